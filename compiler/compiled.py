@@ -1,0 +1,185 @@
+"""The compiled model: CasADi functions of one site per kind, and the exchange between sites as structure.
+
+Takes: nothing (these are the data types the stage `functions` fills and the runtime reads).
+Gives: `CompiledSystem` and its parts.
+Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
+Does not: evaluate anything, or read or write files (see `store`).
+
+Every function of a kind takes some of these vectors, in this order:
+
+    x  (n_x,)  continuous states, in the order of `Kind.states`
+    u  (n_u,)  the values the holds put out at this moment, in the order of `Kind.holds`
+    m  (n_m,)  for a tick: the partition's remembered outputs from its previous tick
+    r  (n_r,)  for a tick: what the site hears from the others, in the order of `ClockPartition.receives`
+    p  (n_p,)  parameters, in the order of `Kind.parameters`
+    t  ()      time in seconds
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+PEERS = "peers"  # the parameter that holds the number of peers
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings."""
+
+    name: str
+    period: str
+    phase: str
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Carries every sender's channels to the others; `delay` is the name of a timing, `clock` of a clock."""
+
+    name: str
+    clock: str
+    delay: str
+    graph: str  # "complete"
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """A period, phase or delay: exact value in seconds; `expression` is its text if it depends on names."""
+
+    name: str
+    value: Fraction
+    expression: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A number of the scene: SI value; `expression` is its text if it depends on other parameters.
+
+    `minimum` is the least value allowed; `open_minimum` says that the least value itself is excluded.
+    """
+
+    name: str
+    unit: str  # in SI base or derived units, "1" when dimensionless
+    value: float
+    expression: str | None = None
+    minimum: float | None = None
+    open_minimum: bool = False
+    maximum: float | None = None
+    about: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """A continuous state: name, SI unit, and the parameter that holds its start value."""
+
+    name: str
+    unit: str
+    start: str
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Row of u: output `output` of clock partition `clock`, acting from its tick + the timing `delay` on.
+
+    Before the first computed value acts, the hold puts out zero.
+    """
+
+    name: str
+    clock: str
+    output: int
+    delay: str
+
+
+@dataclass(frozen=True, slots=True)
+class Receive:
+    """Row of r: the `operator` ("mean" or "sum") over the other peers of a channel of a link.
+
+    `channel` is the row of that link's `SendPartition` outputs. Read at a tick: the newest delivered value.
+    """
+
+    name: str
+    operator: str
+    link: str
+    channel: int
+
+
+@dataclass(frozen=True, slots=True)
+class ClockPartition:
+    """What a site computes at a tick of one clock.
+
+    `tick(x, u, m, r, p, t) -> y (n_y,)`; `outputs` names the rows of y; `memories` are the rows of y
+    whose values at the previous tick make up m; `starts` are the parameters holding their start values.
+    """
+
+    clock: str
+    outputs: tuple[str, ...]
+    memories: tuple[int, ...]
+    starts: tuple[str, ...]
+    receives: tuple[Receive, ...]
+    tick: Any  # casadi.Function
+
+
+@dataclass(frozen=True, slots=True)
+class SendPartition:
+    """What a site sends over one link at a tick of the link's clock: `send(x, u, p, t) -> s (n_c,)`."""
+
+    link: str
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    send: Any  # casadi.Function
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`."""
+
+    name: str
+    states: tuple[State, ...]
+    holds: tuple[Hold, ...]
+    parameters: tuple[str, ...]
+    derivative: Any  # casadi.Function
+    clocks: tuple[ClockPartition, ...]
+    sends: tuple[SendPartition, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """`count` peers of kind `kind` (an index); `values` overrides parameters, by name, for this group.
+
+    An override is a `Parameter` of the same name, so that it can be an expression too.
+    """
+
+    name: str
+    count: int
+    kind: int
+    values: tuple[Parameter, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What the model was compiled from: the topology's path and the SHA-256 of every text read."""
+
+    topology: str
+    texts: tuple[tuple[str, str], ...]  # (path or library name, hexadecimal digest)
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledSystem:
+    """A compiled scene. `dropped` lists what the scene named but does not need, with the reason."""
+
+    name: str
+    about: str
+    clocks: tuple[Clock, ...]
+    links: tuple[Link, ...]
+    timings: tuple[Timing, ...]
+    parameters: tuple[Parameter, ...]
+    kinds: tuple[Kind, ...]
+    groups: tuple[Group, ...]
+    dropped: tuple[tuple[str, str], ...]
+    origin: Origin
+
+    @property
+    def peers(self) -> int:
+        """The number of peers in the scene."""
+        return sum(group.count for group in self.groups)

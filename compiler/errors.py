@@ -1,0 +1,111 @@
+"""What a user is told when the input is at fault.
+
+Takes: nothing. Gives: `Place`, `Mistake`, `ApcError` and the collector `Mistakes`.
+Guarantees: mistakes of one file come out together, in file order, each once.
+Does not: print, or decide exit codes.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Place:
+    """A position in a text file; `line` and `column` count from 1, 0 means the file as a whole."""
+
+    file: str
+    line: int = 0
+    column: int = 0
+    source_line: str = ""
+
+    def __str__(self) -> str:
+        """Return `file:line:column`, or the file alone when no line is known."""
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+
+    def shifted(self, columns: int) -> Place:
+        """Return the place `columns` further right on the same line."""
+        return Place(self.file, self.line, self.column + columns, self.source_line)
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """One fault in the input: what it is about, what was got, what was expected, the line to write.
+
+    It reads `PLACE: CODE WHAT wants EXPECTED, got GOT. Write: HINT`; `expected`, `got` and `hint`
+    may be empty, and then their part of the sentence is left out.
+    """
+
+    code: str
+    place: Place
+    what: str
+    expected: str = ""
+    got: str = ""
+    hint: str = ""
+
+    def __str__(self) -> str:
+        """Return the message with the source line and a caret under the place."""
+        text = f"{self.place}: {self.code} {self.sentence}"
+        line = self.place.source_line.rstrip("\n")
+        if not (self.place.line and line.strip()):
+            return text
+        # A long line is shown around its fault only; a tab or control character would move the caret.
+        start = max(0, self.place.column - 1 - 60)
+        shown = "".join(c if c.isprintable() else " " for c in line[start : start + 100])
+        return f"{text}\n    {shown}\n    {' ' * (self.place.column - 1 - start)}^"
+
+    @property
+    def sentence(self) -> str:
+        """The message without place, code and source line."""
+        text = self.what
+        if self.expected:
+            text += f" wants {self.expected}"
+        if self.got:
+            text += f", got {self.got}" if self.expected else f" {self.got}"
+        if not text.endswith((".", "?", "!")):
+            text += "."
+        return f"{text} Write: {self.hint}" if self.hint else text
+
+
+class ApcError(Exception):
+    """The input is at fault. `mistakes` holds at least one `Mistake`, in file order."""
+
+    def __init__(self, mistakes: Iterable[Mistake] | Mistake) -> None:
+        found = (mistakes,) if isinstance(mistakes, Mistake) else tuple(mistakes)
+        assert found, "an ApcError names at least one mistake"
+        self.mistakes = found
+        super().__init__("\n".join(str(mistake) for mistake in found))
+
+
+class Mistakes:
+    """Collects mistakes so that a file's faults are reported together."""
+
+    def __init__(self) -> None:
+        self._found: dict[Mistake, None] = {}
+
+    def add(
+        self, code: str, place: Place, what: str, *, expected: str = "", got: str = "", hint: str = ""
+    ) -> None:
+        """Record one mistake; the same mistake twice counts once."""
+        self._found[Mistake(code, place, what, expected, got, hint)] = None
+
+    def take(self, error: ApcError) -> None:
+        """Record every mistake of an error raised further down."""
+        for mistake in error.mistakes:
+            self._found[mistake] = None
+
+    def __bool__(self) -> bool:
+        return bool(self._found)
+
+    def raise_if_any(self) -> None:
+        """Raise `ApcError` with all mistakes in file order, if there is one."""
+        if self._found:
+            raise ApcError(sorted(self._found, key=lambda mistake: (mistake.place, mistake.code)))
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name closest to a misspelt one, or an empty string when none is close."""
+    close = difflib.get_close_matches(name[:200], list(known), n=1, cutoff=0.6)
+    return close[0] if close else ""

@@ -1,0 +1,92 @@
+"""Reads typed values out of YAML nodes, recording a mistake where a node is not what it should be.
+
+Takes: nodes of the stage `source`. Gives: texts, mappings, entries.
+Guarantees: a node of the wrong form adds one mistake and yields None, so that reading goes on.
+Does not: know any section, component or unit.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+
+from apc.compiler.errors import Mistakes, Place, nearest
+from apc.compiler.source import Mapping, Node, Scalar, Sequence
+
+IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}\Z")
+
+
+def form(node: Node) -> str:
+    """Return what a node is, in words, for a message."""
+    if isinstance(node, Mapping):
+        return "a mapping"
+    if isinstance(node, Sequence):
+        return "a list"
+    return f"{brief(node.text)}" if node.text.strip() else "nothing"
+
+
+def brief(text: str) -> str:
+    """Return a text short enough for one line of a message."""
+    flat = " ".join(text.split())
+    return flat if len(flat) <= 60 else flat[:57] + "..."
+
+
+def read_mapping(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> Mapping | None:
+    """Return the node when it is a mapping."""
+    if node is None or isinstance(node, Mapping):
+        return node
+    mistakes.add("E203", node.place, what, expected="a mapping of keys to values", got=form(node), hint=hint)
+    return None
+
+
+def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> str | None:
+    """Return the text of a scalar that isn't empty."""
+    if node is None:
+        return None
+    if isinstance(node, Scalar) and node.text.strip():
+        return node.text
+    mistakes.add("E203", node.place, what, expected="a single value", got=form(node), hint=hint)
+    return None
+
+
+def read_name(node: Scalar, what: str, mistakes: Mistakes) -> str | None:
+    """Return the text of a scalar when it can serve as a name: a letter, then letters, digits, underscores."""
+    if IDENTIFIER.match(node.text):
+        return node.text
+    mistakes.add(
+        "E205",
+        node.place,
+        f"the name of {what}",
+        expected="a letter followed by letters, digits or underscores (63 at most)",
+        got=brief(node.text) or "nothing",
+    )
+    return None
+
+
+def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: Mistakes) -> None:
+    """Record every key that isn't allowed, with the nearest allowed one."""
+    for key, _ in mapping.entries:
+        if key.text not in allowed:
+            add_unknown(
+                "E202", key.place, f"{what} has no key {brief(key.text)}", key.text, allowed, mistakes
+            )
+
+
+def add_unknown(
+    code: str, place: Place, what: str, name: str, known: Collection[str], mistakes: Mistakes
+) -> None:
+    """Record an unknown name, with the nearest known one or, failing that, a list of them."""
+    close = nearest(name, known)
+    if close:
+        mistakes.add(code, place, f"{what}; the nearest is {close}", hint=close)
+    elif known:
+        listed = ", ".join(list(known)[:12]) + (", …" if len(known) > 12 else "")
+        mistakes.add(code, place, f"{what}; there are: {listed}")
+    else:
+        mistakes.add(code, place, f"{what}; there is none")
+
+
+def entries(mapping: Mapping | None) -> Iterator[tuple[Scalar, Node]]:
+    """Yield the entries of a mapping that may be missing."""
+    if mapping is not None:
+        yield from mapping.entries

@@ -1,0 +1,158 @@
+"""NAME.apc: the compiled model on disk.
+
+Takes: `CompiledSystem`. Gives: a file, and the same system back.
+Guarantees: written whole or not at all; a damaged file, one of another format version, or one that is older
+than its topology is refused by name; nothing is unpickled, and no library or topology is needed to load.
+Does not: compile.
+
+The file is a ZIP archive: `model.json` holds the structure, the numbers and the SHA-256 of every other
+member; each CasADi function is a member in CasADi's own serialization.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import tempfile
+import types
+import typing
+import zipfile
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import casadi
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+
+FORMAT = 1
+MEMBER = "model.json"
+# CasADi's reader can crash on text that isn't its own, so every member is checked against its digest first.
+LARGEST = 256 * 2**20
+
+
+def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a temporary file beside `path`, then rename it. Raises ApcError if it can't."""
+    temporary: Path | None = None
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        write(temporary)
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        temporary.replace(path)
+    except OSError as error:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        reason = error.strerror or str(error)
+        raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {reason}")) from error
+    except BaseException:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        raise
+
+
+def save(system: CompiledSystem, path: Path) -> None:
+    """Write a compiled model. Raises ApcError if the file can't be written."""
+    functions: dict[str, str] = {}
+    document = _plain(system, functions)
+    digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in functions.items()}
+    text = json.dumps({"format": FORMAT, "system": document, "functions": digests}, indent=1, sort_keys=True)
+
+    def write(temporary: Path) -> None:
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in {MEMBER: text, **functions}.items():
+                # A fixed date: the same model gives the same bytes.
+                archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
+
+    write_atomically(path, write)
+
+
+def load(path: Path) -> CompiledSystem:
+    """Read a compiled model. Raises ApcError if the file is missing, damaged or of another version."""
+    try:
+        if path.is_dir():
+            raise ApcError(Mistake("E602", Place(str(path)), "is a folder, not a compiled model"))
+        with zipfile.ZipFile(path) as archive:
+            if sum(info.file_size for info in archive.infolist()) > LARGEST:
+                raise _damaged(path, f"it unpacks to more than {LARGEST >> 20} MiB")
+            document = json.loads(archive.read(MEMBER))
+            if document["format"] != FORMAT:
+                what = f"has format version {document['format']}, this program reads version {FORMAT}"
+                raise ApcError(Mistake("E603", Place(str(path)), what, hint=f"apc compile {path.stem}.yaml"))
+            functions = {}
+            for name, digest in document["functions"].items():
+                content = archive.read(name)
+                if hashlib.sha256(content).hexdigest() != digest:
+                    raise _damaged(path, f"its member {name} was changed")
+                functions[name] = casadi.Function.deserialize(content.decode())
+        system = _typed(CompiledSystem, document["system"], functions)
+    except FileNotFoundError as error:
+        raise ApcError(Mistake("E602", Place(str(path)), "does not exist", hint="apc compile")) from error
+    except OSError as error:
+        raise ApcError(Mistake("E602", Place(str(path)), f"can't be read: {error.strerror}")) from error
+    except (
+        zipfile.BadZipFile,
+        KeyError,
+        ValueError,
+        TypeError,
+        RuntimeError,
+        EOFError,
+        NotImplementedError,
+    ) as error:
+        raise _damaged(path, "it is not what apc compile writes") from error
+    assert isinstance(system, CompiledSystem)
+    return system
+
+
+def _damaged(path: Path, why: str) -> ApcError:
+    mistake = Mistake("E604", Place(str(path)), f"is damaged: {why}", hint=f"apc compile {path.stem}.yaml")
+    return ApcError(mistake)
+
+
+def _plain(value: Any, functions: dict[str, str]) -> Any:
+    """Return dataclasses as dictionaries, fractions as texts, CasADi functions as names of members."""
+    if dataclasses.is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name), functions) for f in dataclasses.fields(value)}
+    if isinstance(value, tuple):
+        return [_plain(item, functions) for item in value]
+    if isinstance(value, Fraction):
+        return str(value)
+    if isinstance(value, casadi.Function):
+        name = f"function{len(functions)}.casadi"
+        functions[name] = value.serialize()
+        return name
+    return value
+
+
+def _typed(wanted: Any, value: Any, functions: dict[str, Any]) -> Any:
+    """Build a value of the wanted type from its plain form."""
+    origin = typing.get_origin(wanted)
+    if dataclasses.is_dataclass(wanted) and isinstance(wanted, type):
+        hints = typing.get_type_hints(wanted)
+        return wanted(
+            **{f.name: _typed(hints[f.name], value[f.name], functions) for f in dataclasses.fields(wanted)}
+        )
+    if origin is tuple:
+        arguments = typing.get_args(wanted)
+        if arguments[-1] is Ellipsis:
+            return tuple(_typed(arguments[0], item, functions) for item in value)
+        return tuple(_typed(a, item, functions) for a, item in zip(arguments, value, strict=True))
+    if origin in (typing.Union, types.UnionType):
+        inner = [a for a in typing.get_args(wanted) if a is not type(None)]
+        return None if value is None else _typed(inner[0], value, functions)
+    if wanted is Fraction:
+        return Fraction(value)
+    if wanted is Any:
+        return functions[value]
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, wanted):
+        raise TypeError(f"expected {wanted}, got {value!r}")
+    return value

@@ -1,0 +1,1 @@
+"""The component library and the example scenes: YAML only, no code."""

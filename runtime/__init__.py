@@ -1,0 +1,1 @@
+"""CasADi to answers: linearize, schedule, lift, modes, spectrum."""

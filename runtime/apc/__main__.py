@@ -1,0 +1,65 @@
+"""The command line's way in and out: `apc …` or `python -m apc …`, and the exit codes.
+
+0 done (an unstable scene is an answer), 1 the input is at fault, 2 usage, 3 a bug of ours.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command and return its exit code; no traceback reaches the terminal."""
+    import click
+
+    from apc.cli import apc
+    from apc.compiler.errors import ApcError
+
+    try:
+        apc.main(arguments, prog_name="apc", standalone_mode=False)
+    except ApcError as error:
+        for mistake in error.mistakes:
+            click.echo(str(mistake), err=True)
+        return 1
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("stopped", err=True)
+        return 130
+    except BrokenPipeError:
+        # Whoever read our output has gone; silence the flush at exit as well.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception:
+        click.echo(
+            f"apc: this is a bug of apc, not of your input; a report is in {_report(arguments)}", err=True
+        )
+        return 3
+    return 0
+
+
+def _report(arguments: list[str]) -> str:
+    from importlib.metadata import version
+
+    text = f"apc {version('apc')}, Python {sys.version}\narguments: {arguments}\n\n{traceback.format_exc()}"
+    try:
+        handle, name = tempfile.mkstemp(prefix="apc-bug-", suffix=".txt")
+        os.close(handle)
+        Path(name).write_text(text, encoding="utf-8")
+    except OSError:
+        return f"no file, as none could be written:\n{text}"
+    return name
+
+
+if __name__ == "__main__":
+    main()

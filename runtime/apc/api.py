@@ -1,0 +1,114 @@
+"""The public functions: plain, with frozen results.
+
+Takes: paths, compiled models, settings. Gives: compiled models and analyses.
+Guarantees: what a command does, the function of its name does.
+Does not: print.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from apc.compiler import store
+from apc.compiler.compiled import CompiledSystem
+
+if TYPE_CHECKING:
+    from apc.runtime.analysis import Analysis
+
+Method = Literal["modes", "dense"]
+
+
+def compile(path: str | Path) -> CompiledSystem:
+    """Compile a topology file and check the result: one frame event by event against the lifted map.
+
+    Parameters
+    ----------
+    path
+        The topology, a YAML file.
+
+    Returns
+    -------
+    CompiledSystem
+        The compiled model; nothing is written (see `save`).
+
+    Raises
+    ------
+    ApcError
+        The file is at fault; holds every mistake found.
+    """
+    from apc.compiler.pipeline import compile_topology
+    from apc.runtime.selfcheck import check_frame
+
+    system = compile_topology(Path(path))
+    check_frame(system)
+    return system
+
+
+def save(model: CompiledSystem, path: str | Path) -> None:
+    """Write a compiled model to a .apc file, whole or not at all. Raises ApcError if it can't be written."""
+    store.save(model, Path(path))
+
+
+def load(path: str | Path) -> CompiledSystem:
+    """Read a compiled model from a .apc file. Raises ApcError if it is damaged, or older than its topology."""
+    from apc.inputs import load_fresh
+
+    return load_fresh(Path(path))
+
+
+def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> CompiledSystem:
+    """Return the model with other parameter values, without compiling again.
+
+    Parameters
+    ----------
+    model
+        The compiled model; it stays as it is.
+    values
+        Quantities by name: `{"contact.stiffness": "800 N/m", "lan.delay": "16 ms"}`.
+
+    Raises
+    ------
+    ApcError
+        A name is unknown, a unit is wrong, or a value lies outside its bounds.
+    """
+    from apc.runtime.parameters import apply, parse_override
+
+    overrides = [parse_override(model, f"{name}={value}") for name, value in values.items()]
+    return apply(model, overrides)
+
+
+def analyze(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None, method: Method = "modes"
+) -> Analysis:
+    """Say whether a scene is stable, by how much, and in which modes.
+
+    Parameters
+    ----------
+    model
+        A compiled model, or the path of a topology or compiled model.
+    set
+        Parameter values to change first, as in `set_parameters`.
+    method
+        "modes": a few systems of a site's size, at a cost that does not grow with the number of peers;
+        "dense": every peer in one system, the check on the other.
+
+    Returns
+    -------
+    Analysis
+        Verdict, spectral radius per frame with its error bound, and the modes.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.runtime.analysis import analyze_dense, analyze_modes
+
+    if not isinstance(model, CompiledSystem):
+        path = Path(model)
+        model = load(path) if path.suffix == ".apc" else compile(path)
+    if set:
+        model = set_parameters(model, set)
+    return analyze_modes(model) if method == "modes" else analyze_dense(model)

@@ -1,0 +1,211 @@
+"""The commands: what they take, what they call, what they print.
+
+Takes: words of a command line. Gives: text on stdout, messages on stderr.
+Guarantees: with --json, stdout holds one JSON document and nothing else.
+Does not: compute, or decide exit codes (see `__main__`).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from apc.compiler.errors import ApcError, Mistake, Place
+
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
+
+STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}\Z")
+CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
+
+
+def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        click.echo(f"apc {version('apc')}")
+        context.exit()
+
+
+@click.group(context_settings=CONTEXT)
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_version,
+    help="Show the version.",
+)
+def apc() -> None:
+    """Is a shared virtual object stable in the hands of all its users?
+
+    Describe users, masses, couplers and network links in a YAML file, a
+    topology. Compile it to equations and read the verdict:
+
+    \b
+        apc new            write a topology.yaml to start from
+        apc compile        check it and turn it into topology.apc
+        apc analyze        stable or not, by how much, in which modes
+
+    Without FILE a command takes the only topology of the folder.
+    """
+
+
+@apc.command()
+@click.argument("name", default="topology")
+def new(name: str) -> None:
+    """Write NAME.yaml, a commented topology to start from.
+
+    NAME is "topology" if not given. A file that exists is never overwritten.
+    """
+    if not NAME.match(name):
+        what = "a scene's name"
+        expected = "letters, digits, - and _, 63 at most, with a letter or digit first"
+        raise ApcError(Mistake("E612", Place(name[:80] or "''"), what, expected, "this", "apc new my-scene"))
+    from importlib.resources import files
+
+    text = files("apc.models").joinpath("scenes/template.yaml").read_text(encoding="utf-8")
+    path = Path(f"{name}.yaml")
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text.replace("topology: my-scene", f"topology: {name}"))
+    except FileExistsError:
+        raise ApcError(
+            Mistake(
+                "E613", Place(str(path)), "exists already and is left as it is", hint="apc new another-name"
+            )
+        ) from None
+    except OSError as error:
+        raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {error.strerror}")) from None
+    click.echo(f"{path} is written. Next: apc compile {path}")
+
+
+@apc.command()
+@click.argument("file", required=False)
+def check(file: str | None) -> None:
+    """Report every mistake in a topology; build nothing.
+
+    Exit code 0 if there is none, 1 otherwise.
+    """
+    from apc.inputs import find_input
+    from apc.compiler.pipeline import compile_topology
+
+    path = Path(file) if file else find_input(compiled_too=False)
+    system = compile_topology(path)
+    click.echo(f"{path}: no mistakes. {system.name}, {_counted(system.peers, 'peer')}.")
+
+
+@apc.command("compile")
+@click.argument("file", required=False)
+@click.option(
+    "--until",
+    type=click.Choice(STAGES),
+    default="compiled",
+    metavar="STAGE",
+    help=f"Stop after a stage, print what it made and write nothing. One of {', '.join(STAGES[:-1])}.",
+)
+def compile_command(file: str | None, until: str) -> None:
+    """Turn a topology into equations: NAME.yaml to NAME.apc beside it.
+
+    Prints what the scene needed: states, delays and packets kept for a peer,
+    and how large the systems are that decide its stability.
+    """
+    from apc.inputs import find_input
+    from apc.compiler.pipeline import run_stages
+
+    path = Path(file) if file else find_input(compiled_too=False)
+    if until != "compiled":
+        from apc.compiler.listing import describe
+
+        click.echo(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
+        return
+    from apc.compiler.pipeline import compile_topology
+    from apc.compiler.store import save
+    from apc.report import compile_report
+    from apc.runtime.needs import needs
+    from apc.runtime.selfcheck import check_frame
+
+    if path.suffix == ".apc":
+        raise ApcError(Mistake("E614", Place(str(path)), "is compiled already", hint=f"apc analyze {path}"))
+    system = compile_topology(path)
+    difference = check_frame(system)
+    target = path.with_suffix(".apc")
+    save(system, target)
+    click.echo(compile_report(system, needs(system), target, difference))
+
+
+@apc.command()
+@click.argument("file", required=False)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar='PATH="VALUE UNIT"',
+    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
+)
+@click.option(
+    "--method",
+    type=click.Choice(["modes", "dense"]),
+    default="modes",
+    show_default=True,
+    help="modes: a few small systems, whatever the number of peers. dense: all peers in one system, to check.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: bool) -> None:
+    """Say whether a scene is stable, by how much, and in which modes.
+
+    FILE is a topology or a compiled model. The spectral radius is per frame,
+    the time after which all clocks stand as before; below 1 every motion
+    dies out. A motion of all peers together, which nothing hinders, is left
+    out of it and named.
+    """
+    from apc.runtime.analysis import analyze_dense, analyze_modes
+
+    system = _model(Path(file) if file else None)
+    if settings:
+        from apc.runtime.parameters import apply, parse_override
+
+        system = apply(system, [parse_override(system, text) for text in settings])
+    result = analyze_modes(system) if method == "modes" else analyze_dense(system)
+    if as_json:
+        _print_json(result.to_dict())
+    else:
+        from apc.report import analysis_report
+
+        click.echo(analysis_report(result))
+
+
+def _model(path: Path | None) -> CompiledSystem:
+    """Return the compiled model of a file; a topology is compiled in memory unless a fresh model is beside it."""
+    from apc.inputs import find_input, is_fresh, load_fresh
+
+    path = find_input(compiled_too=True) if path is None else path
+    if path.suffix == ".apc":
+        return load_fresh(path)
+    beside = path.with_suffix(".apc")
+    if beside.is_file() and path.is_file():
+        from apc.compiler.store import load
+
+        try:
+            system = load(beside)
+        except ApcError:
+            pass  # it is only a saving of time; the topology itself decides
+        else:
+            if is_fresh(system, beside) and system.origin.topology == path.name:
+                return system
+    from apc.compiler.pipeline import compile_topology
+
+    return compile_topology(path)
+
+
+def _print_json(document: dict[str, Any]) -> None:
+    click.echo(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -1,0 +1,79 @@
+"""Which file a command means, and whether a compiled model still matches its topology.
+
+Takes: paths. Gives: the topology or compiled model to work on.
+Guarantees: a compiled model that no longer matches its topology is never used.
+Does not: compile.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.source import MAX_BYTES
+from apc.compiler.store import load
+
+_TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
+
+
+def find_input(*, compiled_too: bool) -> Path:
+    """Return the only topology of the working folder, or failing that, its only compiled model.
+
+    Parameters
+    ----------
+    compiled_too
+        Whether a compiled model serves.
+
+    Raises
+    ------
+    ApcError
+        There is none, or there are several.
+    """
+    here = Path()
+    topologies = sorted(path for path in here.glob("*.yaml") if _is_topology(path))
+    models = sorted(here.glob("*.apc")) if compiled_too else []
+    orphans = [path for path in models if path.with_suffix(".yaml") not in topologies]
+    candidates = [*topologies, *orphans]
+    if len(candidates) == 1:
+        return candidates[0]
+    place = Place("this folder")
+    if not candidates:
+        what = "holds no topology" + (" and no compiled model" if compiled_too else "")
+        raise ApcError(
+            Mistake("E610", place, what, hint="apc new  (it writes a topology.yaml to start from)")
+        )
+    listed = ", ".join(str(path) for path in candidates[:10]) + (", …" if len(candidates) > 10 else "")
+    raise ApcError(
+        Mistake("E611", place, f"holds {len(candidates)} scenes: {listed}", hint=f"apc … {candidates[0]}")
+    )
+
+
+def _is_topology(path: Path) -> bool:
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return _TOPOLOGY.search(file.read(MAX_BYTES)) is not None
+    except OSError:
+        return False
+
+
+def load_fresh(path: Path) -> CompiledSystem:
+    """Read a compiled model. Raises ApcError if it is damaged, or if its topology has changed since."""
+    system = load(path)
+    if not is_fresh(system, path):
+        what = f"is stale: {system.origin.topology} has changed since it was compiled"
+        hint = f"apc compile {path.with_name(system.origin.topology)}"
+        raise ApcError(Mistake("E605", Place(str(path)), what, hint=hint))
+    return system
+
+
+def is_fresh(system: CompiledSystem, path: Path) -> bool:
+    """Return whether the topology beside a compiled model, if there is one, still has the same text."""
+    topology = path.with_name(system.origin.topology)
+    if not topology.is_file():
+        return True
+    return dict(system.origin.texts).get(topology.name) == hashlib.sha256(topology.read_bytes()).hexdigest()

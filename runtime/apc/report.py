@@ -1,0 +1,119 @@
+"""What a person reads: results as text of at most 80 columns.
+
+Takes: results. Gives: text.
+Guarantees: every number that decides something stands with its error.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis import Analysis
+from apc.runtime.needs import Needs
+from apc.runtime.spectrum import Mode
+
+WIDTH = 80
+MOST_ROWS = 16
+MOVES_WIDTH = 30  # what the other columns leave of 80
+
+_WORDS = {
+    "stable": "Every motion dies out.",
+    "stable up to a common translation": (
+        "Nothing ties the peers to the ground: moved together, they stay where they are.\n"
+        "Every other motion dies out."
+    ),
+    "drifts": "Nothing slows a common motion down. Every other motion dies out.",
+    "unstable": "Some motion grows until the devices shake or hit their limits.",
+}
+
+
+def compile_report(system: CompiledSystem, needs: Needs, target: Path, difference: float) -> str:
+    """Return what `apc compile` prints.
+
+    Parameters
+    ----------
+    system, needs
+        The compiled scene and what it keeps.
+    target
+        The file written.
+    difference
+        The largest relative difference the self-check found.
+    """
+    ticks = ", ".join(
+        f"{name} ticks {count} times" if count != 1 else f"{name} once" for name, count in needs.ticks
+    )
+    lines = [
+        f"{system.name} → {target}",
+        _wrapped(str(needs)),
+        f"  frame {_time(float(needs.frame))}: {ticks}",
+        f"  self-check: one frame event by event and lifted differ by {difference:.0e}",
+    ]
+    lines += [_wrapped(f"left out: {name}, as {reason}") for name, reason in system.dropped]
+    return "\n".join(lines)
+
+
+def analysis_report(result: Analysis) -> str:
+    """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
+    lines = [f"{result.topology}: {result.verdict}", ""]
+    words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
+    lines += [f"  {line}" for line in words.splitlines()]
+    removed = ""
+    if result.rigid_modes:
+        plural = "" if result.rigid_modes == 1 else "s"
+        removed = f", {result.rigid_modes} translation{plural} left out"
+    lines += [
+        "",
+        f"  spectral radius  {result.spectral_radius:.12g} ± {result.spectral_radius_error:.0e}"
+        f" per frame of {_time(result.frame_s)}",
+        f"  peers            {result.peers}, {result.states_per_peer} states each",
+        f"  method           {result.method}{removed}",
+        "",
+        _mode_table(result.modes),
+    ]
+    return "\n".join(lines)
+
+
+def _mode_table(modes: tuple[Mode, ...]) -> str:
+    rows = [mode for mode in modes if mode.eigenvalue.imag >= 0]  # a conjugate pair is one row
+    shown = [mode for mode in rows if mode.magnitude > 1e-6][:MOST_ROWS]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for heading in ("magnitude", "shape", "times", "frequency", "damping"):
+        table.add_column(heading, justify="left" if heading == "shape" else "right", no_wrap=True)
+    table.add_column("moves most", max_width=MOVES_WIDTH)
+    for mode in shown:
+        table.add_row(
+            f"{mode.magnitude:.6f}",
+            mode.shape,
+            str(mode.multiplicity),
+            f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–",
+            f"{mode.damping_ratio:.3g}",
+            _leading(mode),
+        )
+    stream = io.StringIO()
+    Console(file=stream, width=WIDTH - 2, color_system=None).print(table)
+    text = "\n".join("  " + line.rstrip() for line in stream.getvalue().splitlines())
+    left = len(rows) - len(shown)
+    return f"{text}\n  and {left} faster-dying ones (--json lists all)" if left else text
+
+
+def _leading(mode: Mode) -> str:
+    largest = sorted(mode.participation, key=lambda item: -item[1])[:2]
+    return ", ".join(f"{name} {share:.0%}" for name, share in largest)
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds * 1e3:.6g} ms" if seconds < 1 else f"{seconds:.6g} s"
+
+
+def _wrapped(text: str) -> str:
+    stream = io.StringIO()
+    Console(file=stream, width=WIDTH - 4, color_system=None).print(text, highlight=False, markup=False)
+    return "\n".join(
+        ("  " if i == 0 else "    ") + line.rstrip() for i, line in enumerate(stream.getvalue().splitlines())
+    )

@@ -1,0 +1,165 @@
+"""One frame of one site as one linear map.
+
+Takes: a `LinearSite` and its `Schedule`.
+Gives: `LiftedSite`, `lift`.
+Guarantees: the continuous part is propagated by its exact exponential; every matrix comes with a bound on
+its rounding error, entry by entry.
+Does not: know who the others are (see `modes`).
+
+    z⁺ = P z + Q r        z: continuous states, then the remembered values (`Schedule.carried`)
+    s  = S z + D r        r: what the site hears (`Schedule.heard`), s: what it sends (`Schedule.sent`)
+
+D is what is sent after something was heard in the same frame: nilpotent, as nothing is heard before it is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from apc.runtime.linearize import LinearSite, magnitudes
+from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+Floats = NDArray[np.float64]
+
+UNIT = float(np.finfo(np.float64).eps) / 2  # the unit roundoff of double precision
+
+# Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
+# short polynomials of the parameters, a few roundings an entry.
+COEFFICIENT_ROUNDINGS = 8
+
+# Rounding errors charged to an entry of a matrix exponential, per row of the matrix and per squaring, relative
+# to the same entry of the exponential of magnitudes. Higham, The Scaling and Squaring Method for the Matrix
+# Exponential Revisited (2005), sections 2 and 4: Padé degree at most 13, then one product a squaring.
+EXPONENTIAL_ROUNDINGS = 13
+
+
+@dataclass(frozen=True, slots=True)
+class LiftedSite:
+    """The one-frame map of a site. `*_error` bounds the rounding error of the matrix, entry by entry.
+
+    `inside` holds the continuous states at every mark of the schedule as rows over the columns (z, r).
+    """
+
+    z_names: tuple[str, ...]
+    continuous: int  # the first so many entries of z are continuous states
+    frame_s: float
+    p: Floats  # (n_z, n_z)
+    q: Floats  # (n_z, n_r)
+    s: Floats  # (n_s, n_z)
+    d: Floats  # (n_s, n_r)
+    p_error: Floats
+    q_error: Floats
+    s_error: Floats
+    d_error: Floats
+    inside: Floats  # (marks, n_x, n_z + n_r)
+
+
+def lift(site: LinearSite, schedule: Schedule) -> LiftedSite:
+    """Compose a site's events over one frame.
+
+    Parameters
+    ----------
+    site
+        The site's matrices, in floats.
+    schedule
+        What happens in a frame.
+
+    Notes
+    -----
+    Rounding: a sum of k products is off by at most γ_k = k·u/(1 − k·u) times the same sum of magnitudes
+    (Higham, Accuracy and Stability of Numerical Algorithms, section 3.1). The factors multiply along a
+    composition, so the whole frame is off by at most γ times the composition of the magnitudes, with the
+    roundings of every event added up. That bound holds whatever the scaling of the states.
+    """
+    block = np.block([[site.a, site.b], [np.zeros((site.b.shape[1], site.a.shape[1] + site.b.shape[1]))]])
+    steps, large_steps, squarings = {}, {}, 0
+    for duration in {event.duration for event in schedule.events if isinstance(event, Propagate)}:
+        scaled = block * float(duration * schedule.quantum)
+        steps[duration] = expm(scaled)
+        large_steps[duration] = expm(np.abs(scaled))
+        norm = float(np.abs(scaled).sum(axis=0).max(initial=0.0))
+        squarings = max(squarings, int(np.ceil(np.log2(max(norm, 1.0)))))
+    frame = _compose(site, schedule, steps)
+    large = _compose(magnitudes(site), schedule, large_steps)
+
+    size = len(block)
+    width = size + max((tick.m.shape[1] + tick.r.shape[1] for tick in site.ticks), default=0)
+    exponential = (EXPONENTIAL_ROUNDINGS + squarings + COEFFICIENT_ROUNDINGS) * size
+    roundings = sum(
+        size + exponential if isinstance(event, Propagate) else width + COEFFICIENT_ROUNDINGS
+        for event in schedule.events
+        if not isinstance(event, Act)
+    )
+    gamma = roundings * UNIT / (1 - roundings * UNIT)
+
+    n_z = len(site.kind.states) + len(schedule.carried)
+    z, s, inside = frame
+    z_large, s_large, _ = large
+    return LiftedSite(
+        z_names=(*(state.name for state in site.kind.states), *schedule.value_names),
+        continuous=len(site.kind.states),
+        frame_s=float(schedule.frame_s),
+        p=z[:, :n_z],
+        q=z[:, n_z:],
+        s=s[:, :n_z],
+        d=s[:, n_z:],
+        p_error=gamma * z_large[:, :n_z],
+        q_error=gamma * z_large[:, n_z:],
+        s_error=gamma * s_large[:, :n_z],
+        d_error=gamma * s_large[:, n_z:],
+        inside=inside,
+    )
+
+
+def _compose(
+    site: LinearSite, schedule: Schedule, steps: Mapping[int, Floats]
+) -> tuple[Floats, Floats, Floats]:
+    """Follow z and r through one frame; return (z⁺, s, inside), every row over the columns (z, r)."""
+    kind = site.kind
+    n_x, n_u, n_r = len(kind.states), len(kind.holds), len(schedule.heard)
+    n_z = n_x + len(schedule.carried)
+    unit = np.eye(n_z + n_r)
+    nothing = np.zeros(n_z + n_r)
+    value: dict[Value, Floats] = {one: unit[n_x + row] for row, one in enumerate(schedule.carried)}
+    heard = np.vstack([unit[n_z:], nothing])  # its last row stands for what is not read
+
+    # The continuous states above what the holds put out: a step multiplies both at once.
+    moving = np.zeros((n_x + n_u, n_z + n_r))
+    moving[:n_x] = unit[:n_x]
+    for hold, one in enumerate(schedule.acting):
+        moving[n_x + hold] = value.get(one, nothing) if one is not None else nothing
+    sends = [np.hstack([send.x, send.u]) for send in site.sends]
+    ticks = [np.hstack([tick.x, tick.u, tick.m, tick.r]) for tick in site.ticks]
+    sent = np.zeros((len(schedule.sent), n_z + n_r))
+    inside = np.zeros((len(schedule.marks), n_x, n_z + n_r))
+    now, mark = 0, 0
+    for event in schedule.events:
+        if mark < len(schedule.marks) and schedule.marks[mark] == now:
+            inside[mark] = moving[:n_x]
+            mark += 1
+        match event:
+            case Propagate(duration):
+                moving[:n_x] = steps[duration][:n_x] @ moving
+                now += duration
+            case Act(hold, one):
+                moving[n_x + hold] = value.get(one, nothing)
+            case Send(partition, rows):
+                everything = sends[partition] @ moving
+                for channel, row in rows:
+                    sent[row] = everything[channel]
+            case Tick(partition, index, rows_heard):
+                memories = kind.clocks[partition].memories
+                before = [value.get(Value(partition, o, index - 1), nothing) for o in memories]
+                inputs = np.vstack([moving, *before, heard[list(rows_heard)]])
+                for output, row_of in enumerate(ticks[partition] @ inputs):
+                    value[Value(partition, output, index)] = row_of
+    inside[-1] = moving[:n_x]
+    after = [
+        value[Value(one.partition, one.output, one.index + schedule.ticks[one.partition])]
+        for one in schedule.carried
+    ]
+    return np.vstack([moving[:n_x], *after]), sent, inside

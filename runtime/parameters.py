@@ -1,0 +1,273 @@
+"""The numbers of a compiled system, and changing them without compiling again.
+
+Takes: a `CompiledSystem` and overrides such as `contact.stiffness=800 N/m`.
+Gives: `Override`, `parse_override`, `apply`, `Numbers`, `resolve`.
+Guarantees: what depends on a changed parameter by an expression changes with it, in exact rationals; bounds
+are kept; the rest keeps the very numbers it was compiled with.
+Does not: change what was compiled as structure (which parts there are, how many peers).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+from apc.compiler.compiled import PEERS, CompiledSystem, Group, Parameter, Timing
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
+from numpy.typing import NDArray
+
+# The sections of a topology, which a name may start with.
+SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
+
+_PLACE = Place("override")
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """A new SI value for a parameter or timing: of one group, or of all (`group` None)."""
+
+    name: str
+    group: str | None
+    value: Fraction
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """Everything a compiled system needs to become matrices.
+
+    `parameters` holds one vector (n_p,) a group, in the order of its kind's parameters; `timings` seconds by name.
+    """
+
+    parameters: tuple[NDArray[np.float64], ...]
+    timings: Mapping[str, Fraction]
+
+
+def parse_override(system: CompiledSystem, text: str, place: Place = _PLACE) -> Override:
+    """Read `NAME=QUANTITY`, the name as `part.parameter`, `GROUP.part.parameter` or with its section before it.
+
+    Raises
+    ------
+    ApcError
+        E501 not of that form, E502 no such parameter, E503 the number of peers is not a parameter to set;
+        and those of `units.quantity`: the unit has to fit.
+    """
+    # Imported here: reading a unit brings in pint, which an analysis without overrides never needs.
+    from apc.compiler.units import quantity
+
+    name, equals, value = text.partition("=")
+    name, value = name.strip(), value.strip()
+    if not (equals and name and value):
+        form = "contact.stiffness=800 N/m"
+        raise ApcError(Mistake("E501", place, "an override", "NAME=VALUE", text[:80], form))
+    known, group = find(system, name, place)
+    unit = _unit_of(system, known)
+    found = quantity(
+        value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
+    )
+    return Override(known, group, found.value)
+
+
+def find(system: CompiledSystem, name: str, place: Place = _PLACE) -> tuple[str, str | None]:
+    """Return the parameter or timing a person's name means, and the group it names, if any.
+
+    Raises
+    ------
+    ApcError
+        E502 no such parameter, E503 the number of peers.
+    """
+    known = {parameter.name for parameter in system.parameters} | {timing.name for timing in system.timings}
+    groups = {group.name for group in system.groups}
+    first, _, rest = name.partition(".")
+    if first in SECTIONS and name not in known:
+        name = rest
+    first, _, rest = name.partition(".")
+    group = None
+    if name not in known and first in groups and rest in {parameter.name for parameter in system.parameters}:
+        name, group = rest, first
+    if name == PEERS:
+        raise ApcError(
+            Mistake("E503", place, "peers is the number of peers: change a count and compile again")
+        )
+    if name not in known:
+        near = nearest(name, sorted(known - {PEERS}))
+        raise ApcError(Mistake("E502", place, f"{name[:80]} is no parameter of {system.name}", hint=near))
+    return name, group
+
+
+def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSystem:
+    """Return the system with new values; a parameter set loses its expression, what depends on it follows.
+
+    Raises
+    ------
+    ApcError
+        E504 a value beyond the parameter's bounds, E505 a time that can't be.
+    """
+    if not overrides:
+        return system
+    everywhere = {one.name: one.value for one in overrides if one.group is None}
+    parameters = {parameter.name: parameter for parameter in system.parameters}
+    timings = {timing.name: timing for timing in system.timings}
+    common = _Scope(parameters, timings, everywhere)
+    groups = []
+    for group in system.groups:
+        own = {one.name: one.value for one in overrides if one.group == group.name}
+        # Set for everybody means for this group as well: its own old value goes.
+        values = {value.name: value for value in group.values if value.name not in everywhere}
+        values |= {name: parameters[name] for name in own if name not in values}
+        scope = _Scope({**parameters, **values}, timings, {**everywhere, **own})
+        # What a group leaves to everybody is its own as soon as it depends on a value of its own.
+        values |= {
+            name: parameter
+            for name, parameter in parameters.items()
+            if name not in values and own and scope.parameter(name) != common.parameter(name)
+        }
+        groups.append(replace(group, values=tuple(scope.parameter(name) for name in values)))
+    changed = replace(
+        system,
+        parameters=tuple(common.parameter(name) for name in parameters),
+        timings=tuple(common.timing(name) for name in timings),
+        groups=tuple(groups),
+    )
+    _check(changed)
+    return changed
+
+
+def resolve(system: CompiledSystem, overrides: Sequence[Override] = ()) -> Numbers:
+    """Return the numbers of a system, after the overrides.
+
+    Raises
+    ------
+    ApcError
+        As `apply`.
+    """
+    system = apply(system, overrides)
+    return Numbers(
+        parameters=tuple(_vector(system, group) for group in system.groups),
+        timings={timing.name: timing.value for timing in system.timings},
+    )
+
+
+def _vector(system: CompiledSystem, group: Group) -> NDArray[np.float64]:
+    """Return a group's parameters in the order of its kind."""
+    value = {parameter.name: parameter.value for parameter in system.parameters}
+    value |= {parameter.name: parameter.value for parameter in group.values}
+    return np.array([value[name] for name in system.kinds[group.kind].parameters], dtype=np.float64)
+
+
+class _Scope:
+    """Parameters and timings as one group sees them, with the overrides that reach it."""
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Parameter],
+        timings: Mapping[str, Timing],
+        overridden: Mapping[str, Fraction],
+    ) -> None:
+        self._parameters = parameters
+        self._timings = timings
+        self._overridden = overridden
+        self._changed: dict[str, Fraction | None] = {}
+        self._open: set[str] = set()
+
+    def parameter(self, name: str) -> Parameter:
+        """Return a parameter with its value in this scope."""
+        parameter = self._parameters[name]
+        value = self._new(name, parameter.expression)
+        if value is None:
+            return parameter
+        kept = None if name in self._overridden else parameter.expression
+        return replace(parameter, value=float(value), expression=kept)
+
+    def timing(self, name: str) -> Timing:
+        """Return a timing with its value in this scope."""
+        timing = self._timings[name]
+        value = self._new(name, timing.expression)
+        if value is None:
+            return timing
+        kept = None if name in self._overridden else timing.expression
+        return replace(timing, value=value, expression=kept)
+
+    def _new(self, name: str, expression: str | None) -> Fraction | None:
+        """Return the changed value, or None when no override reaches it."""
+        if name in self._overridden:
+            return self._overridden[name]
+        if expression is None:
+            return None
+        if name not in self._changed:
+            assert name not in self._open, f"{name} depends on itself"
+            self._open.add(name)
+            self._changed[name] = self._evaluate(name, expression)
+            self._open.discard(name)
+        return self._changed[name]
+
+    def _evaluate(self, name: str, text: str) -> Fraction | None:
+        """Evaluate an expression if an override reaches one of its names."""
+        from apc.compiler.expression import evaluate, names, parse_expression
+
+        place = Place(name, 1, 1, text)
+        tree = parse_expression(text, place)
+        reached = [self._expression_value(".".join(node.parts)) for node in names(tree)]
+        if all(value is None for value in reached):
+            return None
+        return Fraction(evaluate(tree, self._look_up, place))
+
+    def _expression_value(self, name: str) -> Fraction | None:
+        holder: Parameter | Timing | None = self._parameters.get(name) or self._timings.get(name)
+        return self._new(name, holder.expression) if holder else None
+
+    def _look_up(self, parts: tuple[str, ...]) -> Fraction:
+        name = ".".join(parts)
+        changed = self._expression_value(name)
+        if changed is not None:
+            return changed
+        if name in self._timings:
+            return self._timings[name].value
+        # The shortest decimal of the float is what stood in the text, mostly: 0.008 is 1/125 again.
+        return Fraction(repr(float(self._parameters[name].value)))
+
+
+def _unit_of(system: CompiledSystem, name: str) -> str:
+    """Return the unit a parameter or timing wants."""
+    for parameter in system.parameters:
+        if parameter.name == name:
+            return parameter.unit
+    return "s"
+
+
+def _check(system: CompiledSystem) -> None:
+    """Raise the mistakes of every value that is out of its bounds."""
+    mistakes = Mistakes()
+    for parameter in system.parameters:
+        _check_bounds(parameter, parameter.name, mistakes)
+    for group in system.groups:
+        for parameter in group.values:
+            _check_bounds(parameter, f"{group.name}.{parameter.name}", mistakes)
+    periods = {clock.period for clock in system.clocks}
+    for timing in system.timings:
+        if timing.name in periods and timing.value <= 0:
+            mistakes.add(
+                "E505", _PLACE, timing.name, expected="a time above 0 s", got=f"{float(timing.value)} s"
+            )
+        elif timing.value < 0:
+            mistakes.add(
+                "E505", _PLACE, timing.name, expected="a time of 0 s or more", got=f"{float(timing.value)} s"
+            )
+    mistakes.raise_if_any()
+
+
+def _check_bounds(parameter: Parameter, name: str, mistakes: Mistakes) -> None:
+    """Record a value below the minimum or above the maximum."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    low, high, value = parameter.minimum, parameter.maximum, parameter.value
+
+    def out(expected: str, number: float) -> None:
+        mistakes.add("E504", _PLACE, name, expected=f"{expected} {number:g}{unit}", got=f"{value:g}{unit}")
+
+    if low is not None and parameter.open_minimum and value <= low:
+        out("more than", low)
+    elif low is not None and value < low:
+        out("at least", low)
+    if high is not None and value > high:
+        out("at most", high)

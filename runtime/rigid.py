@@ -1,0 +1,422 @@
+"""The motions that nothing holds back, found in exact arithmetic.
+
+Takes: a `ClosedSystem`.
+Gives: `RigidModes`, `find_rigid_modes`.
+Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
+a stiffness of exactly zero frees what it held.
+Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
+more than two (a motion growing with t²).
+
+A rigid mode is a constant solution of the homogeneous equations,
+
+    A x + B u = 0,   u = y,   y = X x + U u + M y + R r,   r = W s,   s = X x + U u,
+
+which makes an eigenvector of the frame's map with eigenvalue 1. A drift is a solution x(t) = x₁ + t x₀ with x₀
+such a constant: every value y computed at a tick and every packet s as it was at its own time of sending. It
+makes a generalized eigenvector, a Jordan pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import flint
+import numpy as np
+from apc.runtime.linearize import LinearSite
+from apc.runtime.modes import ClosedSystem, PeerGroup
+from apc.runtime.schedule import Act, Propagate, Send, Tick, Value
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+# A linear form in the unknowns, sparse.
+Form = dict[int, Fraction]
+
+# A prime for the quick look: the null space modulo a prime is at least as large as the true one.
+QUICK_PRIME = 2**61 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class RigidModes:
+    """The invariant subspace to remove before eigenvalues are computed.
+
+    `directions` (n, k) are eigenvectors with eigenvalue 1, `generalized` (n, drifts) the second vectors
+    of Jordan pairs, both over the state of the closed system; `names` says what moves in each direction.
+    """
+
+    directions: Floats
+    generalized: Floats
+    names: tuple[str, ...]
+
+    @property
+    def drifts(self) -> int:
+        """The number of motions that grow with time for want of damping."""
+        return int(self.generalized.shape[1])
+
+    @property
+    def basis(self) -> Floats:
+        """All vectors to remove (n, k + drifts)."""
+        return np.hstack([self.directions, self.generalized])
+
+
+def find_rigid_modes(system: ClosedSystem, *, with_drifts: bool = True) -> RigidModes:
+    """Find the rigid modes of a closed system and the drifts among them, in exact rationals.
+
+    Parameters
+    ----------
+    system
+        The closed system.
+    with_drifts
+        Whether to look for drifts, which is most of the work.
+    """
+    exact = _exact_sites(system.sites)
+    numbering = _Numbering(system.sites)
+    still = _null_space(
+        list(_standing(system, exact, numbering)), numbering.size, split=numbering.size, known=0
+    )
+    vectors = [_standing_state(system, exact, numbering, solution) for solution in still]
+    kept = _independent(vectors)  # an output nobody reads may be free without being part of the state
+    still, vectors = [still[place] for place in kept], [vectors[place] for place in kept]
+    pairs = _drifts(system, exact, numbering, still) if still and with_drifts else []
+    n = len(system.names)
+    return RigidModes(
+        directions=_columns(vectors, n),
+        generalized=_columns(pairs, n),
+        names=tuple(
+            ", ".join(name for name, entry in zip(system.names, vector, strict=True) if entry)
+            for vector in vectors
+        ),
+    )
+
+
+class _Numbering:
+    """Numbers the unknowns of the standing solution: every site's states, then its clocks' outputs."""
+
+    def __init__(self, sites: Sequence[PeerGroup]) -> None:
+        self.states: list[int] = []
+        self.outputs: list[list[int]] = []
+        self.size = 0
+        for group in sites:
+            kind = group.jacobians.kind
+            self.states.append(self.size)
+            self.size += len(kind.states)
+            starts = []
+            for partition in kind.clocks:
+                starts.append(self.size)
+                self.size += len(partition.outputs)
+            self.outputs.append(starts)
+
+
+def _exact_sites(sites: Sequence[PeerGroup]) -> list[LinearSite]:
+    """Return every site's exact matrices; equal sites are worked out once."""
+    known: dict[int, LinearSite] = {}
+    return [known.setdefault(id(group.site), group.exact()) for group in sites]
+
+
+def _add(form: Form, weight: Any, other: Mapping[int, Fraction]) -> None:
+    """Add weight · other to a form in place."""
+    if weight:
+        for index, value in other.items():
+            form[index] = form.get(index, Fraction(0)) + weight * value
+
+
+def _combine(terms: Iterable[tuple[Any, Form]]) -> Form:
+    """Return the sum of weight · form."""
+    total: Form = {}
+    for weight, form in terms:
+        _add(total, weight, form)
+    return total
+
+
+def _standing(system: ClosedSystem, exact: Sequence[LinearSite], number: _Numbering) -> Iterator[Form]:
+    """Yield the equations of a constant solution, each a form that must vanish."""
+    sent = [_standing_sends(site, number, g) for g, site in enumerate(exact)]
+    for g, site in enumerate(exact):
+        x, u = _standing_inputs(site, number, g)
+        for row_a, row_b in zip(site.a, site.b, strict=True):
+            yield _combine([*zip(row_a, x, strict=True), *zip(row_b, u, strict=True)])
+        for p, (tick, partition) in enumerate(zip(site.ticks, site.kind.clocks, strict=True)):
+            y = [{number.outputs[g][p] + o: Fraction(1)} for o in range(len(partition.outputs))]
+            m = [y[o] for o in partition.memories]
+            r = []
+            for receive in partition.receives:
+                weights = system.coupling.get((receive.operator, receive.link))
+                channel = _channel(site, receive.link, receive.channel)
+                r.append(
+                    _combine(
+                        (weight, sent[h].get((receive.link, channel), {}))
+                        for h, weight in enumerate(weights[g] if weights else ())
+                    )
+                )
+            for o in range(len(partition.outputs)):
+                terms = [*zip(tick.x[o], x, strict=True), *zip(tick.u[o], u, strict=True)]
+                terms += [*zip(tick.m[o], m, strict=True), *zip(tick.r[o], r, strict=True)]
+                yield _combine([*terms, (-1, y[o])])
+
+
+def _standing_inputs(site: LinearSite, number: _Numbering, g: int) -> tuple[list[Form], list[Form]]:
+    """Return x and u of a site as forms in the unknowns of the standing solution."""
+    partition_of = {partition.clock: p for p, partition in enumerate(site.kind.clocks)}
+    x: list[Form] = [{number.states[g] + i: Fraction(1)} for i in range(len(site.kind.states))]
+    u: list[Form] = [
+        {number.outputs[g][partition_of[hold.clock]] + hold.output: Fraction(1)} for hold in site.kind.holds
+    ]
+    return x, u
+
+
+def _standing_sends(site: LinearSite, number: _Numbering, g: int) -> dict[tuple[str, str], Form]:
+    """Return what a site sends in the standing solution, by link and channel."""
+    x, u = _standing_inputs(site, number, g)
+    return {
+        (sending.link, channel): _combine([*zip(send.x[c], x, strict=True), *zip(send.u[c], u, strict=True)])
+        for send, sending in zip(site.sends, site.kind.sends, strict=True)
+        for c, channel in enumerate(sending.channels)
+    }
+
+
+def _channel(site: LinearSite, link: str, channel: int) -> str:
+    """Return the name of a channel, by its row in the site's own send partition."""
+    return next(sending.channels[channel] for sending in site.kind.sends if sending.link == link)
+
+
+def _standing_state(
+    system: ClosedSystem, exact: Sequence[LinearSite], number: _Numbering, solution: Sequence[Fraction]
+) -> list[Fraction]:
+    """Return the closed system's state that belongs to a standing solution."""
+    state: list[Fraction] = []
+    for g, group in enumerate(system.sites):
+        start = number.states[g]
+        state += solution[start : start + len(group.jacobians.kind.states)]
+        state += [solution[number.outputs[g][v.partition] + v.output] for v in group.schedule.carried]
+        sends = _standing_sends(exact[g], number, g)
+        for packet in system.packets:
+            if packet.site == g:
+                one = group.schedule.sent[packet.row]
+                state.append(_value(sends[one.link, one.channel], solution))
+    return state
+
+
+def _value(form: Form, solution: Sequence[Fraction]) -> Fraction:
+    """Return the value of a form at a solution."""
+    return sum((weight * solution[index] for index, weight in form.items()), Fraction(0))
+
+
+def _drifts(
+    system: ClosedSystem,
+    exact: Sequence[LinearSite],
+    number: _Numbering,
+    still: Sequence[Sequence[Fraction]],
+) -> list[list[Fraction]]:
+    """Return the states at t = 0 of the ramps x(t) = x₁ + t x₀, x₀ a combination of the standing solutions.
+
+    The unknowns are the weights of the standing solutions in x₀, every site's x₁ and every value its clocks
+    compute in a frame; a frame later a value has grown by the frame's length times its standing value.
+    """
+    frame = system.sites[0].schedule.frame_s
+    size = len(still)
+    starts: list[int] = []
+    values: list[dict[tuple[int, int, int], int]] = []
+    for group in system.sites:
+        kind = group.jacobians.kind
+        starts.append(size)
+        size += len(kind.states)
+        numbered = {}
+        for p, partition in enumerate(kind.clocks):
+            for o in range(len(partition.outputs)):
+                for index in range(group.schedule.ticks[p]):
+                    numbered[p, o, index] = size
+                    size += 1
+        values.append(numbered)
+
+    def slope(unknown: int) -> Form:
+        return {weight: solution[unknown] for weight, solution in enumerate(still) if solution[unknown]}
+
+    def slope_of(form: Form) -> Form:
+        return _combine((weight, slope(unknown)) for unknown, weight in form.items())
+
+    def value(g: int, one: Value | None) -> Form:
+        ticks = system.sites[g].schedule.ticks[one.partition] if one else 0
+        if one is None or not ticks:
+            return {}
+        frames, index = divmod(one.index, ticks)
+        grown = slope(number.outputs[g][one.partition] + one.output)
+        return _combine(
+            [(1, {values[g][one.partition, one.output, index]: Fraction(1)}), (frames * frame, grown)]
+        )
+
+    def moving(g: int, time: Fraction) -> list[Form]:
+        n_x = len(system.sites[g].jacobians.kind.states)
+        return [
+            _combine([(1, {starts[g] + i: Fraction(1)}), (time, slope(number.states[g] + i))])
+            for i in range(n_x)
+        ]
+
+    # First everything that is sent, as a form; then what is computed and moved, as equations.
+    sent: list[dict[int, Form]] = []
+    sent_slopes: list[dict[int, Form]] = []
+    for g, (site, group) in enumerate(zip(exact, system.sites, strict=True)):
+        forms: dict[int, Form] = {}
+        for event, time, acting in _walk(group):
+            if isinstance(event, Send):
+                send = site.sends[event.partition]
+                inputs = [*moving(g, time), *(value(g, one) for one in acting)]
+                for channel, row in event.rows:
+                    forms[row] = _combine(zip([*send.x[channel], *send.u[channel]], inputs, strict=True))
+        standing = _standing_sends(site, number, g)
+        sent.append(forms)
+        sent_slopes.append(
+            {row: slope_of(standing[one.link, one.channel]) for row, one in enumerate(group.schedule.sent)}
+        )
+
+    equations: list[Form] = []
+    for g, (site, group) in enumerate(zip(exact, system.sites, strict=True)):
+        for event, time, acting in _walk(group):
+            x, u = moving(g, time), [value(g, one) for one in acting]
+            if isinstance(event, Propagate):
+                for i, (row_a, row_b) in enumerate(zip(site.a, site.b, strict=True)):
+                    rate = slope(number.states[g] + i)
+                    # The velocity of the ramp is what the equations give at both ends of the interval.
+                    for at in (x, moving(g, time + event.duration * group.schedule.quantum)):
+                        terms = [*zip(row_a, at, strict=True), *zip(row_b, u, strict=True), (-1, rate)]
+                        equations.append(_combine(terms))
+            elif isinstance(event, Tick):
+                tick, partition = site.ticks[event.partition], site.kind.clocks[event.partition]
+                m = [value(g, Value(event.partition, o, event.index - 1)) for o in partition.memories]
+                r = [_heard(system, g, place, sent, sent_slopes, frame) for place in event.heard]
+                for o in range(len(partition.outputs)):
+                    row = [*tick.x[o], *tick.u[o], *tick.m[o], *tick.r[o]]
+                    terms = list(zip(row, [*x, *u, *m, *r], strict=True))
+                    own = value(g, Value(event.partition, o, event.index))
+                    equations.append(_combine([*terms, (-1, own)]))
+
+    solutions = _null_space(equations, size, split=len(still), known=len(still))
+    states = []
+    for solution in solutions:
+        state: list[Fraction] = []
+        for g, group in enumerate(system.sites):
+            state += solution[starts[g] : starts[g] + len(group.jacobians.kind.states)]
+            state += [_value(value(g, one), solution) for one in group.schedule.carried]
+            for packet in system.packets:
+                if packet.site == g:
+                    before = (-packet.lag * frame, sent_slopes[g][packet.row])
+                    state.append(_value(_combine([(1, sent[g][packet.row]), before]), solution))
+        states.append(state)
+    return states
+
+
+def _walk(group: PeerGroup) -> Iterator[tuple[Any, Fraction, tuple[Value | None, ...]]]:
+    """Yield each event of a frame with its time in seconds and what every hold puts out just before it."""
+    schedule = group.schedule
+    acting = list(schedule.acting)
+    now = 0
+    for event in schedule.events:
+        yield event, now * schedule.quantum, tuple(acting)
+        if isinstance(event, Propagate):
+            now += event.duration
+        elif isinstance(event, Act):
+            acting[event.hold] = event.value
+
+
+def _heard(
+    system: ClosedSystem,
+    g: int,
+    place: int,
+    sent: Sequence[Mapping[int, Form]],
+    slopes: Sequence[Mapping[int, Form]],
+    frame: Fraction,
+) -> Form:
+    """Return what site g hears, each packet as it was when it was sent."""
+    if place < 0:
+        return {}
+    one = system.sites[g].schedule.heard[place]
+    total: Form = {}
+    for h, weight in enumerate(system.coupling[one.operator, one.sent.link][g]):
+        if weight:
+            row = system.sites[h].schedule.sent.index(one.sent)
+            _add(total, weight, sent[h][row])
+            _add(total, -weight * one.lag * frame, slopes[h][row])
+    return total
+
+
+def _null_space(equations: Sequence[Form], size: int, *, split: int, known: int) -> list[list[Fraction]]:
+    """Return a basis of the solutions of homogeneous equations that do not vanish on the first `split` unknowns.
+
+    The number of vectors is the dimension of the solutions' part in these unknowns, and their parts there
+    are independent. `known` solutions that vanish there are known to exist.
+
+    Notes
+    -----
+    Reduced with the unknowns in reverse order, each pivot is bound by unknowns before it; a free unknown
+    among the first `split` then stands for one vector, and the later free ones vanish on these.
+    """
+    rows = [form for form in equations if any(form.values())]
+    if not size or (rows and _surely_none(rows, size, known)):
+        return []
+    matrix = flint.fmpq_mat(max(len(rows), 1), size)
+    for line, form in enumerate(rows):
+        for index, weight in form.items():
+            exact = Fraction(weight)
+            matrix[line, size - 1 - index] = flint.fmpq(exact.numerator, exact.denominator)
+    reduced, rank = matrix.rref()
+    pivots = []
+    column = 0
+    for line in range(rank):
+        while reduced[line, column] == 0:
+            column += 1
+        pivots.append(column)
+    taken = set(pivots)
+    basis = []
+    for unknown in range(split):
+        column = size - 1 - unknown
+        if column in taken:
+            continue
+        vector = [Fraction(0)] * size
+        vector[unknown] = Fraction(1)
+        for line, pivot in enumerate(pivots):
+            entry = reduced[line, column]
+            vector[size - 1 - pivot] = Fraction(-int(entry.p), int(entry.q))
+        basis.append(vector)
+    return basis
+
+
+def _surely_none(rows: Sequence[Form], size: int, known: int) -> bool:
+    """Say whether a look modulo a prime already shows no more than `known` solutions; False proves nothing.
+
+    Independent whole-number solutions, freed of common factors, stay independent modulo a prime: there are at
+    least as many solutions modulo the prime as over the rationals.
+    """
+    matrix = flint.nmod_mat(len(rows), size, QUICK_PRIME)
+    for line, form in enumerate(rows):
+        for index, weight in form.items():
+            exact = Fraction(weight)
+            if exact.denominator % QUICK_PRIME == 0:
+                return False
+            scaled = exact.numerator * pow(exact.denominator, -1, QUICK_PRIME)
+            matrix[line, index] = scaled % QUICK_PRIME
+    return bool(size - matrix.rank() <= known)
+
+
+def _independent(vectors: Sequence[Sequence[Fraction]]) -> list[int]:
+    """Return the places of the vectors that are no combination of those before them."""
+    if not vectors or not vectors[0]:
+        return []
+    matrix = flint.fmpq_mat(
+        [
+            [flint.fmpq(entry.numerator, entry.denominator) for entry in row]
+            for row in zip(*vectors, strict=True)
+        ]
+    )
+    reduced, rank = matrix.rref()
+    return [next(c for c in range(len(vectors)) if reduced[line, c] != 0) for line in range(rank)]
+
+
+def _columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
+    """Return exact vectors as the columns of a float matrix (n, len(vectors))."""
+    return (
+        np.array([[float(entry) for entry in vector] for vector in vectors], dtype=np.float64)
+        .reshape(-1, n)
+        .T
+    )

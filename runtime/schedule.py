@@ -1,0 +1,454 @@
+"""What happens in one frame, in what order, and what must be remembered from frame to frame.
+
+Takes: a `CompiledSystem`, its timings as exact rationals, the structural patterns of its kinds.
+Gives: `Schedule` and its events, `build_schedules`, `ORDER`.
+Guarantees: exact time (integers of one quantum); the state at the start of a frame is what is demanded
+and nothing else: a hold that acts at once adds none, a link adds a sender's packets that are still to be heard.
+Does not: look at numbers other than times.
+
+Every value a clock computes is one symbol, `Value(partition, output, index)`: what output `output` was at the
+tick `index`, counted from the frame's first tick of that clock; a negative index is an earlier frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
+from apc.runtime.linearize import LinearSite
+
+# The order of coincident events. Continuous variables are continuous, so sampling needs no place in it.
+ORDER = ("send", "deliver", "tick", "act")
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Value:
+    """Output `output` of clock partition `partition` as computed at tick `index` of the frame."""
+
+    partition: int
+    output: int
+    index: int
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Sent:
+    """A channel of a link as sent at the link clock's tick `slot` of a frame."""
+
+    link: str
+    channel: str
+    slot: int
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Heard:
+    """What a site hears: `operator` over the other peers' `sent`, of `lag` frames ago (0: this frame)."""
+
+    operator: str
+    sent: Sent
+    lag: int
+
+
+@dataclass(frozen=True, slots=True)
+class Propagate:
+    """Nothing happens for `duration` quanta."""
+
+    duration: int
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """The site's send partition `partition` sends; `rows` are (channel, row of s) pairs."""
+
+    partition: int
+    rows: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Clock partition `partition` computes for the `index`-th time; `heard` are rows of r, -1 for one not read."""
+
+    partition: int
+    index: int
+    heard: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Act:
+    """Hold `hold` switches to `value`."""
+
+    hold: int
+    value: Value
+
+
+Event = Propagate | Send | Tick | Act
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """One frame of one kind of site.
+
+    `acting` is what each hold puts out as the frame begins (None for a hold nobody reads); `carried` are the
+    values of earlier frames that this one needs, the remembered part of z after the continuous states; `heard`
+    names r; `sent` names s and `depths` says how many frames each row of s must be kept; `ticks` counts a clock
+    partition's ticks in a frame; `marks` are the instants, in quanta, of the fastest clock's ticks and the end.
+    """
+
+    quantum: Fraction
+    frame: int
+    events: tuple[Event, ...]
+    acting: tuple[Value | None, ...]
+    carried: tuple[Value, ...]
+    heard: tuple[Heard, ...]
+    sent: tuple[Sent, ...]
+    depths: tuple[int, ...]
+    ticks: tuple[int, ...]
+    marks: tuple[int, ...]
+    value_names: tuple[str, ...]
+    sent_names: tuple[str, ...]
+    sent_times: tuple[int, ...]  # in quanta from the frame's start
+
+    @property
+    def frame_s(self) -> Fraction:
+        """The length of the frame in seconds."""
+        return self.frame * self.quantum
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """A clock in quanta: ticks at phase + k*period for every integer k, 0 <= phase < period."""
+
+    phase: int
+    period: int
+
+    def at(self, index: int) -> int:
+        return self.phase + index * self.period
+
+    def newest(self, limit: int, *, strictly: bool = False) -> int:
+        """Return the index of the last tick at or (strictly) before `limit`."""
+        index = (limit - self.phase) // self.period
+        return index - 1 if strictly and self.at(index) == limit else index
+
+
+@dataclass(frozen=True, slots=True)
+class _Times:
+    """Every time of the system in quanta."""
+
+    quantum: Fraction
+    frame: int
+    clocks: Mapping[str, _Grid]
+    delays: Mapping[str, int]
+
+
+def build_schedules(
+    system: CompiledSystem,
+    timings: Mapping[str, Fraction],
+    patterns: Sequence[LinearSite],
+    *,
+    order: Sequence[str] = ORDER,
+) -> tuple[Schedule, ...]:
+    """Build the schedule of every kind, over the frame they share.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    timings
+        Seconds by the name of the timing.
+    patterns
+        The structural pattern of each kind (`SiteJacobians.pattern`).
+    order
+        The order of coincident events, a permutation of `ORDER`. With "act" before "tick", a value that acts at
+        once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and "tick"
+        before "deliver" for a packet that arrives exactly at a tick.
+    """
+    assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
+    rank = {name: place for place, name in enumerate(order)}
+    live = [_live_outputs(pattern) for pattern in patterns]
+    read = [_live_receives(pattern, outputs) for pattern, outputs in zip(patterns, live, strict=True)]
+    times = _times(system, timings, patterns, live, read)
+
+    heard = [
+        _heard_at_ticks(pattern.kind, system, outputs, receives, times, rank)
+        for pattern, outputs, receives in zip(patterns, live, read, strict=True)
+    ]
+    depth: dict[Sent, int] = {}
+    for by_tick in heard:
+        for row in by_tick.values():
+            for one in row:
+                if one is not None:
+                    depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
+    return tuple(
+        _build(pattern, system, outputs, by_tick, depth, times, rank)
+        for pattern, outputs, by_tick in zip(patterns, live, heard, strict=True)
+    )
+
+
+def _live_outputs(pattern: LinearSite) -> frozenset[tuple[int, int]]:
+    """Return the (partition, output) pairs that can reach the motion or the network."""
+    kind = pattern.kind
+    clocks = {partition.clock: index for index, partition in enumerate(kind.clocks)}
+    live: set[tuple[int, int]] = set()
+    holds = {h for h in range(len(kind.holds)) if pattern.b[:, h].any()}
+    holds |= {h for send in pattern.sends for h in range(len(kind.holds)) if send.u[:, h].any()}
+    size = -1
+    while size != len(live) + len(holds):
+        size = len(live) + len(holds)
+        live |= {(clocks[kind.holds[h].clock], kind.holds[h].output) for h in holds}
+        for partition, output in tuple(live):
+            tick = pattern.ticks[partition]
+            memories = kind.clocks[partition].memories
+            live |= {(partition, memories[m]) for m in tick.m[output].nonzero()[0]}
+            holds |= set(tick.u[output].nonzero()[0].tolist())
+    return frozenset(live)
+
+
+def _live_holds(pattern: LinearSite, live: frozenset[tuple[int, int]]) -> tuple[bool, ...]:
+    """Say of each hold whether anybody reads it."""
+    return tuple(
+        bool(
+            pattern.b[:, h].any()
+            or any(send.u[:, h].any() for send in pattern.sends)
+            or any(pattern.ticks[partition].u[output, h] for partition, output in live)
+        )
+        for h in range(len(pattern.kind.holds))
+    )
+
+
+def _live_receives(pattern: LinearSite, live: frozenset[tuple[int, int]]) -> frozenset[tuple[int, int]]:
+    """Return the (partition, receive) pairs that a live output reads."""
+    return frozenset(
+        (partition, int(row))
+        for partition, output in live
+        for row in pattern.ticks[partition].r[output].nonzero()[0]
+    )
+
+
+def _times(
+    system: CompiledSystem,
+    timings: Mapping[str, Fraction],
+    patterns: Sequence[LinearSite],
+    live: Sequence[frozenset[tuple[int, int]]],
+    read: Sequence[frozenset[tuple[int, int]]],
+) -> _Times:
+    """Find the quantum of which every period, phase and delay in use is a multiple, and the frame."""
+    clock_of = {clock.name: clock for clock in system.clocks}
+    link_of = {link.name: link for link in system.links}
+    clocks: dict[str, Clock] = {}
+    delays: dict[str, Fraction] = {}
+    for pattern, outputs, receives in zip(patterns, live, read, strict=True):
+        for partition, _ in outputs:
+            name = pattern.kind.clocks[partition].clock
+            clocks[name] = clock_of[name]
+        for hold, used in zip(pattern.kind.holds, _live_holds(pattern, outputs), strict=True):
+            if used:
+                delays[hold.delay] = timings[hold.delay]
+        for partition, row in receives:
+            link = link_of[pattern.kind.clocks[partition].receives[row].link]
+            clocks[link.clock] = clock_of[link.clock]
+            delays[link.delay] = timings[link.delay]
+    if not clocks:  # nothing is sampled: any frame will do
+        clocks = dict(clock_of) or {"": Clock("", "", "")}
+    period = {name: timings[clock.period] if name else Fraction(1) for name, clock in clocks.items()}
+    phase = {
+        name: timings[clock.phase] % period[name] if name else Fraction(0) for name, clock in clocks.items()
+    }
+    quantum = _common_divisor([*period.values(), *phase.values(), *delays.values()])
+    count = {name: int(value / quantum) for name, value in period.items()}
+    return _Times(
+        quantum=quantum,
+        frame=math.lcm(*count.values()),
+        clocks={name: _Grid(int(phase[name] / quantum), count[name]) for name in clocks},
+        delays={name: int(value / quantum) for name, value in delays.items()},
+    )
+
+
+def _common_divisor(times: Iterable[Fraction]) -> Fraction:
+    """Return the largest rational of which every time is a whole multiple."""
+    listed = list(times)
+    denominator = math.lcm(*(time.denominator for time in listed))
+    return Fraction(math.gcd(*(int(time * denominator) for time in listed)), denominator)
+
+
+def _heard_at_ticks(
+    kind: Kind,
+    system: CompiledSystem,
+    live: frozenset[tuple[int, int]],
+    read: frozenset[tuple[int, int]],
+    times: _Times,
+    rank: Mapping[str, int],
+) -> dict[tuple[int, int], tuple[Heard | None, ...]]:
+    """Return, for every (partition, tick) of the frame, what each receive of the partition hears."""
+    link_of = {link.name: link for link in system.links}
+    channels = {sending.link: sending.channels for sending in kind.sends}
+    heard: dict[tuple[int, int], tuple[Heard | None, ...]] = {}
+    for p in sorted({partition for partition, _ in live}):
+        partition = kind.clocks[p]
+        grid = times.clocks[partition.clock]
+        for index in range(times.frame // grid.period):
+            row: list[Heard | None] = []
+            for place, receive in enumerate(partition.receives):
+                if (p, place) not in read:
+                    row.append(None)
+                    continue
+                number = _newest_packet(link_of[receive.link], grid.at(index), times, rank)
+                slots = times.frame // times.clocks[link_of[receive.link].clock].period
+                frames, slot = divmod(number, slots)
+                sent = Sent(receive.link, channels[receive.link][receive.channel], slot)
+                row.append(Heard(receive.operator, sent, -frames))
+            heard[p, index] = tuple(row)
+    return heard
+
+
+def _newest_packet(link: Link, instant: int, times: _Times, rank: Mapping[str, int]) -> int:
+    """Return the number of the newest packet delivered before a tick at `instant`; negative: earlier frames."""
+    delay = times.delays[link.delay]
+    missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0
+    number = times.clocks[link.clock].newest(instant - delay, strictly=rank["tick"] < rank["deliver"])
+    return number - missed
+
+
+def _build(
+    pattern: LinearSite,
+    system: CompiledSystem,
+    live: frozenset[tuple[int, int]],
+    heard_at: Mapping[tuple[int, int], tuple[Heard | None, ...]],
+    depth: Mapping[Sent, int],
+    times: _Times,
+    rank: Mapping[str, int],
+) -> Schedule:
+    """Build one kind's schedule, once it is known what the whole system hears."""
+    kind, frame = pattern.kind, times.frame
+    partition_of = {partition.clock: index for index, partition in enumerate(kind.clocks)}
+    grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
+    holds = _live_holds(pattern, live)
+    heard = tuple(sorted({one for row in heard_at.values() for one in row if one is not None}))
+    place_of = {one: index for index, one in enumerate(heard)}
+    channels = {sending.link: sending.channels for sending in kind.sends}
+    sent = tuple(sorted(one for one in depth if one.channel in channels.get(one.link, ())))
+
+    # Everything that happens, as (instant, rank, event); propagation fills the gaps.
+    happenings: list[tuple[int, int, Event | None]] = []
+    for (p, index), row in heard_at.items():
+        places = tuple(-1 if one is None else place_of[one] for one in row)
+        instant = times.clocks[kind.clocks[p].clock].at(index)
+        happenings.append((instant, rank["tick"], Tick(p, index, places)))
+    for p, sending in enumerate(kind.sends):
+        grid = grid_of[sending.link]
+        for slot in range(frame // grid.period if grid else 0):
+            rows = tuple(
+                (sending.channels.index(one.channel), place)
+                for place, one in enumerate(sent)
+                if one.link == sending.link and one.slot == slot
+            )
+            if rows:
+                assert grid is not None
+                happenings.append((grid.at(slot), rank["send"], Send(p, rows)))
+    acting: list[Value | None] = []
+    for h, hold in enumerate(kind.holds):
+        if not holds[h]:
+            acting.append(None)
+            continue
+        grid, delay, p = times.clocks[hold.clock], times.delays[hold.delay], partition_of[hold.clock]
+        missed = 1 if delay == 0 and rank["act"] < rank["tick"] else 0
+        first = grid.newest(-delay, strictly=True)  # switched before the frame begins
+        acting.append(Value(p, hold.output, first - missed))
+        for index in range(first + 1, grid.newest(frame - delay, strictly=True) + 1):
+            switch = Act(h, Value(p, hold.output, index - missed))
+            happenings.append((grid.at(index) + delay, rank["act"], switch))
+    fastest = min(times.clocks.values(), key=lambda grid: grid.period)
+    marks = sorted({0, frame} | {fastest.at(i) for i in range(frame // fastest.period)})
+    happenings += [(mark, 0, None) for mark in marks]  # so that propagation stops there
+    happenings.sort(key=lambda item: item[:2])
+
+    events: list[Event] = []
+    now = 0
+    for instant, _, event in happenings:
+        if instant > now:
+            events.append(Propagate(instant - now))
+            now = instant
+        if event is not None:
+            events.append(event)
+
+    ticks = tuple(
+        frame // times.clocks[partition.clock].period if partition.clock in times.clocks else 0
+        for partition in kind.clocks
+    )
+    carried = _carried(pattern, live, events, acting, ticks)
+    grids = [times.clocks.get(partition.clock) for partition in kind.clocks]
+    return Schedule(
+        quantum=times.quantum,
+        frame=frame,
+        events=tuple(events),
+        acting=tuple(acting),
+        carried=carried,
+        heard=heard,
+        sent=sent,
+        depths=tuple(depth[one] for one in sent),
+        ticks=ticks,
+        marks=tuple(marks),
+        value_names=tuple(
+            _at_time(
+                kind.clocks[value.partition].outputs[value.output],
+                grids[value.partition].at(value.index) * times.quantum,  # type: ignore[union-attr] # it ticks
+            )
+            for value in carried
+        ),
+        sent_names=tuple(f"{one.channel} sent" for one in sent),
+        sent_times=tuple(_slot_time(one, grid_of) for one in sent),
+    )
+
+
+def _slot_time(sent: Sent, grid_of: Mapping[str, _Grid | None]) -> int:
+    """Return when a slot is sent, in quanta from the frame's start."""
+    grid = grid_of[sent.link]
+    assert grid is not None
+    return grid.at(sent.slot)
+
+
+def _carried(
+    pattern: LinearSite,
+    live: frozenset[tuple[int, int]],
+    events: Sequence[Event],
+    acting: Sequence[Value | None],
+    ticks: Sequence[int],
+) -> tuple[Value, ...]:
+    """Return the values of earlier frames that this frame reads, and those still to be read later.
+
+    A value read at index -j is, one frame on, the value of index n - j; if that is negative too, it is
+    carried as well.
+    """
+    kind = pattern.kind
+    now = list(acting)
+    demanded: set[Value] = set()
+
+    def read(row: Iterable[int]) -> None:
+        demanded.update(value for h in row if (value := now[h]) is not None)
+
+    for event in events:
+        match event:
+            case Act(hold, value):
+                now[hold] = value
+            case Propagate():
+                read(pattern.b.any(axis=0).nonzero()[0].tolist())
+            case Send(partition, rows):
+                for channel, _ in rows:
+                    read(pattern.sends[partition].u[channel].nonzero()[0].tolist())
+            case Tick(partition, index, _):
+                for output in (o for p, o in live if p == partition):
+                    read(pattern.ticks[partition].u[output].nonzero()[0].tolist())
+                    for m in pattern.ticks[partition].m[output].nonzero()[0]:
+                        demanded.add(Value(partition, kind.clocks[partition].memories[m], index - 1))
+    carried: set[Value] = set()
+    for value in demanded:
+        while value.index < 0:
+            carried.add(value)
+            value = Value(value.partition, value.output, value.index + ticks[value.partition])
+    return tuple(sorted(carried))
+
+
+def _at_time(name: str, seconds: Fraction) -> str:
+    """Return `name(-1 ms)`: a value as it was at a time before the frame."""
+    return f"{name}({float(seconds * 1000):.6g} ms)"

@@ -1,0 +1,337 @@
+"""Eigenvalues with error bounds, and the verdict.
+
+Takes: the `ClosedSystem`s that make up a whole.
+Gives: `Mode`, `Spectrum`, `solve_spectrum`.
+Guarantees: rigid modes are removed before any eigenvalue is computed; every reported error bounds what rounding
+did since the site's coefficients, and a verdict nearer to the boundary than its error says so.
+Does not: raise the precision (an undecided verdict is left undecided).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from apc.runtime.lift import UNIT
+from apc.runtime.modes import ClosedSystem
+from apc.runtime.rigid import RigidModes, find_rigid_modes
+from numpy.typing import NDArray
+from scipy.linalg import matrix_balance, schur, solve_sylvester
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+STABLE = "stable"
+STABLE_TRANSLATING = "stable up to a common translation"
+DRIFTS = "drifts"
+UNSTABLE = "unstable"
+UNDECIDED = "undecided: |ρ−1| below the error bound"
+
+# A mode that shrinks to less than this in a frame is one that ends in finite time, computed in floats.
+DEADBEAT = 1e-12
+
+# Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
+# cluster at zero, the queues running empty; they are bounded together, so that they spoil no other's bound.
+SMALL = 1e-2
+
+# Backward error of LAPACK's reduction to Schur form and of the few orthogonal products here, in units of
+# n·UNIT·‖matrix‖_F: 'a modest constant' (LAPACK Users' Guide, 3rd ed., section 4.8); measured below 1.
+SCHUR_ROUNDINGS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One eigenvalue of the whole system's frame map, held `multiplicity` times.
+
+    `magnitude` is per frame; `error` bounds |eigenvalue − truth|. `frequency_hz` and `damping_ratio` belong to
+    s = log(eigenvalue)/frame on the branch the motion takes inside the frame. `shape` is the system the
+    mode belongs to. `participation` shares the mode out among the states (the shares add up to 1).
+    """
+
+    eigenvalue: complex
+    magnitude: float
+    multiplicity: int
+    frequency_hz: float
+    damping_ratio: float
+    shape: str
+    participation: tuple[tuple[str, float], ...]
+    error: float
+
+
+@dataclass(frozen=True, slots=True)
+class Spectrum:
+    """All modes but the rigid ones, the largest first, and what follows from them.
+
+    `spectral_radius` is per frame; `stable` is None when the verdict is undecided.
+    """
+
+    modes: tuple[Mode, ...]
+    spectral_radius: float
+    spectral_radius_error: float
+    rigid_modes: int
+    drifts: int
+    verdict: str
+    stable: bool | None
+
+
+def solve_spectrum(systems: Sequence[ClosedSystem]) -> Spectrum:
+    """Compute the spectrum of a whole system given as independent closed systems.
+
+    Parameters
+    ----------
+    systems
+        The closed systems, each counted as often as its multiplicity says.
+
+    Notes
+    -----
+    A drift leaves a second eigenvalue 1 behind when only the rigid direction is removed. So when every error
+    disc keeps clear of 1 there is none, and the exact search for one is spared.
+    """
+    found: list[Mode] = []
+    rigid = drifts = 0
+    low = high = 0.0
+    for system in systems:
+        free = find_rigid_modes(system, with_drifts=False)
+        modes, least, most = _solve(system, free)
+        if free.names and not all(abs(mode.eigenvalue - 1) > mode.error for mode in modes):
+            free = find_rigid_modes(system)
+            if free.drifts:
+                modes, least, most = _solve(system, free)
+        found += modes
+        low, high = max(low, least), max(high, most)
+        rigid += system.multiplicity * free.directions.shape[1]
+        drifts += system.multiplicity * free.drifts
+    found.sort(key=lambda mode: (-mode.magnitude, mode.shape, mode.eigenvalue.real, mode.eigenvalue.imag))
+    radius = found[0].magnitude if found else 0.0
+    error = max(high - radius, radius - low, 0.0)
+    verdict, stable = _judge(radius, error, rigid, drifts)
+    return Spectrum(tuple(found), radius, error, rigid, drifts, verdict, stable)
+
+
+def _judge(radius: float, error: float, rigid: int, drifts: int) -> tuple[str, bool | None]:
+    """Return the verdict and whether it means stable; one NaN decides nothing."""
+    if radius - error > 1:
+        return UNSTABLE, False
+    if not radius + error < 1:
+        return UNDECIDED, None
+    if drifts:
+        return DRIFTS, False
+    return (STABLE_TRANSLATING if rigid else STABLE), True
+
+
+def _solve(system: ClosedSystem, free: RigidModes) -> tuple[list[Mode], float, float]:
+    """Return the modes of one system and bounds from below and above on its spectral radius."""
+    n = len(system.names)
+    # Balancing scales by powers of two: it changes no digit.
+    _, (scale, _) = matrix_balance(system.matrix, permute=False, separate=True)
+    matrix = system.matrix / scale[:, None] * scale
+    error = system.error / scale[:, None] * scale
+    count = free.basis.shape[1]
+    if count == n:
+        return [], 0.0, 0.0
+    # Q = [Q1 Q2], Q1 spanning the rigid motions: Qᵀ M Q = [J C; 0 H], and H holds all the others.
+    basis, _ = np.linalg.qr(free.basis / scale[:, None], mode="complete")
+    rigid, rest = basis[:, :count], basis[:, count:]
+    reduced = rest.T @ matrix @ rest
+    reduced_error = np.abs(rest.T) @ error @ np.abs(rest)
+    reduced_error += SCHUR_ROUNDINGS * n * UNIT * float(np.linalg.norm(matrix))
+
+    values, right, left, errors, low, high = _eigen(reduced, reduced_error)
+    # Back to the whole state: the right vectors get their rigid part, the left ones have none.
+    corner, coupling = rigid.T @ matrix @ rigid, rigid.T @ matrix @ rest
+    modes = []
+    for value, x, y, bound in zip(values, right.T, left, errors, strict=True):
+        whole = rest @ x
+        if count:
+            whole = (
+                whole + rigid @ np.linalg.lstsq(value * np.eye(count) - corner, coupling @ x, rcond=None)[0]
+            )
+        shares = np.abs(whole * (rest @ y))
+        total = shares.sum()
+        shares = shares / total if total > 0 else np.abs(whole) / np.abs(whole).sum()
+        modes.append(_mode(system, complex(value), whole * scale, shares, float(bound)))
+    return modes, low, high
+
+
+def _mode(system: ClosedSystem, value: complex, vector: Complexes, shares: Floats, error: float) -> Mode:
+    """Describe one eigenvalue by its vector over the state and its states' shares."""
+    magnitude = abs(value)
+    if magnitude <= max(DEADBEAT * len(system.names), min(error, SMALL)):
+        frequency, damping = 0.0, 1.0
+    else:
+        angle = _angle(system, value, vector, shares)
+        rate = complex(np.log(magnitude), angle) / system.frame_s
+        frequency = abs(rate.imag) / (2 * np.pi)
+        damping = -rate.real / abs(rate) if rate else 1.0
+    return Mode(
+        eigenvalue=value,
+        magnitude=magnitude,
+        multiplicity=system.multiplicity,
+        frequency_hz=float(frequency),
+        damping_ratio=float(damping),
+        shape=system.name,
+        participation=tuple(zip(system.names, (float(share) for share in shares), strict=True)),
+        error=error,
+    )
+
+
+def _angle(system: ClosedSystem, value: complex, vector: Complexes, shares: Floats) -> float:
+    """Return by how much the mode turns in a frame, in radians, whole turns counted.
+
+    The eigenvalue knows the angle up to whole turns; these are counted on the continuous state that takes
+    most part, from tick to tick of the fastest clock. A real vector has no angle but its sign: each change
+    of sign is half a turn.
+    """
+    principal = float(np.angle(value))
+    if not system.motion:
+        return principal
+    dominant = int(np.argmax(shares[list(system.motion)]))
+    course = system.inside[:, dominant] @ vector
+    if not np.all(np.abs(course) > 0):
+        return principal
+    turned = float(np.sum(np.angle(course[1:] / course[:-1])))
+    return principal + 2 * np.pi * round((turned - principal) / (2 * np.pi))
+
+
+def _eigen(matrix: Floats, error: Floats) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
+    """Compute eigenvalues, right vectors (columns), left vectors (rows), error bounds, and the radius's bounds.
+
+    Notes
+    -----
+    Schur form with the small eigenvalues last, T = [T₁ R; 0 T₂]; a Sylvester equation frees T₁ of R, and the
+    eigenvectors V of T₁ diagonalize it. With X the transformation and E the error of the matrix,
+    X⁻¹(M + E)X = diag(Λ, T₂) + G, |G| ≤ |X⁻¹| (|residual| + |E| |X|). Every eigenvalue then lies in one of
+    the discs of Gershgorin about Λ, of radius Σ_j |G_ij|, or within Elsner's distance of those of T₂ (Horn and
+    Johnson, Matrix Analysis, 6.1 and 6.4; Feingold and Varga 1962 for the blocks). Discs that touch
+    hold together as many eigenvalues as there are; each is then off by at most the reach of the whole cluster.
+    Where the eigenvectors fail (a defective matrix), Elsner's bound holds for the matrix as a whole:
+    |λ − λ̂| ≤ (‖M‖ + ‖M + E‖)^(1−1/n) ‖E‖^(1/n) (Stewart and Sun, Matrix Perturbation Theory, IV.1.3).
+    """
+    n = len(matrix)
+    triangle, unitary, large = schur(matrix, output="complex", sort=lambda z: abs(z) >= SMALL)
+    values = np.diag(triangle).copy()
+    upper, lower = triangle[:large, :large], triangle[large:, large:]
+    right = np.zeros((n, n), dtype=np.complex128)
+    right[large:, large:] = np.eye(n - large)
+    if large:
+        right[:large, :large] = _triangular_vectors(upper)
+        if large < n:
+            right[:large, large:] = solve_sylvester(upper, -lower, -triangle[:large, large:])
+    whole = unitary @ right
+    whole /= np.linalg.norm(whole, axis=0)
+    spread = float(np.linalg.norm(error))
+    elsner = _elsner(float(np.linalg.norm(matrix)), spread, n)
+    centres, radii = values, np.full(n, elsner)
+    try:
+        inverse = np.linalg.inv(whole)
+    except np.linalg.LinAlgError:
+        inverse = np.full((n, n), np.nan, dtype=np.complex128)
+    # The diagonal form as it came out, and all that it leaves: rounding of the products included.
+    form = np.zeros((n, n), dtype=np.complex128)
+    form[:large, :large] = np.diag(values[:large])
+    form[large:, large:] = lower * (1 + 0j)
+    if large < n and np.all(np.isfinite(inverse)):
+        tail = whole[:, large:]
+        form[large:, large:] = inverse[large:] @ (matrix @ tail)
+    # NaN compares false below, and the bound for the whole matrix stays.
+    doubt = np.abs(matrix @ whole - whole @ form)
+    doubt += 4 * (n + 2) * UNIT * (np.abs(matrix) @ np.abs(whole) + np.abs(whole) @ np.abs(form))
+    weight = np.abs(inverse)
+    # The computed inverse is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
+    defect = float(
+        np.max(np.sum(np.abs(np.eye(n) - inverse @ whole) + 4 * n * UNIT * weight @ np.abs(whole), axis=1))
+    )
+    if defect < 0.5:
+        rest = np.sum(weight @ (doubt + error @ np.abs(whole)), axis=1)
+        # A row of (I − F)⁻¹ Z: its own, and at most defect/(1 − defect) of the largest of the others.
+        rest = rest + defect / (1 - defect) * float(rest.max())
+        discs = rest.copy()
+        if large < n:
+            block = form[large:, large:]
+            size = float(np.linalg.norm(block))
+            height = float(np.linalg.norm(rest[large:])) + SCHUR_ROUNDINGS * n * UNIT * size
+            small_values = np.linalg.eigvals(block)
+            centres = np.concatenate([values[:large], small_values])
+            discs[large:] = _elsner(size, height, n - large)
+        if np.all(np.isfinite(discs)):
+            gershgorin = discs
+            if _reach(centres, gershgorin) <= _reach(values, radii):
+                radii = gershgorin
+            else:
+                centres = values
+    low, high, errors = _clusters(centres, radii)
+    # A real matrix: an eigenvalue alone in a disc across the real axis has no conjugate, so it is real.
+    alone = errors == radii
+    centres = np.where(alone & (np.abs(centres.imag) <= radii), centres.real + 0j, centres)
+    vectors, duals = _plain_vectors(matrix, whole, inverse, centres, large)
+    return centres, vectors, duals, errors, low, high
+
+
+def _triangular_vectors(triangle: Complexes) -> Complexes:
+    """Return the eigenvectors of a triangular matrix as columns, in the order of its diagonal.
+
+    A repeated diagonal entry is moved by a rounding, so that a defective matrix gives vectors that are nearly
+    parallel instead of a division by zero; what that costs shows in the residual.
+    """
+    n = len(triangle)
+    tiny = max(UNIT * float(np.linalg.norm(triangle)), np.finfo(np.float64).tiny)
+    vectors = np.eye(n, dtype=np.complex128)
+    for k in range(n):
+        for i in range(k - 1, -1, -1):
+            gap = triangle[k, k] - triangle[i, i]
+            if abs(gap) < tiny:
+                gap = complex(tiny)
+            vectors[i, k] = triangle[i, i + 1 : k + 1] @ vectors[i + 1 : k + 1, k] / gap
+        vectors[:, k] /= np.linalg.norm(vectors[:, k])
+    return vectors
+
+
+def _elsner(norm: float, error: float, n: int) -> float:
+    """Return Elsner's bound for a matrix of the given norm, moved by at most `error`."""
+    return float((2 * norm + error) ** (1 - 1 / n) * error ** (1 / n)) if n else 0.0
+
+
+def _reach(centres: Complexes, radii: Floats) -> float:
+    """Return the largest magnitude in the discs."""
+    return float(np.max(np.abs(centres) + radii, initial=0.0))
+
+
+def _clusters(centres: Complexes, radii: Floats) -> tuple[float, float, Floats]:
+    """Return bounds on the spectral radius and, for each centre, how far its eigenvalue can be.
+
+    k discs that hang together hold k eigenvalues, nobody knows which in which: each centre is then off by at
+    most the distance to the far side of any of them.
+    """
+    n = len(centres)
+    distance = np.abs(centres[:, None] - centres[None, :])
+    touching = distance <= radii[:, None] + radii[None, :]
+    cluster = np.arange(n)
+    for _ in range(n):
+        spread = np.array([cluster[touching[i]].min() for i in range(n)])
+        if np.array_equal(spread, cluster):
+            break
+        cluster = spread
+    errors = np.array([np.max(np.where(cluster == cluster[i], distance[i] + radii, 0.0)) for i in range(n)])
+    lows = [float(np.min(np.abs(centres[cluster == c]) - radii[cluster == c])) for c in np.unique(cluster)]
+    return max(0.0, *lows), _reach(centres, radii), errors
+
+
+def _plain_vectors(
+    matrix: Floats, whole: Complexes, inverse: Complexes, centres: Complexes, large: int
+) -> tuple[Complexes, Complexes]:
+    """Return right vectors (columns) and left vectors (rows) in the order of the centres.
+
+    The large ones are columns of X and rows of its inverse. Of a small or defective one the vectors are
+    singular vectors of M − λ: some vector that is right to rounding, where no full set exists.
+    """
+    n = len(matrix)
+    sound = bool(np.all(np.isfinite(inverse)))
+    right, left = np.zeros((n, n), dtype=np.complex128), np.zeros((n, n), dtype=np.complex128)
+    for i in range(n):
+        if i < large and sound:
+            right[:, i], left[i] = whole[:, i], inverse[i]
+        else:
+            rows, _, columns = np.linalg.svd(matrix - centres[i] * np.eye(n))
+            right[:, i], left[i] = columns[-1].conj(), rows[:, -1].conj()
+    return right, left

@@ -1,0 +1,170 @@
+"""N full peers, event by event, by hand: the check on everything in the runtime, and none of its code.
+
+The scene is the one of `sites.paper`: point masses under zero-order-held forces, in closed form. The matrix of
+one frame comes column by column, each the frame that starts from one unit vector. Numbers are floats or
+mpmath's (`frame_matrix(…, number=mpmath.mpf)`, at the working precision set by the caller) or anything with
+arithmetic and an `exp`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything about the scene, times in exact seconds; `users` overrides values a user."""
+
+    operator: str = "mean"
+    peers: int = 3
+    kt: float = 500.0
+    bt: float = 0.0
+    kc: float = 1000.0
+    bc: float = 0.0
+    cube: float = 0.2
+    cube_damping: float = 5.0
+    device: float = 0.1
+    device_damping: float = 5.0
+    comp: Fraction = Fraction(1, 1000)
+    comm: Fraction = Fraction(8, 1000)
+    own_delay: bool = False
+    haptic: Fraction = Fraction(1, 1000)
+    network: Fraction = Fraction(8, 1000)
+    haptic_phase: Fraction = Fraction(0)
+    network_phase: Fraction = Fraction(0)
+    users: tuple[dict[str, float], ...] = field(default=())
+
+
+def frame_matrix(
+    scene: Scene, *, number: Callable[[Any], Any] = float, exp: Any = math.exp
+) -> list[list[Any]]:
+    """Return the one-frame matrix of all peers, as rows.
+
+    The state is every peer's (x, v, x_O, v_O), then its last computed forces, newest first, then its last
+    packets, newest first: as many as any delay can ask for, so some entries may matter to nobody.
+    """
+    frame = _frame(scene.haptic, scene.network)
+    force_depth = math.ceil(scene.comp / scene.haptic) + 1
+    packet_depth = math.ceil(scene.comm / scene.network) + 1
+    n = scene.peers * (4 + 3 * force_depth + 2 * packet_depth)
+    columns = []
+    for column in range(n):
+        state = [number(1 if row == column else 0) for row in range(n)]
+        columns.append(_one_frame(scene, state, frame, force_depth, packet_depth, number, exp))
+    return [[columns[c][r] for c in range(n)] for r in range(n)]
+
+
+def _frame(one: Fraction, other: Fraction) -> Fraction:
+    """Return the least common multiple of two periods."""
+    return Fraction(
+        math.lcm(one.numerator * other.denominator, other.numerator * one.denominator),
+        one.denominator * other.denominator,
+    )
+
+
+def _one_frame(
+    scene: Scene,
+    state: Sequence[Any],
+    frame: Fraction,
+    force_depth: int,
+    packet_depth: int,
+    number: Callable[[Any], Any],
+    exp: Any,
+) -> list[Any]:
+    """Propagate all peers through one frame."""
+    size = 4 + 3 * force_depth + 2 * packet_depth
+    parts = [list(state[i * size : (i + 1) * size]) for i in range(scene.peers)]
+    value = [
+        {
+            name: number(user.get(name, getattr(scene, name)))
+            for name in ("kt", "bt", "kc", "bc", "cube", "cube_damping", "device", "device_damping")
+        }
+        for user in (scene.users or ({},) * scene.peers)
+    ]
+    haptic_0, network_0 = scene.haptic_phase % scene.haptic, scene.network_phase % scene.network
+    motion = [part[:4] for part in parts]
+    # forces[i] is a list of (time computed, contact, own part, heard part); packets likewise (time, x, v).
+    forces, packets = [], []
+    for part in parts:
+        forces.append(
+            [(haptic_0 - (k + 1) * scene.haptic, *part[4 + 3 * k : 7 + 3 * k]) for k in range(force_depth)]
+        )
+        at = 4 + 3 * force_depth
+        packets.append(
+            [
+                (network_0 - (k + 1) * scene.network, *part[at + 2 * k : at + 2 * k + 2])
+                for k in range(packet_depth)
+            ]
+        )
+    instants = {Fraction(0), frame}
+    for start, period, delay in (
+        (haptic_0, scene.haptic, scene.comp),
+        (haptic_0, scene.haptic, Fraction(0)),
+        (network_0, scene.network, Fraction(0)),
+    ):
+        first = -math.ceil(delay / period) - 1
+        instants |= {start + k * period + delay for k in range(first, math.ceil(frame / period) + 1)}
+    times = sorted(time for time in instants if 0 <= time <= frame)
+
+    def newest(listed: Sequence[tuple[Any, ...]], now: Fraction, delay: Fraction) -> tuple[Any, ...]:
+        return max((one for one in listed if one[0] + delay <= now), key=lambda one: one[0])
+
+    for now, following in zip(times, times[1:], strict=False):
+        if (now - network_0) % scene.network == 0:
+            for i in range(scene.peers):
+                packets[i].append((now, motion[i][2], motion[i][3]))
+        if (now - haptic_0) % scene.haptic == 0:
+            arrived = [newest(listed, now, scene.comm) for listed in packets]
+            for i, (x, v, x_o, v_o) in enumerate(motion):
+                p = value[i]
+                heard = [arrived[j] for j in range(scene.peers) if j != i]
+                others = number(len(heard))
+                share = others if scene.operator == "mean" else number(1)
+                weight = number(1) if scene.operator == "mean" else others
+                position = sum((one[1] for one in heard), number(0)) / share
+                velocity = sum((one[2] for one in heard), number(0)) / share
+                forces[i].append(
+                    (
+                        now,
+                        p["kc"] * (x - x_o) + p["bc"] * (v - v_o),
+                        weight * (p["kt"] * x_o + p["bt"] * v_o),
+                        -p["kt"] * position - p["bt"] * velocity,
+                    )
+                )
+        duration = following - now
+        for i in range(scene.peers):
+            p = value[i]
+            delayed = newest(forces[i], now, scene.comp)
+            at_once = newest(forces[i], now, Fraction(0))
+            pull = delayed[2] + (at_once if scene.own_delay else delayed)[3]
+            x, v, x_o, v_o = motion[i]
+            x, v = _coast(x, v, -delayed[1], p["device"], p["device_damping"], duration, number, exp)
+            x_o, v_o = _coast(
+                x_o, v_o, delayed[1] - pull, p["cube"], p["cube_damping"], duration, number, exp
+            )
+            motion[i] = [x, v, x_o, v_o]
+
+    result: list[Any] = []
+    for i in range(scene.peers):
+        result += motion[i]
+        for one in sorted(forces[i], key=lambda one: one[0], reverse=True)[:force_depth]:
+            result += one[1:]
+        for one in sorted(packets[i], key=lambda one: one[0], reverse=True)[:packet_depth]:
+            result += one[1:]
+    return result
+
+
+def _coast(
+    x: Any, v: Any, force: Any, mass: Any, damping: Any, duration: Fraction, number: Any, exp: Any
+) -> tuple[Any, Any]:
+    """Move a damped point mass under a constant force: m dv/dt = F − b v."""
+    t = number(duration.numerator) / number(duration.denominator)
+    if damping == 0:
+        return x + t * v + t * t / (number(2) * mass) * force, v + t / mass * force
+    decay = exp(-damping * t / mass)
+    rise = (number(1) - decay) / damping  # ∫₀ᵗ e^(−b s/m)/m ds
+    return x + mass * rise * v + (t - mass * rise) / damping * force, decay * v + rise * force

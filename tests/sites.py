@@ -1,0 +1,171 @@
+"""Compiled systems written by hand: the scene of Rakhsha and Constantinescu, as the compiler would give it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import casadi
+from apc.compiler.compiled import (
+    Clock,
+    ClockPartition,
+    CompiledSystem,
+    Group,
+    Hold,
+    Kind,
+    Link,
+    Origin,
+    Parameter,
+    Receive,
+    SendPartition,
+    State,
+    Timing,
+)
+
+NAMES = (
+    "device.mass",
+    "device.damping",
+    "cube.mass",
+    "cube.damping",
+    "contact.stiffness",
+    "contact.damping",
+    "coordination.stiffness",
+    "coordination.damping",
+    "hand.force",
+    "device.x.start",
+    "cube.x.start",
+    "zero",
+    "peers",
+)
+UNITS = ("kg", "N*s/m", "kg", "N*s/m", "N/m", "N*s/m", "N/m", "N*s/m", "N", "m", "m", "1", "1")
+STATES = (
+    State("device.x", "m", "device.x.start"),
+    State("device.v", "m/s", "zero"),
+    State("cube.x", "m", "cube.x.start"),
+    State("cube.v", "m/s", "zero"),
+)
+MS = Fraction(1, 1000)
+
+
+def user(operator: str = "mean", *, own_delay: bool = False) -> Kind:
+    """Build the kind of one user: device, its cube copy, contact between them, coordination to the others.
+
+    F_C = K_C (x − x_O) + B_C (v − v_O) acts on the cube, −F_C on the device. F_T pulls the cube back:
+    K_T (x_O − mean of the others) for "mean", K_T ((peers − 1) x_O − sum of the others) for "sum"; the same
+    with B_T and velocities. With `own_delay` the two parts of F_T are held apart, the heard one at once.
+    """
+    x, p, t = casadi.SX.sym("x", 4), casadi.SX.sym("p", len(NAMES)), casadi.SX.sym("t")
+    r, m = casadi.SX.sym("r", 2), casadi.SX.sym("m", 0)
+    named = dict(zip(NAMES, casadi.vertsplit(p), strict=True))
+    u = casadi.SX.sym("u", 3 if own_delay else 2)
+    own_weight = 1 if operator == "mean" else named["peers"] - 1
+    k_t, b_t = named["coordination.stiffness"], named["coordination.damping"]
+    contact = named["contact.stiffness"] * (x[0] - x[2]) + named["contact.damping"] * (x[1] - x[3])
+    own = k_t * own_weight * x[2] + b_t * own_weight * x[3]
+    heard = -k_t * r[0] - b_t * r[1]
+
+    pull = u[1] + u[2] if own_delay else u[1]
+    derivative = casadi.vertcat(
+        x[1],
+        (named["hand.force"] - u[0] - named["device.damping"] * x[1]) / named["device.mass"],
+        x[3],
+        (u[0] - pull - named["cube.damping"] * x[3]) / named["cube.mass"],
+    )
+    outputs = casadi.vertcat(contact, own, heard) if own_delay else casadi.vertcat(contact, own + heard)
+    names = (
+        ("contact.f", "coordination.own", "coordination.heard")
+        if own_delay
+        else ("contact.f", "coordination.f")
+    )
+    delays = ("contact.delay", "coordination.delay", "none")
+    return Kind(
+        name="user",
+        states=STATES,
+        holds=tuple(Hold(name, "haptic", row, delays[row]) for row, name in enumerate(names)),
+        parameters=NAMES,
+        derivative=casadi.Function("derivative", [x, u, p, t], [derivative]),
+        clocks=(
+            ClockPartition(
+                clock="haptic",
+                outputs=names,
+                memories=(),
+                starts=(),
+                receives=(
+                    Receive("coordination.others.x", operator, "lan", 0),
+                    Receive("coordination.others.v", operator, "lan", 1),
+                ),
+                tick=casadi.Function("tick", [x, u, m, r, p, t], [outputs]),
+            ),
+        ),
+        sends=(
+            SendPartition(
+                link="lan",
+                channels=("coordination.x", "coordination.v"),
+                units=("m", "m/s"),
+                send=casadi.Function("send", [x, u, p, t], [x[2:4]]),
+            ),
+        ),
+    )
+
+
+def paper(
+    operator: str = "mean",
+    *,
+    peers: int = 3,
+    kt: float = 500.0,
+    bt: float = 0.0,
+    kc: float = 1000.0,
+    bc: float = 0.0,
+    cube: float = 0.2,
+    comp: Fraction = MS,
+    comm: Fraction = 8 * MS,
+    own_delay: bool = False,
+    haptic: Fraction = MS,
+    network: Fraction = 8 * MS,
+    haptic_phase: Fraction = Fraction(0),
+    network_phase: Fraction = Fraction(0),
+) -> CompiledSystem:
+    """Build the paper's system for equal users; `cube` is the mass of one copy."""
+    values = (0.1, 5.0, cube, 5.0, kc, bc, kt, bt, 0.0, 0.0, 0.0, 0.0, float(peers))
+    minima = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, None, None, None, None, None)
+    return CompiledSystem(
+        name="paper",
+        about="Users move a shared cube.",
+        clocks=(
+            Clock("haptic", "haptic.period", "haptic.phase"),
+            Clock("network", "network.period", "network.phase"),
+        ),
+        links=(Link("lan", "network", "lan.delay", "complete"),),
+        timings=(
+            Timing("haptic.period", haptic),
+            Timing("haptic.phase", haptic_phase),
+            Timing("network.period", network),
+            Timing("network.phase", network_phase),
+            Timing("contact.delay", comp),
+            Timing("coordination.delay", comp),
+            Timing("lan.delay", comm),
+            Timing("none", Fraction(0)),
+        ),
+        parameters=tuple(
+            Parameter(name, unit, value, minimum=minimum, open_minimum=name.endswith(".mass"))
+            for name, unit, value, minimum in zip(NAMES, UNITS, values, minima, strict=True)
+        ),
+        kinds=(user(operator, own_delay=own_delay),),
+        groups=(Group("user", peers, 0),),
+        dropped=(),
+        origin=Origin("paper.yaml", ()),
+    )
+
+
+def grouped(system: CompiledSystem, *groups: tuple[str, int, dict[str, float]]) -> CompiledSystem:
+    """Return the system with other groups: (name, count, parameter values of its own)."""
+    of_name = {parameter.name: parameter for parameter in system.parameters}
+    total = float(sum(count for _, count, _ in groups))
+    return replace(
+        system,
+        parameters=tuple(replace(p, value=total) if p.name == "peers" else p for p in system.parameters),
+        groups=tuple(
+            Group(name, count, 0, tuple(replace(of_name[key], value=value) for key, value in own.items()))
+            for name, count, own in groups
+        ),
+    )
