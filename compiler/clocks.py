@@ -20,6 +20,7 @@ first packet arrives a receiver holds the sender's start values; before the firs
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 from apc.compiler.errors import Mistakes
 from apc.compiler.expression import (
@@ -204,7 +205,8 @@ class _Partitioner:
         self.mistakes.add(
             "E505",
             equation.place,
-            f"in `{equation.text}` of {equation.origin}, {name} is {_domain(its)} and the rest is {_domain(others)}",
+            f"in `{equation.text}` of {equation.origin}, "
+            f"{name} is {_domain(its)} and the rest is {_domain(others)}",
             hint=hint,
         )
 
@@ -254,7 +256,7 @@ class _Partitioner:
         def replace(node: Expr) -> Expr | None:
             if not (isinstance(node, Call) and node.function == "hold"):
                 return None
-            delay = node.arguments[1] if len(node.arguments) == 2 else Number(0)
+            delay = node.arguments[1] if len(node.arguments) == 2 else Number(Fraction(0))
             argument = node.arguments[0]
             if isinstance(argument, Name) and ".".join(argument.parts) in self.variables:
                 return Call("hold", (argument, delay))

@@ -176,7 +176,7 @@ KEYWORDS = frozenset(("if", "then", "elseif", "else", "and", "or", "not"))
 
 
 def parse_expression(text: str, place: Place) -> Expr:
-    """Return the tree of an expression.
+    """Return the tree of an expression that is a number; a condition stands inside an `if` only.
 
     Parameters
     ----------

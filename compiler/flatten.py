@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.expression import (
@@ -265,4 +266,4 @@ def _connections(parts: list[Part], mistakes: Mistakes) -> Iterator[FlatEquation
             total: Expr = Name((*members[0], variable.name))
             for member in members[1:]:
                 total = Binary("+", total, Name((*member, variable.name)))
-            yield FlatEquation(total, Number(0), "connection", None, place)
+            yield FlatEquation(total, Number(Fraction(0)), "connection", None, place)

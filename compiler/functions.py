@@ -15,11 +15,11 @@ from typing import Any
 
 import casadi
 import sympy
-
+from apc.compiler.clocks import HoldCrossing
 from apc.compiler.compiled import (
     PEERS,
-    ClockPartition,
     Clock,
+    ClockPartition,
     CompiledSystem,
     Group,
     Hold,
@@ -32,7 +32,6 @@ from apc.compiler.compiled import (
     State,
     Timing,
 )
-from apc.compiler.clocks import HoldCrossing
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.expression import Expr, Name, Number, evaluate, format_expression
 from apc.compiler.library import Number as NumberParameter
@@ -440,7 +439,10 @@ class _Writer:
         return _Writer({**self.known, **known}, {**self.definitions, **definitions})
 
     def write(self, wanted: sympy.Symbol) -> casadi.SX:
-        """Return the value of a symbol, writing what it depends on first; a stack, so that depth is no limit."""
+        """Return the value of a symbol, writing what it depends on first.
+
+        A stack instead of recursion, so that the length of a chain of definitions is no limit.
+        """
         work = [wanted]
         while work:
             s = work[-1]
@@ -452,7 +454,8 @@ class _Writer:
                 work += missing
             else:
                 self.known[s] = self._build(self.definitions[s])
-        return self.known[wanted]
+        value: casadi.SX = self.known[wanted]
+        return value
 
     def translate(self, expression: sympy.Expr) -> casadi.SX:
         """Return the value of an expression."""
@@ -462,7 +465,8 @@ class _Writer:
 
     def _build(self, expression: sympy.Expr) -> casadi.SX:
         if expression.is_Symbol:
-            return self.known[expression]
+            known: casadi.SX = self.known[expression]
+            return known
         if expression.is_Number:
             return casadi.SX(float(expression))
         if expression.is_Mul:
@@ -472,7 +476,8 @@ class _Writer:
             return _fold(arguments, operator.add)
         if expression.is_Pow:
             return _power(arguments[0], expression.exp, arguments[1])
-        return _CASADI[expression.func.__name__](*arguments)
+        value: casadi.SX = _CASADI[expression.func.__name__](*arguments)
+        return value
 
     def _product(self, expression: sympy.Expr) -> casadi.SX:
         """Return a product, dividing by its factors of negative power: a/b rounds once, a*b**-1 twice."""

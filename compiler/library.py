@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from apc.compiler.dimensions import check_equation, dimension_of
-from apc.compiler.errors import ApcError, Mistakes, Place, nearest
+from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
+from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.expression import (
     Call,
     Compare,
@@ -43,12 +43,20 @@ from apc.compiler.reading import (
     read_name,
     read_text,
 )
-from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source, parse_source, read_source
+from apc.compiler.source import (
+    Mapping,
+    Node,
+    Scalar,
+    Sequence,
+    Source,
+    parse_source,
+    place_in,
+    read_source,
+)
 from apc.compiler.units import DIMENSIONLESS, Dimension, Unit, parse_quantity, parse_unit, quantity
 
 REFERENCES = ("clock", "link")
 RESERVED = frozenset({"peers", "others", "time", "ground", "type", "at", "shared", "count"})
-SECOND = Dimension((("s", 1),))
 _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
 
@@ -195,6 +203,11 @@ class Library:
         return tuple(sorted(self._files))
 
     @property
+    def component_names(self) -> tuple[str, ...]:
+        """The names of the components among them."""
+        return tuple(name for name in self.names if _is_definition(self._source(name), "component"))
+
+    @property
     def texts(self) -> tuple[tuple[str, str], ...]:
         """The name and SHA-256 of each text handed out so far."""
         return tuple(sorted(self._texts.items()))
@@ -258,7 +271,7 @@ def read_connector(source: Source) -> Connector:
     root = read_mapping(source.root, "a connector definition", mistakes)
     mistakes.raise_if_any()
     assert root is not None
-    check_keys(root, ("connector", "about", "source", "potentials", "flows"), "a connector", mistakes)
+    root = check_keys(root, ("connector", "about", "source", "potentials", "flows"), "a connector", mistakes)
     potentials = _variables(root.get("potentials"), mistakes)
     flows = _variables(root.get("flows"), mistakes)
     name = read_text(root.get("connector"), "connector", mistakes) or ""
@@ -285,7 +298,7 @@ def read_component(source: Source, library: Library) -> Component:
     root = read_mapping(source.root, "a component definition", mistakes)
     mistakes.raise_if_any()
     assert root is not None
-    check_keys(root, COMPONENT_KEYS, "a component", mistakes)
+    root = check_keys(root, COMPONENT_KEYS, "a component", mistakes)
     title = root.get("component")
     name = read_name(title, "a component", mistakes) if isinstance(title, Scalar) else None
     connectors = _connectors(root.get("connectors"), library, mistakes)
@@ -347,7 +360,7 @@ class _Scope:
         found = []
         for name, expression, text, place in self.sends:
             dimension = self._dimension(expression, text, place, mistakes)
-            found.append(Send(name, expression, text, place, dimension or DIMENSIONLESS))
+            found.append(Send(name, expression, text, place, _known(dimension)))
         return tuple(found)
 
     def infer_locals(self, mistakes: Mistakes) -> tuple[tuple[str, Dimension], ...]:
@@ -361,7 +374,7 @@ class _Scope:
                 # An unknown name on the right is reported once, by `check`; a local may still be undecided.
                 dimension = self._dimension(equation.right, equation.text, equation.place, Mistakes())
                 self.dimensions[left.parts] = dimension
-                found.append((left.parts[0], dimension or DIMENSIONLESS))
+                found.append((left.parts[0], _known(dimension)))
         return tuple(found)
 
     def check(self, mistakes: Mistakes) -> None:
@@ -370,7 +383,7 @@ class _Scope:
             unknown = False
             left, right = self._decided(equation.left), self._decided(equation.right)
             for side in (left, right):
-                unknown |= self._check_names(side, equation.place, mistakes)
+                unknown |= self._check_names(side, equation.text, equation.place, mistakes)
             if not unknown:
                 try:
                     check_equation(
@@ -394,7 +407,7 @@ class _Scope:
 
     def _dimension(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> Dimension | None:
         expression = self._decided(expression)
-        if self._check_names(expression, place, mistakes):
+        if self._check_names(expression, text, place, mistakes):
             return None
         try:
             return dimension_of(expression, lambda name: self.dimensions.get(name.parts), text, place)
@@ -402,7 +415,7 @@ class _Scope:
             mistakes.take(error)
             return None
 
-    def _check_names(self, expression: Expr, place: Place, mistakes: Mistakes) -> bool:
+    def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
         wrong = False
         for node in walk(expression):
             if isinstance(node, Name) and node.parts not in self.dimensions:
@@ -410,8 +423,13 @@ class _Scope:
                 shown = ".".join(node.parts)
                 known = sorted(".".join(parts) for parts in self.dimensions)
                 what = f"{self.component.name} has no {brief(shown)}"
-                add_unknown("E303", place.shifted(node.start), what, shown, known, mistakes)
+                add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)
         return wrong
+
+
+def _known(dimension: Dimension | None) -> Dimension:
+    """Return a dimension that was inferred; what fits every dimension, such as 0, has none."""
+    return DIMENSIONLESS if dimension in (None, ANY) else dimension
 
 
 def option_test(node: Expr, options: dict[str, Option]) -> tuple[Option, str] | None:
@@ -529,7 +547,7 @@ def _variables(node: Node | None, mistakes: Mistakes) -> tuple[Variable, ...]:
         body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{unit: m}}")
         if name is None or body is None:
             continue
-        check_keys(body, ("unit", "start", "about"), f"variable {name}", mistakes)
+        body = check_keys(body, ("unit", "start", "about"), f"variable {name}", mistakes)
         unit = _unit(body, name, mistakes)
         start = _declared(body.get("start"), name, unit, mistakes)
         about = read_text(body.get("about"), "about", mistakes) or ""
@@ -577,7 +595,7 @@ def _reference(name: str, value: Scalar, mistakes: Mistakes) -> Reference | None
 
 
 def _option(name: str, body: Mapping, mistakes: Mistakes) -> Option | None:
-    check_keys(body, ("options", "default", "about"), f"parameter {name}", mistakes)
+    body = check_keys(body, ("options", "default", "about"), f"parameter {name}", mistakes)
     options = body.get("options")
     assert isinstance(options, Sequence)
     words = tuple(item.text for item in options.items if isinstance(item, Scalar))
@@ -592,7 +610,7 @@ def _option(name: str, body: Mapping, mistakes: Mistakes) -> Option | None:
 
 def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
     keys = ("unit", "min", "above", "max", "default", "about", "shared", "options")
-    check_keys(body, keys, f"parameter {name}", mistakes)
+    body = check_keys(body, keys, f"parameter {name}", mistakes)
     unit = _unit(body, name, mistakes)
     shared = read_text(body.get("shared"), "shared", mistakes)
     node = body.get("shared")
@@ -660,9 +678,9 @@ def _declared(node: Node | None, name: str, unit: Unit | None, mistakes: Mistake
 
 def unknown_component(place: Place, name: str, library: Library, mistakes: Mistakes) -> None:
     """Record that no component has this name."""
-    close = nearest(name, library.names)
-    what = f"there is no component {brief(name)}"
-    add_unknown("E206", place, what, name, (close,) if close else library.names, mistakes)
+    add_unknown(
+        "E206", place, f"there is no component {brief(name)}", name, library.component_names, mistakes
+    )
 
 
 def numbers(component: Component) -> Iterator[Number]:

@@ -63,13 +63,22 @@ def read_name(node: Scalar, what: str, mistakes: Mistakes) -> str | None:
     return None
 
 
-def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: Mistakes) -> None:
-    """Record every key that isn't allowed, with the nearest allowed one."""
-    for key, _ in mapping.entries:
+def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: Mistakes) -> Mapping:
+    """Record every key that isn't allowed, with the nearest allowed one.
+
+    Returns the mapping as it was meant: a misspelt key reads as the one nearest to it, so that one slip is
+    not reported a second time as something missing.
+    """
+    meant: dict[str, tuple[Scalar, Node]] = {key.text: (key, node) for key, node in mapping.entries}
+    for key, node in mapping.entries:
         if key.text not in allowed:
             add_unknown(
                 "E202", key.place, f"{what} has no key {brief(key.text)}", key.text, allowed, mistakes
             )
+            close = nearest(key.text, allowed)
+            if close and close not in meant:
+                meant[close] = (Scalar(close, close, key.plain, key.place), node)
+    return Mapping(tuple(meant.values()), mapping.place)
 
 
 def add_unknown(

@@ -9,15 +9,14 @@ Does not: look into a component's equations.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.dimensions import dimension_of
+from apc.compiler.dimensions import ANY, SECOND, dimension_of
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.expression import Expr, Name, evaluate, parse_expression, walk
 from apc.compiler.library import (
-    SECOND,
     Component,
     Library,
     Number,
@@ -37,7 +36,7 @@ from apc.compiler.reading import (
     read_name,
     read_text,
 )
-from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source
+from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source, place_in
 from apc.compiler.units import DIMENSIONLESS, Dimension, format_dimension, format_si, parse_quantity, quantity
 
 SECTIONS = ("masses", "couplers", "links", "hands")
@@ -164,19 +163,21 @@ class _Reader:
         self.bodies: dict[str, tuple[str, Mapping, Component, Place]] = {}
         self.groups: dict[str, int] = {}
         self.faulty: set[str] = set()  # parts that are there but can't be read: reported once, there
+        self.missing: set[str] = set()  # sections that are named but not there: reported once
 
     def read(self) -> Scene | None:
         mistakes = self.mistakes
         root = read_mapping(self.source.root, "a topology", mistakes, hint="topology: my-scene")
         if root is None:
             return None
-        check_keys(root, KEYS, "a topology", mistakes)
+        root = check_keys(root, KEYS, "a topology", mistakes)
         name = self._required(root, "topology", "topology: my-scene")
         title = read_text(name, "topology", mistakes, hint="topology: my-scene") or ""
         about = read_text(root.get("about"), "about", mistakes) or ""
         peers = self._required(root, "peers", "peers: {user: {count: 3}}")
         group_bodies = self._read_counts(peers)
-        self._required(root, "masses", "masses: {device: {mass: 0.1 kg}}")
+        if self._required(root, "masses", "masses: {device: {mass: 0.1 kg}}") is None:
+            self.missing.add("masses")
         self._read_parameters(root.get("parameters"))
         self._read_clocks(root.get("clocks"))
         for section in SECTIONS:
@@ -234,25 +235,25 @@ class _Reader:
 
     def _expression(self, text: str, place: Place, what: str, dimension: Dimension, unit: str) -> Value:
         expression = parse_expression(text, place)
-        self._check_names(expression, place, what, unit)
+        self._check_names(expression, text, place, what)
         found = dimension_of(expression, self._dimension_of_name, text, place)
-        if found is not None and found != dimension and any(isinstance(n, Name) for n in walk(expression)):
+        if found not in (None, ANY, dimension) and any(isinstance(n, Name) for n in walk(expression)):
             hint = f"{what}: 1 {unit}"
             mistakes = Mistakes()
-            got = f"{brief(text)}, which is in {format_dimension(found)}"
+            got = f"{brief(text)}, which is in {format_dimension(found or dimension)}"
             mistakes.add("E204", place, what, expected=unit, got=got, hint=hint)
             mistakes.raise_if_any()
         number = evaluate(expression, self._number_of_name, place=place)
         return Value(Fraction(number), dimension, text, place)
 
-    def _check_names(self, expression: Expr, place: Place, what: str, unit: str) -> None:
+    def _check_names(self, expression: Expr, text: str, place: Place, what: str) -> None:
         mistakes = Mistakes()
         for node in walk(expression):
             if isinstance(node, Name) and node.parts[0] not in self.parameters and node.parts != ("peers",):
                 shown = ".".join(node.parts)
                 known = ("peers", *self.parameters)
-                text = f"{what} names {brief(shown)}, which is no parameter of this topology"
-                add_unknown("E206", place.shifted(node.start), text, shown, known, mistakes)
+                told = f"{what} names {brief(shown)}, which is no parameter of this topology"
+                add_unknown("E206", place_in(place, text, node.start), told, shown, known, mistakes)
         mistakes.raise_if_any()
 
     def _dimension_of_name(self, name: Name) -> Dimension | None:
@@ -292,7 +293,7 @@ class _Reader:
             body = read_mapping(value, key.text, self.mistakes, hint=f"{key.text}: {{count: 3}}")
             if name is None or body is None:
                 continue
-            check_keys(body, ("count", "set"), f"group {name}", self.mistakes)
+            body = check_keys(body, ("count", "set"), f"group {name}", self.mistakes)
             count = self._read_count(body, name)
             if count is not None:
                 self.groups[name] = count
@@ -362,10 +363,12 @@ class _Reader:
                 tree = trees.pop(name)
                 text, place = waiting[name]
                 try:
-                    self._check_names(tree, place, name, "")
+                    self._check_names(tree, text, place, name)
                     dimension = dimension_of(tree, self._dimension_of_name, text, place)
                     number = Fraction(evaluate(tree, self._number_of_name, place=place))
-                    self.parameters[name] = Value(number, dimension or DIMENSIONLESS, text, place)
+                    self.parameters[name] = Value(
+                        number, DIMENSIONLESS if dimension in (None, ANY) else dimension, text, place
+                    )
                 except ApcError as error:
                     self.mistakes.take(error)
 
@@ -381,12 +384,12 @@ class _Reader:
                 continue
             phase: Value | None = Value(Fraction(0), SECOND, None, value.place)
             if isinstance(value, Mapping):
-                check_keys(value, ("period", "phase"), f"clock {name}", self.mistakes)
-                period = self._time(value.get("period"), "period")
-                if value.get("period") is None:
-                    self.mistakes.add("E201", value.place, f"clock {name} has no period", hint="period: 1 ms")
-                if value.get("phase") is not None:
-                    phase = self._time(value.get("phase"), "phase")
+                body = check_keys(value, ("period", "phase"), f"clock {name}", self.mistakes)
+                period = self._time(body.get("period"), "period")
+                if body.get("period") is None:
+                    self.mistakes.add("E201", body.place, f"clock {name} has no period", hint="period: 1 ms")
+                if body.get("phase") is not None:
+                    phase = self._time(body.get("phase"), "phase")
             else:
                 period = self._time(value, name)
             if period is None or phase is None:
@@ -456,7 +459,7 @@ class _Reader:
         names = [p.name for p in component.parameters]
         variables = [v.name for v in component.variables if v.start is not None]
         allowed = ("type", "at", "shared", *connectors, *names, *variables)
-        check_keys(body, allowed, f"{name} ({component.name})", self.mistakes)
+        body = check_keys(body, allowed, f"{name} ({component.name})", self.mistakes)
         values: list[tuple[str, Value]] = []
         options: list[tuple[str, str]] = []
         references: list[tuple[str, str]] = []
@@ -581,18 +584,18 @@ class _Reader:
         if word is None or word in known:
             return word
         if root.get(section) is None:
-            example = f"{section}: {{{brief(word)}: " + (
-                "1 ms}" if section == "clocks" else "{clock: network}}"
-            )
-            self.mistakes.add("E201", root.place, f"the topology has no {section} section", hint=example)
-        elif not self._named_in(root.get(section), word):  # a faulty clock or link was reported there
+            if section not in self.missing:
+                self.missing.add(section)
+                example = "1 ms" if section == "clocks" else "{clock: network}"
+                self._required(root, section, f"{section}: {{{brief(word)}: {example}}}")
+        elif not self._may_be_in(root.get(section), word):  # a faulty clock or link was reported there
             what = f"{part} names {parameter.target} {brief(word)}, which isn't in {section}"
             add_unknown("E206", node.place, what, word, list(known), self.mistakes)
         return None
 
     @staticmethod
-    def _named_in(section: Node | None, word: str) -> bool:
-        return isinstance(section, Mapping) and section.get(word) is not None
+    def _may_be_in(section: Node | None, word: str) -> bool:
+        return not isinstance(section, Mapping) or section.get(word) is not None
 
     def _connection(
         self, part: str, connector: str, type_name: str, node: Node | None, section: str, place: Place
@@ -612,6 +615,8 @@ class _Reader:
         if other in self.faulty:
             return None
         if other not in self.bodies:
+            if "masses" in self.missing:
+                return None  # one missing section is one mistake
             what = f"{part} joins its {connector} to {brief(other)}, which is no part of this topology"
             add_unknown("E206", node.place, what, other, [n for n in self.bodies if n != part], self.mistakes)
             return None
@@ -709,7 +714,7 @@ class _Reader:
         section = read_mapping(node, "experiment", self.mistakes, hint="experiment: {duration: 3 s}")
         if section is None:
             return None, 0
-        check_keys(section, ("duration", "seed"), "experiment", self.mistakes)
+        section = check_keys(section, ("duration", "seed"), "experiment", self.mistakes)
         duration = self._time(section.get("duration"), "duration")
         if duration is not None and duration.number <= 0:
             self.mistakes.add(
@@ -729,11 +734,11 @@ class _Reader:
         section = read_mapping(node, "studies", self.mistakes)
         if section is None:
             return ()
-        check_keys(section, ("region",), "studies", self.mistakes)
+        section = check_keys(section, ("region",), "studies", self.mistakes)
         region = read_mapping(section.get("region"), "region", self.mistakes)
         if region is None:
             return ()
-        check_keys(region, ("x", "y"), "region", self.mistakes)
+        region = check_keys(region, ("x", "y"), "region", self.mistakes)
         return tuple(axis for key in ("x", "y") if (axis := self._axis(key, region.get(key))) is not None)
 
     def _axis(self, key: str, node: Node | None) -> Axis | None:
@@ -784,6 +789,3 @@ def _cycle(needs: dict[str, list[str]]) -> list[str]:
         path.append(name)
         name = needs[name][0]
     return [*path[path.index(name) :], name]
-
-
-Resolver = Callable[[tuple[str, ...]], Fraction]

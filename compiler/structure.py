@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import sympy
-
 from apc.compiler.clocks import (
     CONTINUOUS,
     ClockedKind,

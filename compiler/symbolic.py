@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import sympy
-
 from apc.compiler.expression import (
     Binary,
     Call,

@@ -452,9 +452,9 @@ class _UnitParser:
             return power
         # Only a root that is rational keeps the scale exact.
         root = Fraction(math.isqrt(power.numerator), math.isqrt(power.denominator))
-        if power == 1 or (exponent.denominator == 2 and root**2 == power):
-            return root
-        self.fail("a root whose scale is a rational number")
+        if power != 1 and (exponent.denominator != 2 or root**2 != power):
+            self.fail("a root whose scale is a rational number")
+        return root
 
     def check(self, scale: Fraction, dimension: Dimension) -> None:
         bits = max(scale.numerator.bit_length(), scale.denominator.bit_length())

@@ -2,8 +2,8 @@
 
 Takes: a `CompiledSystem`.
 Gives: `Analysis`, `analyze_modes`, `analyze_dense`; `Prepared`, `prepare` for many analyses of one system.
-Guarantees: the cost of `analyze_modes` grows with the number of different groups, not of peers; of equal input
-comes equal output.
+Guarantees: the cost of `analyze_modes` grows with the number of different groups, not of peers; of equal
+input comes equal output.
 Does not: read files, or draw.
 """
 

@@ -1,7 +1,7 @@
 """Walk a CasADi function's instructions over any kind of number.
 
-Takes: a CasADi SX Function and arguments that are rationals, intervals, long floats, anything with arithmetic.
-Gives: `evaluate_exact`.
+Takes: a CasADi SX Function and arguments that are rationals, intervals, long floats, anything with
+arithmetic. Gives: `evaluate_exact`.
 Guarantees: over `Fraction`, sums, products, quotients, whole powers, comparisons and constants are exact.
 Does not: evaluate MX functions; transcendental operations over `Fraction` are rounded to double precision.
 """

@@ -9,7 +9,8 @@ Does not: know who the others are (see `modes`).
     z⁺ = P z + Q r        z: continuous states, then the remembered values (`Schedule.carried`)
     s  = S z + D r        r: what the site hears (`Schedule.heard`), s: what it sends (`Schedule.sent`)
 
-D is what is sent after something was heard in the same frame: nilpotent, as nothing is heard before it is sent.
+D is what is sent after something was heard in the same frame: nilpotent, as nothing is heard before it is
+sent.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ UNIT = float(np.finfo(np.float64).eps) / 2  # the unit roundoff of double precis
 # short polynomials of the parameters, a few roundings an entry.
 COEFFICIENT_ROUNDINGS = 8
 
-# Rounding errors charged to an entry of a matrix exponential, per row of the matrix and per squaring, relative
-# to the same entry of the exponential of magnitudes. Higham, The Scaling and Squaring Method for the Matrix
-# Exponential Revisited (2005), sections 2 and 4: Padé degree at most 13, then one product a squaring.
+# Rounding errors charged to an entry of a matrix exponential, per row of the matrix and per squaring,
+# relative to the same entry of the exponential of magnitudes. Higham, The Scaling and Squaring Method for
+# the Matrix Exponential Revisited (2005), sections 2 and 4: Padé degree at most 13, then one product a
+# squaring.
 EXPONENTIAL_ROUNDINGS = 13
 
 

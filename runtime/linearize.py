@@ -118,7 +118,7 @@ def linearize(site: SiteJacobians, parameters: NDArray[np.float64]) -> LinearSit
 
 
 def linearize_exact(site: SiteJacobians, parameters: NDArray[np.float64]) -> LinearSite:
-    """Return the same matrices as exact rationals (object arrays of `Fraction`), the parameters as they are."""
+    """Return the same matrices in exact rationals, as object arrays of `Fraction`."""
     arguments = _start(site, [Fraction(float(value)) for value in parameters], Fraction)
     flat = np.array(evaluate_exact(site.function, arguments)[0], dtype=object)
     return _assemble(site.kind, site.affine, _cut(flat, site.shapes))

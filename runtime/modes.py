@@ -6,11 +6,12 @@ Guarantees: the systems of `modes`, each as often as its multiplicity says, have
 `dense`, whatever the number of peers; the cost grows with the number of different groups only.
 Does not: compute eigenvalues (see `spectrum`).
 
-On a complete graph a peer of group g hears r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and 1 for
-a sum. K groups of n_1 … n_K equal peers then split exactly:
+On a complete graph a peer of group g hears r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and 1
+for a sum. K groups of n_1 … n_K equal peers then split exactly:
 
     common        all peers of a group alike: r_g = c_g Σ_h (n_h − δ_gh) s_h        once
-    difference g  peers of group g apart, their sum zero, all else at rest: r_g = −c_g s_g        n_g − 1 times
+    difference g  peers of group g apart, their sum zero, all else at rest: r_g = −c_g s_g        n_g − 1
+    times
 """
 
 from __future__ import annotations
@@ -63,9 +64,10 @@ class ClosedSystem:
     """One autonomous system: state⁺ = `matrix` · state, once a frame.
 
     The state holds, site by site, z and then the packets on their way; `names` names it, `offsets` says
-    where each site's part starts, `packets` lists the packets in order of state (site by site). `error` bounds
-    the rounding error of the matrix entry by entry. `inside` holds all continuous states (site by site) at
-    the ticks of the fastest clock as rows over the state; `motion` says where these are in the state.
+    where each site's part starts, `packets` lists the packets in order of state (site by site). `error`
+    bounds the rounding error of the matrix entry by entry. `inside` holds all continuous states (site by
+    site) at the ticks of the fastest clock as rows over the state; `motion` says where these are in the
+    state.
     """
 
     name: str
@@ -311,7 +313,8 @@ def _closed(
 
 def _layout(sites: Sequence[PeerGroup], packets: Sequence[Packet]) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return where each site's part of the state starts, and the names of the state."""
-    offsets, names = [], []
+    offsets: list[int] = []
+    names: list[str] = []
     for h, group in enumerate(sites):
         offsets.append(len(names))
         schedule = group.schedule

@@ -37,7 +37,8 @@ class Override:
 class Numbers:
     """Everything a compiled system needs to become matrices.
 
-    `parameters` holds one vector (n_p,) a group, in the order of its kind's parameters; `timings` seconds by name.
+    `parameters` holds one vector (n_p,) a group, in the order of its kind's parameters; `timings` seconds by
+    name.
     """
 
     parameters: tuple[NDArray[np.float64], ...]
@@ -45,7 +46,7 @@ class Numbers:
 
 
 def parse_override(system: CompiledSystem, text: str, place: Place = _PLACE) -> Override:
-    """Read `NAME=QUANTITY`, the name as `part.parameter`, `GROUP.part.parameter` or with its section before it.
+    """Read `NAME=QUANTITY`; the name may start with a group, or with the section it stands in.
 
     Raises
     ------

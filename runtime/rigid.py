@@ -11,9 +11,9 @@ A rigid mode is a constant solution of the homogeneous equations,
 
     A x + B u = 0,   u = y,   y = X x + U u + M y + R r,   r = W s,   s = X x + U u,
 
-which makes an eigenvector of the frame's map with eigenvalue 1. A drift is a solution x(t) = x₁ + t x₀ with x₀
-such a constant: every value y computed at a tick and every packet s as it was at its own time of sending. It
-makes a generalized eigenvector, a Jordan pair.
+which makes an eigenvector of the frame's map with eigenvalue 1. A drift is a solution x(t) = x₁ + t x₀ with
+x₀ such a constant: every value y computed at a tick and every packet s as it was at its own time of sending.
+It makes a generalized eigenvector, a Jordan pair.
 """
 
 from __future__ import annotations
@@ -204,105 +204,134 @@ def _value(form: Form, solution: Sequence[Fraction]) -> Fraction:
     return sum((weight * solution[index] for index, weight in form.items()), Fraction(0))
 
 
+class _Ramp:
+    """The ramps x(t) = x₁ + t x₀ as forms in their unknowns.
+
+    The unknowns are the weights of the standing solutions in x₀, every site's x₁, and every value its clocks
+    compute in a frame; a frame later a value has grown by the frame's length times its standing value.
+    """
+
+    def __init__(
+        self,
+        system: ClosedSystem,
+        exact: Sequence[LinearSite],
+        number: _Numbering,
+        still: Sequence[Sequence[Fraction]],
+    ) -> None:
+        self.system, self.exact, self.number, self.still = system, exact, number, still
+        self.frame = system.sites[0].schedule.frame_s
+        self.size = len(still)
+        self.starts: list[int] = []
+        self.values: list[dict[Value, int]] = []
+        for group in system.sites:
+            kind = group.jacobians.kind
+            self.starts.append(self.size)
+            self.size += len(kind.states)
+            computed = [
+                Value(p, o, index)
+                for p, partition in enumerate(kind.clocks)
+                for o in range(len(partition.outputs))
+                for index in range(group.schedule.ticks[p])
+            ]
+            self.values.append({one: self.size + place for place, one in enumerate(computed)})
+            self.size += len(computed)
+
+    def slope(self, form: Form) -> Form:
+        """Return what a form of the standing solution is in x₀: a form in the weights."""
+        return _combine(
+            (weight, {place: solution[unknown] for place, solution in enumerate(self.still)})
+            for unknown, weight in form.items()
+        )
+
+    def rate(self, g: int, state: int) -> Form:
+        """Return the constant rate of a continuous state."""
+        return self.slope({self.number.states[g] + state: Fraction(1)})
+
+    def position(self, g: int, time: Fraction) -> list[Form]:
+        """Return the continuous states of site g at a time in seconds."""
+        start, count = self.starts[g], len(self.exact[g].kind.states)
+        return [_combine([(1, {start + i: Fraction(1)}), (time, self.rate(g, i))]) for i in range(count)]
+
+    def value(self, g: int, one: Value | None) -> Form:
+        """Return a value of site g, of whatever frame."""
+        ticks = self.system.sites[g].schedule.ticks[one.partition] if one else 0
+        if one is None or not ticks:
+            return {}
+        frames, index = divmod(one.index, ticks)
+        grown = self.slope({self.number.outputs[g][one.partition] + one.output: Fraction(1)})
+        first = {self.values[g][Value(one.partition, one.output, index)]: Fraction(1)}
+        return _combine([(1, first), (frames * self.frame, grown)])
+
+    def sends(self, g: int) -> tuple[dict[int, Form], dict[int, Form]]:
+        """Return what site g sends, and how fast that grows, by row of s."""
+        site, schedule = self.exact[g], self.system.sites[g].schedule
+        sent: dict[int, Form] = {}
+        for event, time, acting in _walk(self.system.sites[g]):
+            if isinstance(event, Send):
+                matrices = site.sends[event.partition]
+                inputs = [*self.position(g, time), *(self.value(g, one) for one in acting)]
+                for channel, row in event.rows:
+                    weights = [*matrices.x[channel], *matrices.u[channel]]
+                    sent[row] = _combine(zip(weights, inputs, strict=True))
+        standing = _standing_sends(site, self.number, g)
+        growth = {row: self.slope(standing[one.link, one.channel]) for row, one in enumerate(schedule.sent)}
+        return sent, growth
+
+    def heard(self, g: int, place: int, sent: Sequence[tuple[dict[int, Form], dict[int, Form]]]) -> Form:
+        """Return what site g hears at a row of r, each packet as it was when it was sent."""
+        if place < 0:
+            return {}
+        one = self.system.sites[g].schedule.heard[place]
+        total: Form = {}
+        for h, weight in enumerate(self.system.coupling[one.operator, one.sent.link][g]):
+            if weight:
+                row = self.system.sites[h].schedule.sent.index(one.sent)
+                _add(total, weight, sent[h][0][row])
+                _add(total, -weight * one.lag * self.frame, sent[h][1][row])
+        return total
+
+    def equations(self, sent: Sequence[tuple[dict[int, Form], dict[int, Form]]]) -> Iterator[Form]:
+        """Yield the equations of a ramp: every value as computed, every rate at both ends of an interval."""
+        for g, (site, group) in enumerate(zip(self.exact, self.system.sites, strict=True)):
+            for event, time, acting in _walk(group):
+                x, u = self.position(g, time), [self.value(g, one) for one in acting]
+                if isinstance(event, Propagate):
+                    end = self.position(g, time + event.duration * group.schedule.quantum)
+                    for i, (a, b) in enumerate(zip(site.a, site.b, strict=True)):
+                        for at in (x, end):
+                            terms = [*zip(a, at, strict=True), *zip(b, u, strict=True)]
+                            yield _combine([*terms, (-1, self.rate(g, i))])
+                elif isinstance(event, Tick):
+                    tick, partition = site.ticks[event.partition], site.kind.clocks[event.partition]
+                    before = (Value(event.partition, o, event.index - 1) for o in partition.memories)
+                    inputs = [*x, *u, *(self.value(g, one) for one in before)]
+                    inputs += [self.heard(g, place, sent) for place in event.heard]
+                    for o in range(len(partition.outputs)):
+                        row = [*tick.x[o], *tick.u[o], *tick.m[o], *tick.r[o]]
+                        own = self.value(g, Value(event.partition, o, event.index))
+                        yield _combine([*zip(row, inputs, strict=True), (-1, own)])
+
+
 def _drifts(
     system: ClosedSystem,
     exact: Sequence[LinearSite],
     number: _Numbering,
     still: Sequence[Sequence[Fraction]],
 ) -> list[list[Fraction]]:
-    """Return the states at t = 0 of the ramps x(t) = x₁ + t x₀, x₀ a combination of the standing solutions.
-
-    The unknowns are the weights of the standing solutions in x₀, every site's x₁ and every value its clocks
-    compute in a frame; a frame later a value has grown by the frame's length times its standing value.
-    """
-    frame = system.sites[0].schedule.frame_s
-    size = len(still)
-    starts: list[int] = []
-    values: list[dict[tuple[int, int, int], int]] = []
-    for group in system.sites:
-        kind = group.jacobians.kind
-        starts.append(size)
-        size += len(kind.states)
-        numbered = {}
-        for p, partition in enumerate(kind.clocks):
-            for o in range(len(partition.outputs)):
-                for index in range(group.schedule.ticks[p]):
-                    numbered[p, o, index] = size
-                    size += 1
-        values.append(numbered)
-
-    def slope(unknown: int) -> Form:
-        return {weight: solution[unknown] for weight, solution in enumerate(still) if solution[unknown]}
-
-    def slope_of(form: Form) -> Form:
-        return _combine((weight, slope(unknown)) for unknown, weight in form.items())
-
-    def value(g: int, one: Value | None) -> Form:
-        ticks = system.sites[g].schedule.ticks[one.partition] if one else 0
-        if one is None or not ticks:
-            return {}
-        frames, index = divmod(one.index, ticks)
-        grown = slope(number.outputs[g][one.partition] + one.output)
-        return _combine(
-            [(1, {values[g][one.partition, one.output, index]: Fraction(1)}), (frames * frame, grown)]
-        )
-
-    def moving(g: int, time: Fraction) -> list[Form]:
-        n_x = len(system.sites[g].jacobians.kind.states)
-        return [
-            _combine([(1, {starts[g] + i: Fraction(1)}), (time, slope(number.states[g] + i))])
-            for i in range(n_x)
-        ]
-
-    # First everything that is sent, as a form; then what is computed and moved, as equations.
-    sent: list[dict[int, Form]] = []
-    sent_slopes: list[dict[int, Form]] = []
-    for g, (site, group) in enumerate(zip(exact, system.sites, strict=True)):
-        forms: dict[int, Form] = {}
-        for event, time, acting in _walk(group):
-            if isinstance(event, Send):
-                send = site.sends[event.partition]
-                inputs = [*moving(g, time), *(value(g, one) for one in acting)]
-                for channel, row in event.rows:
-                    forms[row] = _combine(zip([*send.x[channel], *send.u[channel]], inputs, strict=True))
-        standing = _standing_sends(site, number, g)
-        sent.append(forms)
-        sent_slopes.append(
-            {row: slope_of(standing[one.link, one.channel]) for row, one in enumerate(group.schedule.sent)}
-        )
-
-    equations: list[Form] = []
-    for g, (site, group) in enumerate(zip(exact, system.sites, strict=True)):
-        for event, time, acting in _walk(group):
-            x, u = moving(g, time), [value(g, one) for one in acting]
-            if isinstance(event, Propagate):
-                for i, (row_a, row_b) in enumerate(zip(site.a, site.b, strict=True)):
-                    rate = slope(number.states[g] + i)
-                    # The velocity of the ramp is what the equations give at both ends of the interval.
-                    for at in (x, moving(g, time + event.duration * group.schedule.quantum)):
-                        terms = [*zip(row_a, at, strict=True), *zip(row_b, u, strict=True), (-1, rate)]
-                        equations.append(_combine(terms))
-            elif isinstance(event, Tick):
-                tick, partition = site.ticks[event.partition], site.kind.clocks[event.partition]
-                m = [value(g, Value(event.partition, o, event.index - 1)) for o in partition.memories]
-                r = [_heard(system, g, place, sent, sent_slopes, frame) for place in event.heard]
-                for o in range(len(partition.outputs)):
-                    row = [*tick.x[o], *tick.u[o], *tick.m[o], *tick.r[o]]
-                    terms = list(zip(row, [*x, *u, *m, *r], strict=True))
-                    own = value(g, Value(event.partition, o, event.index))
-                    equations.append(_combine([*terms, (-1, own)]))
-
-    solutions = _null_space(equations, size, split=len(still), known=len(still))
+    """Return the states at the start of a frame of the ramps on top of the standing solutions `still`."""
+    ramp = _Ramp(system, exact, number, still)
+    sent = [ramp.sends(g) for g in range(len(exact))]
     states = []
-    for solution in solutions:
+    for solution in _null_space(list(ramp.equations(sent)), ramp.size, split=len(still), known=len(still)):
         state: list[Fraction] = []
         for g, group in enumerate(system.sites):
-            state += solution[starts[g] : starts[g] + len(group.jacobians.kind.states)]
-            state += [_value(value(g, one), solution) for one in group.schedule.carried]
+            state += [_value(form, solution) for form in ramp.position(g, Fraction(0))]
+            state += [_value(ramp.value(g, one), solution) for one in group.schedule.carried]
             for packet in system.packets:
                 if packet.site == g:
-                    before = (-packet.lag * frame, sent_slopes[g][packet.row])
-                    state.append(_value(_combine([(1, sent[g][packet.row]), before]), solution))
+                    now, growth = sent[g][0][packet.row], sent[g][1][packet.row]
+                    before = _combine([(1, now), (-packet.lag * ramp.frame, growth)])
+                    state.append(_value(before, solution))
         states.append(state)
     return states
 
@@ -320,29 +349,8 @@ def _walk(group: PeerGroup) -> Iterator[tuple[Any, Fraction, tuple[Value | None,
             acting[event.hold] = event.value
 
 
-def _heard(
-    system: ClosedSystem,
-    g: int,
-    place: int,
-    sent: Sequence[Mapping[int, Form]],
-    slopes: Sequence[Mapping[int, Form]],
-    frame: Fraction,
-) -> Form:
-    """Return what site g hears, each packet as it was when it was sent."""
-    if place < 0:
-        return {}
-    one = system.sites[g].schedule.heard[place]
-    total: Form = {}
-    for h, weight in enumerate(system.coupling[one.operator, one.sent.link][g]):
-        if weight:
-            row = system.sites[h].schedule.sent.index(one.sent)
-            _add(total, weight, sent[h][row])
-            _add(total, -weight * one.lag * frame, slopes[h][row])
-    return total
-
-
 def _null_space(equations: Sequence[Form], size: int, *, split: int, known: int) -> list[list[Fraction]]:
-    """Return a basis of the solutions of homogeneous equations that do not vanish on the first `split` unknowns.
+    """Return the solutions of homogeneous equations that do not vanish on the first `split` unknowns.
 
     The number of vectors is the dimension of the solutions' part in these unknowns, and their parts there
     are independent. `known` solutions that vanish there are known to exist.

@@ -3,8 +3,8 @@
 Takes: a `CompiledSystem`, its timings as exact rationals, the structural patterns of its kinds.
 Gives: `Schedule` and its events, `build_schedules`, `ORDER`.
 Guarantees: exact time (integers of one quantum); the state at the start of a frame is what is demanded
-and nothing else: a hold that acts at once adds none, a link adds a sender's packets that are still to be heard.
-Does not: look at numbers other than times.
+and nothing else: a hold that acts at once adds none, a link adds a sender's packets that are still to be
+heard. Does not: look at numbers other than times.
 
 Every value a clock computes is one symbol, `Value(partition, output, index)`: what output `output` was at the
 tick `index`, counted from the frame's first tick of that clock; a negative index is an earlier frame.
@@ -17,6 +17,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
+import numpy as np
 from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
 from apc.runtime.linearize import LinearSite
 
@@ -68,7 +69,7 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Clock partition `partition` computes for the `index`-th time; `heard` are rows of r, -1 for one not read."""
+    """Clock partition `partition` computes, tick `index`; `heard` are rows of r, -1 for one not read."""
 
     partition: int
     index: int
@@ -91,9 +92,10 @@ class Schedule:
     """One frame of one kind of site.
 
     `acting` is what each hold puts out as the frame begins (None for a hold nobody reads); `carried` are the
-    values of earlier frames that this one needs, the remembered part of z after the continuous states; `heard`
-    names r; `sent` names s and `depths` says how many frames each row of s must be kept; `ticks` counts a clock
-    partition's ticks in a frame; `marks` are the instants, in quanta, of the fastest clock's ticks and the end.
+    values of earlier frames that this one needs, the remembered part of z after the continuous states;
+    `heard` names r; `sent` names s and `depths` says how many frames each row of s must be kept; `ticks`
+    counts a clock partition's ticks in a frame; `marks` are the instants, in quanta, of the fastest clock's
+    ticks and the end.
     """
 
     quantum: Fraction
@@ -160,9 +162,9 @@ def build_schedules(
     patterns
         The structural pattern of each kind (`SiteJacobians.pattern`).
     order
-        The order of coincident events, a permutation of `ORDER`. With "act" before "tick", a value that acts at
-        once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and "tick"
-        before "deliver" for a packet that arrives exactly at a tick.
+        The order of coincident events, a permutation of `ORDER`. With "act" before "tick", a value that acts
+        at once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and
+        "tick" before "deliver" for a packet that arrives exactly at a tick.
     """
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
     rank = {name: place for place, name in enumerate(order)}
@@ -303,7 +305,7 @@ def _heard_at_ticks(
 
 
 def _newest_packet(link: Link, instant: int, times: _Times, rank: Mapping[str, int]) -> int:
-    """Return the number of the newest packet delivered before a tick at `instant`; negative: earlier frames."""
+    """Return the number of the newest packet a tick at `instant` sees; negative: of an earlier frame."""
     delay = times.delays[link.delay]
     missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0
     number = times.clocks[link.clock].newest(instant - delay, strictly=rank["tick"] < rank["deliver"])
@@ -432,7 +434,7 @@ def _carried(
             case Act(hold, value):
                 now[hold] = value
             case Propagate():
-                read(pattern.b.any(axis=0).nonzero()[0].tolist())
+                read(np.flatnonzero(pattern.b.any(axis=0)).tolist())
             case Send(partition, rows):
                 for channel, _ in rows:
                     read(pattern.sends[partition].u[channel].nonzero()[0].tolist())

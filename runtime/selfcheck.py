@@ -30,7 +30,7 @@ ROUNDINGS_PER_EVENT = 1e3
 
 
 def check_frame(system: CompiledSystem) -> float:
-    """Compare one frame of every kind, both ways, from a random state; return the largest relative difference.
+    """Compare one frame of every kind, both ways, at random; return the largest relative difference.
 
     Raises
     ------

@@ -2,8 +2,8 @@
 
 Takes: the `ClosedSystem`s that make up a whole.
 Gives: `Mode`, `Spectrum`, `solve_spectrum`.
-Guarantees: rigid modes are removed before any eigenvalue is computed; every reported error bounds what rounding
-did since the site's coefficients, and a verdict nearer to the boundary than its error says so.
+Guarantees: rigid modes are removed before any eigenvalue is computed; every reported error bounds what
+rounding did since the site's coefficients, and a verdict nearer to the boundary than its error says so.
 Does not: raise the precision (an undecided verdict is left undecided).
 """
 
@@ -44,8 +44,8 @@ SCHUR_ROUNDINGS = 10
 class Mode:
     """One eigenvalue of the whole system's frame map, held `multiplicity` times.
 
-    `magnitude` is per frame; `error` bounds |eigenvalue − truth|. `frequency_hz` and `damping_ratio` belong to
-    s = log(eigenvalue)/frame on the branch the motion takes inside the frame. `shape` is the system the
+    `magnitude` is per frame; `error` bounds |eigenvalue − truth|. `frequency_hz` and `damping_ratio` belong
+    to s = log(eigenvalue)/frame on the branch the motion takes inside the frame. `shape` is the system the
     mode belongs to. `participation` shares the mode out among the states (the shares add up to 1).
     """
 
@@ -195,17 +195,17 @@ def _angle(system: ClosedSystem, value: complex, vector: Complexes, shares: Floa
 
 
 def _eigen(matrix: Floats, error: Floats) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
-    """Compute eigenvalues, right vectors (columns), left vectors (rows), error bounds, and the radius's bounds.
+    """Compute eigenvalues, right vectors (columns), left vectors (rows), errors, and the radius's bounds.
 
     Notes
     -----
     Schur form with the small eigenvalues last, T = [T₁ R; 0 T₂]; a Sylvester equation frees T₁ of R, and the
     eigenvectors V of T₁ diagonalize it. With X the transformation and E the error of the matrix,
     X⁻¹(M + E)X = diag(Λ, T₂) + G, |G| ≤ |X⁻¹| (|residual| + |E| |X|). Every eigenvalue then lies in one of
-    the discs of Gershgorin about Λ, of radius Σ_j |G_ij|, or within Elsner's distance of those of T₂ (Horn and
-    Johnson, Matrix Analysis, 6.1 and 6.4; Feingold and Varga 1962 for the blocks). Discs that touch
-    hold together as many eigenvalues as there are; each is then off by at most the reach of the whole cluster.
-    Where the eigenvectors fail (a defective matrix), Elsner's bound holds for the matrix as a whole:
+    the discs of Gershgorin about Λ, of radius Σ_j |G_ij|, or within Elsner's distance of those of T₂ (Horn
+    and Johnson, Matrix Analysis, 6.1 and 6.4; Feingold and Varga 1962 for the blocks). Discs that touch
+    hold together as many eigenvalues as there are; each is then off by at most the reach of the whole
+    cluster. Where the eigenvectors fail (a defective matrix), Elsner's bound holds for the matrix as a whole:
     |λ − λ̂| ≤ (‖M‖ + ‖M + E‖)^(1−1/n) ‖E‖^(1/n) (Stewart and Sun, Matrix Perturbation Theory, IV.1.3).
     """
     n = len(matrix)

@@ -1,13 +1,14 @@
 """N full peers, event by event, by hand: the check on everything in the runtime, and none of its code.
 
-The scene is the one of `sites.paper`: point masses under zero-order-held forces, in closed form. The matrix of
-one frame comes column by column, each the frame that starts from one unit vector. Numbers are floats or
+The scene is the one of `sites.paper`: point masses under zero-order-held forces, in closed form. The matrix
+of one frame comes column by column, each the frame that starts from one unit vector. Numbers are floats or
 mpmath's (`frame_matrix(…, number=mpmath.mpf)`, at the working precision set by the caller) or anything with
 arithmetic and an `exp`.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -113,7 +114,7 @@ def _one_frame(
     def newest(listed: Sequence[tuple[Any, ...]], now: Fraction, delay: Fraction) -> tuple[Any, ...]:
         return max((one for one in listed if one[0] + delay <= now), key=lambda one: one[0])
 
-    for now, following in zip(times, times[1:], strict=False):
+    for now, following in itertools.pairwise(times):
         if (now - network_0) % scene.network == 0:
             for i in range(scene.peers):
                 packets[i].append((now, motion[i][2], motion[i][3]))

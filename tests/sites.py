@@ -1,4 +1,4 @@
-"""Compiled systems written by hand: the scene of Rakhsha and Constantinescu, as the compiler would give it."""
+"""Compiled systems written by hand: the scene of Rakhsha and Constantinescu, as compiled."""
 
 from __future__ import annotations
 

@@ -146,8 +146,8 @@ def test_a_character_of_a_text_is_found_in_its_line_unless_it_was_folded() -> No
         ("a: @x\n", "a.yaml:1:4: E109 a text starting with @ needs quotes. Write: '@x'"),
         (
             "a: b: c\n",
-            "a.yaml:1:5: E109 a ': ' cannot stand here: the line above ends wrongly, or the text needs quotes."
-            " Write: key: 'text: with a colon'",
+            "a.yaml:1:5: E109 a ': ' cannot stand here: the line above ends wrongly, or the text needs"
+            " quotes. Write: key: 'text: with a colon'",
         ),
         (
             "a: 1\nb\nc: 2\n",

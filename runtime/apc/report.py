@@ -51,7 +51,7 @@ def compile_report(system: CompiledSystem, needs: Needs, target: Path, differenc
     lines = [
         f"{system.name} → {target}",
         _wrapped(str(needs)),
-        f"  frame {_time(float(needs.frame))}: {ticks}",
+        f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
         f"  self-check: one frame event by event and lifted differ by {difference:.0e}",
     ]
     lines += [_wrapped(f"left out: {name}, as {reason}") for name, reason in system.dropped]

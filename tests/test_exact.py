@@ -1,0 +1,64 @@
+"""Claims about `apc.runtime.exact`."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import casadi
+import mpmath
+import pytest
+from apc.runtime.exact import evaluate_exact
+
+
+def _function(build: object, size: int = 2) -> casadi.Function:
+    x = casadi.SX.sym("x", size)
+    return casadi.Function("f", [x], [build(x)])  # type: ignore[operator]
+
+
+def test_rational_operations_are_exact() -> None:
+    f = _function(lambda x: casadi.vertcat(x[0] / x[1] + x[0] * x[0] - 3, 1 / x[0], x[1] ** 3, -x[0]))
+    third, seventh = Fraction(1, 3), Fraction(1, 7)
+    assert evaluate_exact(f, [[third, seventh]]) == [
+        [Fraction(7, 3) + Fraction(1, 9) - 3, Fraction(3), Fraction(1, 343), -third]
+    ]
+
+
+def test_conditions_choose_without_touching_the_other_branch() -> None:
+    f = _function(lambda x: casadi.if_else(x[0] < x[1], x[0], x[1]))
+    assert evaluate_exact(f, [[Fraction(1), Fraction(2)]]) == [[Fraction(1)]]
+    assert evaluate_exact(f, [[Fraction(3), Fraction(2)]]) == [[Fraction(2)]]
+
+
+def test_constants_are_the_doubles_they_are() -> None:
+    f = _function(lambda x: x[0] * 0.1)
+    assert evaluate_exact(f, [[Fraction(1), Fraction(0)]]) == [[Fraction(0.1)]]
+
+
+@pytest.mark.parametrize(
+    "name", ["sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "fabs", "floor", "sign", "fmin", "fmax"]
+)
+def test_every_operation_agrees_with_casadi_in_floats(name: str) -> None:
+    operation = getattr(casadi, name)
+    f = _function(lambda x: operation(x[0], x[1]) if name in ("fmin", "fmax") else operation(x[0]))
+    [[value]] = evaluate_exact(f, [[Fraction(7, 4), Fraction(1, 8)]])
+    assert float(value) == pytest.approx(float(f([1.75, 0.125])), rel=1e-15)
+
+
+def test_transcendental_operations_go_to_any_precision() -> None:
+    f = _function(lambda x: casadi.exp(x[0]), 1)
+    with mpmath.workdps(50):
+        [[value]] = evaluate_exact(
+            f, [[mpmath.mpf(1)]], number=mpmath.mpf, rounded=lambda name, a: getattr(mpmath, name)(a)
+        )
+        assert abs(value - mpmath.e) < mpmath.mpf(10) ** -48
+    [[rounded]] = evaluate_exact(f, [[Fraction(1)]])
+    assert rounded == Fraction(math.e)
+
+
+def test_a_jacobian_can_be_walked_too() -> None:
+    x = casadi.SX.sym("x", 2)
+    jacobian = casadi.densify(casadi.jacobian(casadi.vertcat(x[0] * x[1], x[1] ** 2), x))
+    f = casadi.Function("f", [x], [casadi.vec(jacobian)])
+    a, b = Fraction(1, 3), Fraction(2, 7)
+    assert evaluate_exact(f, [[a, b]]) == [[b, 0, a, 2 * b]]

@@ -1,0 +1,82 @@
+"""Claims about `apc.runtime.lift`."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from apc.runtime.analysis import lifted_groups
+from apc.runtime.lift import LiftedSite
+from scipy.linalg import expm
+from sites import MS, paper
+
+
+def _lifted(**values: object) -> LiftedSite:
+    [group] = lifted_groups(paper(**values))  # type: ignore[arg-type]
+    return group.lifted
+
+
+def test_a_delayed_site_names_its_state() -> None:
+    lifted = _lifted()
+    assert lifted.z_names == (
+        "device.x",
+        "device.v",
+        "cube.x",
+        "cube.v",
+        "contact.f(-1 ms)",
+        "coordination.f(-1 ms)",
+    )
+    assert lifted.p.shape == (6, 6)
+    assert lifted.q.shape == (6, 2)
+    assert lifted.frame_s == 0.008
+
+
+def test_one_rate_without_delay_is_the_sampled_closed_loop_of_the_textbook() -> None:
+    """x⁺ = (Φ + Γ F) x with Φ, Γ from one exponential (Van Loan) and F the sampled feedback."""
+    lifted = _lifted(network=MS, comp=Fraction(0), comm=MS, kc=1500.0, bc=2.0, kt=800.0, bt=3.0)
+    a = np.array([[0, 1, 0, 0], [0, -50.0, 0, 0], [0, 0, 0, 1], [0, 0, 0, -25.0]])
+    b = np.array([[0, 0], [-10.0, 0], [0, 0], [5.0, -5.0]])
+    f = np.array([[1500.0, 2.0, -1500.0, -2.0], [0, 0, 800.0, 3.0]])
+    step = expm(np.block([[a, b], [np.zeros((2, 6))]]) * 0.001)
+    phi, gamma = step[:4, :4], step[:4, 4:]
+    np.testing.assert_allclose(lifted.p, phi + gamma @ f, rtol=0, atol=1e-14)
+    heard = np.zeros((2, 2))
+    heard[1, [1, 0]] = [-800.0, -3.0]  # r is in the order (velocity, position)
+    np.testing.assert_allclose(lifted.q, gamma @ heard, rtol=0, atol=1e-14)
+
+
+def test_what_is_heard_and_sent_on_in_one_frame_is_nilpotent() -> None:
+    lifted = _lifted(network=2 * MS, haptic=3 * MS, comm=Fraction(0), comp=Fraction(0))
+    [group] = lifted_groups(paper(network=2 * MS, haptic=3 * MS, comm=Fraction(0), comp=Fraction(0)))
+    assert lifted.d.any()
+    feedback = np.zeros((len(lifted.s), len(lifted.s)))
+    for place, one in enumerate(group.schedule.heard):
+        if one.lag == 0:
+            feedback[:, group.schedule.sent.index(one.sent)] += lifted.d[:, place]
+    assert not np.linalg.matrix_power(feedback, len(feedback)).any()
+
+
+def test_the_end_of_the_inside_is_the_continuous_part_of_the_map() -> None:
+    lifted = _lifted()
+    np.testing.assert_array_equal(lifted.inside[-1], np.hstack([lifted.p, lifted.q])[:4])
+    np.testing.assert_array_equal(lifted.inside[0], np.eye(4, 8))
+    assert len(lifted.inside) == 9
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-6, 5.0, 500.0])
+def test_no_digit_is_lost_as_the_damping_goes_to_zero(damping: float) -> None:
+    """(1 − e^(−bT/m)) m/b as expm1 has it; the plain formula loses every digit."""
+    system = paper(kc=0.0, kt=0.0, comm=8 * MS)
+    from dataclasses import replace
+
+    system = replace(
+        system,
+        parameters=tuple(
+            replace(p, value=damping) if p.name == "device.damping" else p for p in system.parameters
+        ),
+    )
+    [group] = lifted_groups(system)
+    rate = damping / 0.1
+    expected = -np.expm1(-rate * 0.008) / rate if rate else 0.008
+    assert group.lifted.p[0, 1] == pytest.approx(expected, rel=1e-13)

@@ -1,0 +1,72 @@
+"""Claims about `apc.runtime.linearize`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import casadi
+import numpy as np
+from apc.runtime.linearize import jacobians, linearize, linearize_exact, same_dynamics
+from apc.runtime.parameters import resolve
+from sites import NAMES, paper, user
+
+
+def _vector(**values: float) -> np.ndarray:
+    return resolve(paper(**values)).parameters[0]  # type: ignore[arg-type]
+
+
+def test_the_paper_site_has_the_matrices_derived_by_hand() -> None:
+    site = linearize(jacobians(user("mean")), _vector(kt=800.0, bt=2.0, kc=1500.0, bc=3.0, cube=0.25))
+    np.testing.assert_array_equal(site.a, [[0, 1, 0, 0], [0, -50.0, 0, 0], [0, 0, 0, 1], [0, 0, 0, -20.0]])
+    np.testing.assert_array_equal(site.b, [[0, 0], [-10.0, 0], [0, 0], [4.0, -4.0]])
+    [tick], [send] = site.ticks, site.sends
+    np.testing.assert_array_equal(tick.x, [[1500.0, 3.0, -1500.0, -3.0], [0, 0, 800.0, 2.0]])
+    np.testing.assert_array_equal(tick.r, [[0, 0], [-800.0, -2.0]])
+    np.testing.assert_array_equal(tick.u, np.zeros((2, 2)))
+    assert tick.m.shape == (2, 0)
+    np.testing.assert_array_equal(send.x, [[0, 0, 1, 0], [0, 0, 0, 1]])
+    assert site.affine
+
+
+def test_full_mesh_pulls_with_the_number_of_others() -> None:
+    site = linearize(jacobians(user("sum")), _vector(kt=100.0, bt=2.0, peers=5))
+    np.testing.assert_array_equal(site.ticks[0].x[1], [0, 0, 400.0, 8.0])
+    np.testing.assert_array_equal(site.ticks[0].r[1], [-100.0, -2.0])
+
+
+def test_exact_matrices_are_the_floats_without_their_rounding() -> None:
+    built, parameters = jacobians(user("sum")), _vector(kt=0.1, peers=4)
+    exact, rounded = linearize_exact(built, parameters), linearize(built, parameters)
+    assert exact.ticks[0].x[1, 2] == 3 * Fraction(0.1)
+    assert exact.b[1, 0] == -1 / Fraction(0.1)
+    np.testing.assert_allclose(exact.a.astype(float), rounded.a, rtol=1e-15)
+
+
+def test_a_pattern_is_structure_whatever_the_numbers() -> None:
+    built = jacobians(user("mean"))
+    assert built.pattern.ticks[0].r[1].all()
+    assert not linearize(built, _vector(kt=0.0, bt=0.0)).ticks[0].r.any()
+
+
+def test_a_site_that_is_not_affine_is_linearized_at_its_start_values() -> None:
+    kind = user("mean")
+    x, u = casadi.SX.sym("x", 4), casadi.SX.sym("u", 2)
+    p, t = casadi.SX.sym("p", len(NAMES)), casadi.SX.sym("t")
+    cubic = casadi.vertcat(x[1], u[0] - x[0] ** 3, x[3], u[1])
+    built = jacobians(replace(kind, derivative=casadi.Function("derivative", [x, u, p, t], [cubic])))
+    parameters = _vector()
+    parameters[NAMES.index("device.x.start")] = 2.0
+    assert not built.affine
+    assert linearize(built, parameters).a[1, 0] == -12.0
+    assert linearize_exact(built, parameters).a[1, 0] == -12
+
+
+def test_dynamics_are_the_same_when_only_the_start_differs() -> None:
+    built = jacobians(user("mean"))
+    parameters = _vector()
+    moved, heavier = parameters.copy(), parameters.copy()
+    moved[NAMES.index("device.x.start")] = 0.03
+    heavier[NAMES.index("device.mass")] = 0.2
+    assert same_dynamics(linearize(built, parameters), linearize(built, moved))
+    assert not same_dynamics(linearize(built, parameters), linearize(built, heavier))

@@ -1,0 +1,78 @@
+"""What the README shows is what the program does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from apc.__main__ import run
+
+ROOT = Path(__file__).resolve().parents[1]
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def block_after(mark: str) -> str:
+    """Return the fenced block that follows a mark."""
+    found = re.search(re.escape(mark) + r"\n```\w*\n(.*?)```", TEXT, re.DOTALL)
+    assert found, mark
+    return found.group(1)
+
+
+def test_the_analysis_shown_is_what_analyze_prints(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    mark = "<!-- output: apc analyze models/scenes/three-users-average.yaml -->"
+    assert run(["analyze", "models/scenes/three-users-average.yaml"]) == 0
+    assert capsys.readouterr().out == block_after(mark)
+
+
+def test_the_topology_shown_is_a_scene_and_the_error_shown_is_its_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    topology = next(
+        block for block in re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL) if block.startswith("topology:")
+    )
+    Path("three-users.yaml").write_text(topology, encoding="utf-8")
+    assert run(["check", "three-users.yaml"]) == 0
+    broken = topology.replace("stiffness: 500 N/m", "stiffness: 500")
+    Path("three-users.yaml").write_text(broken, encoding="utf-8")
+    capsys.readouterr()
+    assert run(["check", "three-users.yaml"]) == 1
+    assert capsys.readouterr().err == block_after("<!-- output: error -->")
+
+
+def test_the_python_shown_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    code = re.search(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    assert code
+    exec(compile(code.group(1), "README.md", "exec"), {})  # our own text
+    assert "stable" in capsys.readouterr().out
+
+
+def test_every_command_of_the_program_stands_in_the_table() -> None:
+    from apc.cli import apc
+
+    help_text = CliRunner().invoke(apc, ["--help"]).output
+    commands = re.findall(r"^  (\w+)  ", help_text.split("Commands:")[1], re.MULTILINE)
+    for command in commands:
+        assert f"| `apc {command}" in TEXT, command
+
+
+def test_every_file_linked_exists() -> None:
+    for page in (ROOT / "README.md", ROOT / "models" / "README.md"):
+        for target in re.findall(r"\]\((?!http|#)([^)]+)\)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), target
+
+
+def test_every_component_of_the_library_stands_in_its_reference() -> None:
+    page = (ROOT / "models" / "README.md").read_text(encoding="utf-8")
+    for path in sorted((ROOT / "models").rglob("*.yaml")):
+        text = path.read_text(encoding="utf-8")
+        found = re.match(r"component: (\w+)", text)
+        if found:
+            assert f"[`{found.group(1)}`]({path.relative_to(ROOT / 'models')})" in page, path

@@ -1,0 +1,40 @@
+"""Claims about `apc.runtime.selfcheck`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import apc.runtime.selfcheck as selfcheck
+import pytest
+from apc.runtime.lift import LiftedSite, lift
+from apc.runtime.selfcheck import check_frame
+from sites import MS, grouped, paper
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"operator": "sum", "own_delay": True},
+        {"comp": MS * 5 / 2, "comm": 11 * MS},
+        {"haptic": 3 * MS, "network": 2 * MS, "comm": Fraction(0), "haptic_phase": MS / 3},
+    ],
+)
+def test_a_frame_stepped_and_lifted_agrees_to_rounding(values: dict[str, object]) -> None:
+    system = grouped(
+        paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0, **values),  # type: ignore[arg-type]
+        ("right", 1, {"hand.force": -4.0, "device.x.start": 0.03}),
+        ("left", 2, {"hand.force": 2.0, "device.mass": 0.2}),
+    )
+    assert check_frame(system) < 1e-13
+
+
+def test_a_wrong_lift_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoiled(*arguments: object) -> LiftedSite:
+        lifted = lift(*arguments)  # type: ignore[arg-type]
+        return replace(lifted, p=lifted.p * (1 + 1e-9))
+
+    monkeypatch.setattr(selfcheck, "lift", spoiled)
+    with pytest.raises(AssertionError, match="one frame of user, stepped and lifted, differ by"):
+        check_frame(paper())
