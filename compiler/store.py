@@ -14,11 +14,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import lzma
 import os
+import struct
 import tempfile
 import types
 import typing
 import zipfile
+import zlib
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -32,6 +35,12 @@ FORMAT = 1
 MEMBER = "model.json"
 # CasADi's reader can crash on text that isn't its own, so every member is checked against its digest first.
 LARGEST = 256 * 2**20
+FOREIGN = "it is not what apc compile writes"
+# What zipfile, its decompressors, json and our own reading of the document raise at what isn't theirs.
+DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError),
+    *(AttributeError, KeyError, IndexError, ValueError, TypeError, RuntimeError),
+)
 
 
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
@@ -95,17 +104,11 @@ def load(path: Path) -> CompiledSystem:
     except FileNotFoundError as error:
         raise ApcError(Mistake("E602", Place(str(path)), "does not exist", hint="apc compile")) from error
     except OSError as error:
+        if error.strerror is None:  # a decompressor's
+            raise _damaged(path, FOREIGN) from error
         raise ApcError(Mistake("E602", Place(str(path)), f"can't be read: {error.strerror}")) from error
-    except (
-        zipfile.BadZipFile,
-        KeyError,
-        ValueError,
-        TypeError,
-        RuntimeError,
-        EOFError,
-        NotImplementedError,
-    ) as error:
-        raise _damaged(path, "it is not what apc compile writes") from error
+    except DAMAGE as error:
+        raise _damaged(path, FOREIGN) from error
     assert isinstance(system, CompiledSystem)
     return system
 
@@ -139,6 +142,8 @@ def _typed(wanted: Any, value: Any, functions: dict[str, Any]) -> Any:
             **{f.name: _typed(hints[f.name], value[f.name], functions) for f in dataclasses.fields(wanted)}
         )
     if origin is tuple:
+        if not isinstance(value, list):
+            raise TypeError(f"expected a list, got {value!r}")
         arguments = typing.get_args(wanted)
         if arguments[-1] is Ellipsis:
             return tuple(_typed(arguments[0], item, functions) for item in value)

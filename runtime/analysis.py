@@ -41,6 +41,7 @@ class Analysis:
     """The answer of an analysis; `spectral_radius` is per frame, rigid modes removed.
 
     `states_per_peer` is that of the largest kind of peer in the scene. `method` is "modes" or "dense".
+    `linearized` says that some site is not affine: the answer then holds near its start values only.
     """
 
     topology: str
@@ -54,6 +55,7 @@ class Analysis:
     spectral_radius_error: float
     rigid_modes: int
     modes: tuple[Mode, ...]
+    linearized: bool
 
     def to_dict(self) -> dict[str, Any]:
         """Return the analysis as plain data, ready for JSON."""
@@ -81,6 +83,7 @@ class Analysis:
                 }
                 for mode in self.modes
             ],
+            "linearized": self.linearized,
         }
 
 
@@ -159,4 +162,5 @@ def _analyze(
         spectral_radius_error=spectrum.spectral_radius_error,
         rigid_modes=spectrum.rigid_modes,
         modes=spectrum.modes,
+        linearized=not all(group.site.affine for group in groups),
     )

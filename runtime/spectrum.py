@@ -35,6 +35,14 @@ DEADBEAT = 1e-12
 # cluster at zero, the queues running empty; they are bounded together, so that they spoil no other's bound.
 SMALL = 1e-2
 
+# A radius less certain than this is worth more work: other limits between large and small, this many.
+WIDE = 1e-8
+SPLITS_TRIED = 6
+
+# Powers of a block of small eigenvalues that bound its resolvent: a queue of that many packets is empty by
+# then.
+RESOLVENT_POWERS = 32
+
 # Backward error of LAPACK's reduction to Schur form and of the few orthogonal products here, in units of
 # n·UNIT·‖matrix‖_F: 'a modest constant' (LAPACK Users' Guide, 3rd ed., section 4.8); measured below 1.
 SCHUR_ROUNDINGS = 10
@@ -131,11 +139,15 @@ def _solve(system: ClosedSystem, free: RigidModes) -> tuple[list[Mode], float, f
     if count == n:
         return [], 0.0, 0.0
     # Q = [Q1 Q2], Q1 spanning the rigid motions: Qᵀ M Q = [J C; 0 H], and H holds all the others.
-    basis, _ = np.linalg.qr(free.basis / scale[:, None], mode="complete")
+    known = free.basis / scale[:, None]
+    known = known / np.linalg.norm(known, axis=0)
+    basis, _ = np.linalg.qr(known, mode="complete")
     rigid, rest = basis[:, :count], basis[:, count:]
     reduced = rest.T @ matrix @ rest
     reduced_error = np.abs(rest.T) @ error @ np.abs(rest)
-    reduced_error += SCHUR_ROUNDINGS * n * UNIT * float(np.linalg.norm(matrix))
+    # The directions are rounded; the closer they are to one another, the more that turns their span.
+    turned = float(np.linalg.cond(known)) if count else 1.0
+    reduced_error += SCHUR_ROUNDINGS * n * UNIT * turned * float(np.linalg.norm(matrix))
 
     values, right, left, errors, low, high = _eigen(reduced, reduced_error)
     # Back to the whole state: the right vectors get their rigid part, the left ones have none.
@@ -194,22 +206,69 @@ def _angle(system: ClosedSystem, value: complex, vector: Complexes, shares: Floa
     return principal + 2 * np.pi * round((turned - principal) / (2 * np.pi))
 
 
+@dataclass(frozen=True, slots=True)
+class _Enclosure:
+    """Eigenvalue estimates and the discs that hold the true ones, as many as there are discs.
+
+    `right` has the vectors as columns, `inverse` as rows; both are sound for the first `large` only.
+    """
+
+    values: Complexes
+    centres: Complexes
+    radii: Floats
+    right: Complexes
+    inverse: Complexes
+    large: int
+
+    @property
+    def width(self) -> float:
+        """How uncertain the spectral radius is."""
+        low, high, _ = _clusters(self)
+        return high - low
+
+
 def _eigen(matrix: Floats, error: Floats) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
     """Compute eigenvalues, right vectors (columns), left vectors (rows), errors, and the radius's bounds.
 
+    The eigenvalues are split by magnitude, large from small, see `_enclose`. A chain of packets or forces
+    that nobody answers is a Jordan block at zero, scattered by rounding over a ring that may reach far out:
+    when the first split leaves the radius uncertain, the widest gaps between magnitudes are tried as well.
+    """
+    found = _enclose(matrix, error, SMALL)
+    if not found.width <= WIDE:
+        sizes = np.sort(np.abs(found.values))
+        sizes = sizes[sizes > SMALL]
+        gaps = np.argsort(sizes[:-1] / sizes[1:], kind="stable")[:SPLITS_TRIED]
+        limits = [float(np.sqrt(sizes[gap] * sizes[gap + 1])) for gap in gaps]
+        tried = [found, *(_enclose(matrix, error, limit) for limit in limits)]
+        found = min(tried, key=lambda one: one.width)
+    low, high, errors = _clusters(found)
+    # A real matrix: an eigenvalue alone in a disc across the real axis has no conjugate, so it is real.
+    alone = errors == found.radii
+    values = found.values.copy()
+    real = alone & (np.abs(values.imag) <= found.radii)
+    values[real] = values[real].real
+    right, left = _plain_vectors(matrix, found, values)
+    return values, right, left, errors, low, high
+
+
+def _enclose(matrix: Floats, error: Floats, limit: float) -> _Enclosure:
+    """Enclose the eigenvalues of a matrix that is known up to `error`, entry by entry.
+
     Notes
     -----
-    Schur form with the small eigenvalues last, T = [T₁ R; 0 T₂]; a Sylvester equation frees T₁ of R, and the
-    eigenvectors V of T₁ diagonalize it. With X the transformation and E the error of the matrix,
+    Schur form with the eigenvalues below `limit` last, T = [T₁ R; 0 T₂]; a Sylvester equation frees T₁ of R,
+    and the eigenvectors V of T₁ diagonalize it. With X the transformation and E the error of the matrix,
     X⁻¹(M + E)X = diag(Λ, T₂) + G, |G| ≤ |X⁻¹| (|residual| + |E| |X|). Every eigenvalue then lies in one of
-    the discs of Gershgorin about Λ, of radius Σ_j |G_ij|, or within Elsner's distance of those of T₂ (Horn
-    and Johnson, Matrix Analysis, 6.1 and 6.4; Feingold and Varga 1962 for the blocks). Discs that touch
-    hold together as many eigenvalues as there are; each is then off by at most the reach of the whole
-    cluster. Where the eigenvectors fail (a defective matrix), Elsner's bound holds for the matrix as a whole:
+    the discs of Gershgorin about Λ, of radius Σ_j |G_ij|, or where ‖(λ − T₂)⁻¹‖ ‖G₂‖ ≥ 1 (Feingold and
+    Varga, Block diagonally dominant matrices, 1962), which is inside a disc about 0, see `_resolvent_radius`.
+    Discs that touch hold together as many eigenvalues as there are of them.
+
+    Where the eigenvectors fail (a defective matrix), Elsner's bound holds for the matrix as a whole:
     |λ − λ̂| ≤ (‖M‖ + ‖M + E‖)^(1−1/n) ‖E‖^(1/n) (Stewart and Sun, Matrix Perturbation Theory, IV.1.3).
     """
     n = len(matrix)
-    triangle, unitary, large = schur(matrix, output="complex", sort=lambda z: abs(z) >= SMALL)
+    triangle, unitary, large = _sorted_schur(matrix, limit)
     values = np.diag(triangle).copy()
     upper, lower = triangle[:large, :large], triangle[large:, large:]
     right = np.zeros((n, n), dtype=np.complex128)
@@ -218,54 +277,81 @@ def _eigen(matrix: Floats, error: Floats) -> tuple[Complexes, Complexes, Complex
         right[:large, :large] = _triangular_vectors(upper)
         if large < n:
             right[:large, large:] = solve_sylvester(upper, -lower, -triangle[:large, large:])
-    whole = unitary @ right
-    whole /= np.linalg.norm(whole, axis=0)
-    spread = float(np.linalg.norm(error))
-    elsner = _elsner(float(np.linalg.norm(matrix)), spread, n)
-    centres, radii = values, np.full(n, elsner)
+    right = unitary @ right
+    right /= np.linalg.norm(right, axis=0)
+    spread = float(np.linalg.norm(error)) + SCHUR_ROUNDINGS * n * UNIT * float(np.linalg.norm(matrix))
+    crude = np.full(n, (2 * float(np.linalg.norm(matrix)) + spread) ** (1 - 1 / n) * spread ** (1 / n))
     try:
-        inverse = np.linalg.inv(whole)
+        inverse = np.linalg.inv(right).astype(np.complex128)
     except np.linalg.LinAlgError:
-        inverse = np.full((n, n), np.nan, dtype=np.complex128)
-    # The diagonal form as it came out, and all that it leaves: rounding of the products included.
-    form = np.zeros((n, n), dtype=np.complex128)
-    form[:large, :large] = np.diag(values[:large])
-    form[large:, large:] = lower * (1 + 0j)
-    if large < n and np.all(np.isfinite(inverse)):
-        tail = whole[:, large:]
-        form[large:, large:] = inverse[large:] @ (matrix @ tail)
-    # NaN compares false below, and the bound for the whole matrix stays.
-    doubt = np.abs(matrix @ whole - whole @ form)
-    doubt += 4 * (n + 2) * UNIT * (np.abs(matrix) @ np.abs(whole) + np.abs(whole) @ np.abs(form))
+        inverse = np.full((n, n), np.nan + 0j)
+    whole = _Enclosure(values, values, crude, right, inverse, large if np.isfinite(inverse).all() else 0)
+    if not np.isfinite(inverse).all():
+        return whole
+
+    # The block diagonal form as it came out, and all that it leaves; the rounding of the products is
+    # included.
+    form = np.diag(values).astype(np.complex128)
+    form[large:, large:] = inverse[large:] @ (matrix @ right[:, large:])
+    doubt = np.abs(matrix @ right - right @ form) + error @ np.abs(right)
+    doubt += 4 * (n + 2) * UNIT * (np.abs(matrix) @ np.abs(right) + np.abs(right) @ np.abs(form))
     weight = np.abs(inverse)
-    # The computed inverse is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
-    defect = float(
-        np.max(np.sum(np.abs(np.eye(n) - inverse @ whole) + 4 * n * UNIT * weight @ np.abs(whole), axis=1))
-    )
-    if defect < 0.5:
-        rest = np.sum(weight @ (doubt + error @ np.abs(whole)), axis=1)
-        # A row of (I − F)⁻¹ Z: its own, and at most defect/(1 − defect) of the largest of the others.
-        rest = rest + defect / (1 - defect) * float(rest.max())
-        discs = rest.copy()
-        if large < n:
-            block = form[large:, large:]
-            size = float(np.linalg.norm(block))
-            height = float(np.linalg.norm(rest[large:])) + SCHUR_ROUNDINGS * n * UNIT * size
-            small_values = np.linalg.eigvals(block)
-            centres = np.concatenate([values[:large], small_values])
-            discs[large:] = _elsner(size, height, n - large)
-        if np.all(np.isfinite(discs)):
-            gershgorin = discs
-            if _reach(centres, gershgorin) <= _reach(values, radii):
-                radii = gershgorin
-            else:
-                centres = values
-    low, high, errors = _clusters(centres, radii)
-    # A real matrix: an eigenvalue alone in a disc across the real axis has no conjugate, so it is real.
-    alone = errors == radii
-    centres = np.where(alone & (np.abs(centres.imag) <= radii), centres.real + 0j, centres)
-    vectors, duals = _plain_vectors(matrix, whole, inverse, centres, large)
-    return centres, vectors, duals, errors, low, high
+    # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
+    wrong = np.abs(np.eye(n) - inverse @ right) + 4 * n * UNIT * (weight @ np.abs(right))
+    defect = float(wrong.sum(axis=1).max())
+    if not defect < 0.5:
+        return whole
+    rows = (weight @ doubt).sum(axis=1)
+    # A row of (I − F)⁻¹ Z: its own, and at most defect/(1 − defect) of the largest of them.
+    rows = rows + defect / (1 - defect) * float(rows.max())
+    centres, radii = values.copy(), rows
+    centres[large:] = 0.0
+    radii[large:] = _resolvent_radius(form[large:, large:], float(np.linalg.norm(rows[large:])))
+    if not np.isfinite(radii).all():
+        return whole
+    sharp = _Enclosure(values, centres, radii, right, inverse, large)
+    return sharp if sharp.width <= whole.width else whole
+
+
+def _resolvent_radius(block: Complexes, error: float) -> float:
+    """Return ρ such that no matrix within `error` (in the 2-norm) of the block has an eigenvalue beyond ρ.
+
+    For |λ| > ρ the Neumann series of the resolvent, grouped by K powers, gives
+    ‖(λ − T)⁻¹‖ ≤ Σ_{k<K} ‖T^k‖ ρ^(−k−1) / (1 − ‖T^K‖ ρ^(−K)); while that is less than 1/error, λ is no
+    eigenvalue.
+    """
+    n = len(block)
+    if not n:
+        return 0.0
+    size = float(np.linalg.norm(block))
+    powers, norms, rounding = np.eye(n, dtype=np.complex128), [1.0], 0.0
+    for _ in range(RESOLVENT_POWERS):
+        rounding = rounding * size + 4 * n * UNIT * size * float(np.linalg.norm(powers))
+        powers = powers @ block
+        norms.append(min(float(np.linalg.norm(powers)) + rounding, norms[-1] * size))
+    largest = size + error  # no eigenvalue is larger than the norm
+    if largest == 0.0:
+        return 0.0
+    # The bound falls with ρ: on a grid of eighths of octaves, the smallest ρ that still passes.
+    radii = largest * 2.0 ** (-np.arange(512) / 8)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        terms = np.array(norms)[None, :] / radii[:, None] ** np.arange(RESOLVENT_POWERS + 1)
+        sums = np.cumsum(terms, axis=1)[:, :-1] / radii[:, None]
+        passing = (terms[:, 1:] < 1) & (sums * error < 1 - terms[:, 1:])
+    return float(min(largest, radii[passing.any(axis=1)].min(initial=largest)))
+
+
+def _sorted_schur(matrix: Floats, limit: float) -> tuple[Complexes, Complexes, int]:
+    """Return the complex Schur form with the eigenvalues below a limit last, its basis, and how many are not.
+
+    The sort fails when rounding carries an eigenvalue across the limit; then there is no split.
+    """
+    try:
+        triangle, unitary, large = schur(matrix, output="complex", sort=lambda z: abs(z) >= limit)
+    except np.linalg.LinAlgError:
+        triangle, unitary = schur(matrix, output="complex")
+        large = len(matrix)
+    return triangle, unitary, int(large)
 
 
 def _triangular_vectors(triangle: Complexes) -> Complexes:
@@ -287,51 +373,37 @@ def _triangular_vectors(triangle: Complexes) -> Complexes:
     return vectors
 
 
-def _elsner(norm: float, error: float, n: int) -> float:
-    """Return Elsner's bound for a matrix of the given norm, moved by at most `error`."""
-    return float((2 * norm + error) ** (1 - 1 / n) * error ** (1 / n)) if n else 0.0
+def _clusters(found: _Enclosure) -> tuple[float, float, Floats]:
+    """Return bounds on the spectral radius and, for each estimate, how far its eigenvalue can be.
 
-
-def _reach(centres: Complexes, radii: Floats) -> float:
-    """Return the largest magnitude in the discs."""
-    return float(np.max(np.abs(centres) + radii, initial=0.0))
-
-
-def _clusters(centres: Complexes, radii: Floats) -> tuple[float, float, Floats]:
-    """Return bounds on the spectral radius and, for each centre, how far its eigenvalue can be.
-
-    k discs that hang together hold k eigenvalues, nobody knows which in which: each centre is then off by at
-    most the distance to the far side of any of them.
+    k discs that hang together hold k eigenvalues, nobody knows which in which: each estimate is then off by
+    at most the distance to the far side of any of them.
     """
+    centres, radii = found.centres, found.radii
     n = len(centres)
-    distance = np.abs(centres[:, None] - centres[None, :])
-    touching = distance <= radii[:, None] + radii[None, :]
+    touching = np.abs(centres[:, None] - centres[None, :]) <= radii[:, None] + radii[None, :]
     cluster = np.arange(n)
     for _ in range(n):
         spread = np.array([cluster[touching[i]].min() for i in range(n)])
         if np.array_equal(spread, cluster):
             break
         cluster = spread
-    errors = np.array([np.max(np.where(cluster == cluster[i], distance[i] + radii, 0.0)) for i in range(n)])
-    lows = [float(np.min(np.abs(centres[cluster == c]) - radii[cluster == c])) for c in np.unique(cluster)]
-    return max(0.0, *lows), _reach(centres, radii), errors
+    reach = np.abs(found.values[:, None] - centres[None, :]) + radii[None, :]
+    errors = np.where(cluster[:, None] == cluster[None, :], reach, 0.0).max(axis=1)
+    inner = np.abs(centres) - radii
+    low = max(0.0, *(float(inner[cluster == one].min()) for one in np.unique(cluster)))
+    return low, float((np.abs(centres) + radii).max()), errors
 
 
-def _plain_vectors(
-    matrix: Floats, whole: Complexes, inverse: Complexes, centres: Complexes, large: int
-) -> tuple[Complexes, Complexes]:
-    """Return right vectors (columns) and left vectors (rows) in the order of the centres.
+def _plain_vectors(matrix: Floats, found: _Enclosure, values: Complexes) -> tuple[Complexes, Complexes]:
+    """Return right vectors (columns) and left vectors (rows) in the order of the values.
 
     The large ones are columns of X and rows of its inverse. Of a small or defective one the vectors are
     singular vectors of M − λ: some vector that is right to rounding, where no full set exists.
     """
     n = len(matrix)
-    sound = bool(np.all(np.isfinite(inverse)))
-    right, left = np.zeros((n, n), dtype=np.complex128), np.zeros((n, n), dtype=np.complex128)
-    for i in range(n):
-        if i < large and sound:
-            right[:, i], left[i] = whole[:, i], inverse[i]
-        else:
-            rows, _, columns = np.linalg.svd(matrix - centres[i] * np.eye(n))
-            right[:, i], left[i] = columns[-1].conj(), rows[:, -1].conj()
+    right, left = found.right.copy(), found.inverse.copy()
+    for i in range(found.large, n):
+        rows, _, columns = np.linalg.svd(matrix - values[i] * np.eye(n))
+        right[:, i], left[i] = columns[-1].conj(), rows[:, -1].conj()
     return right, left

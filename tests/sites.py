@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import casadi
 from apc.compiler.compiled import (
@@ -154,6 +156,51 @@ def paper(
         groups=(Group("user", peers, 0),),
         dropped=(),
         origin=Origin("paper.yaml", ()),
+    )
+
+
+def alone(
+    derivative: Callable[..., Any] | None = None,
+    tick: Callable[..., Any] | None = None,
+    *,
+    outputs: tuple[str, ...] = ("f",),
+    memories: tuple[int, ...] = (),
+    delay: Fraction = Fraction(0),
+) -> CompiledSystem:
+    """Build one peer without network: dx/dt = derivative(x, u); each ms y = tick(x, u, m), y[0] acts."""
+    x, p, t = casadi.SX.sym("x"), casadi.SX.sym("p", 1), casadi.SX.sym("t")
+    u = casadi.SX.sym("u", 1 if tick else 0)
+    m, r = casadi.SX.sym("m", len(memories)), casadi.SX.sym("r", 0)
+    rate = derivative(x, u) if derivative else -x
+    partition = ClockPartition(
+        clock="haptic",
+        outputs=outputs,
+        memories=memories,
+        starts=("zero",) * len(memories),
+        receives=(),
+        tick=casadi.Function("tick", [x, u, m, r, p, t], [tick(x, u, m) if tick else casadi.SX(0, 1)]),
+    )
+    kind = Kind(
+        name="alone",
+        states=(State("x", "m", "zero"),),
+        holds=(Hold("f", "haptic", 0, "delay"),) if tick else (),
+        parameters=("zero",),
+        derivative=casadi.Function("derivative", [x, u, p, t], [rate]),
+        clocks=(partition,) if tick else (),
+        sends=(),
+    )
+    timings = (Timing("period", MS), Timing("phase", Fraction(0)), Timing("delay", delay))
+    return CompiledSystem(
+        name="alone",
+        about="One peer.",
+        clocks=(Clock("haptic", "period", "phase"),) if tick else (),
+        links=(),
+        timings=timings,
+        parameters=(Parameter("zero", "1", 0.0),),
+        kinds=(kind,),
+        groups=(Group("peer", 1, 0),),
+        dropped=(),
+        origin=Origin("alone.yaml", ()),
     )
 
 

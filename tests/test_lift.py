@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
+import casadi
 import numpy as np
 import pytest
 from apc.runtime.analysis import lifted_groups
 from apc.runtime.lift import LiftedSite
 from scipy.linalg import expm
-from sites import MS, paper
+
+from tests.sites import MS, alone, paper
 
 
 def _lifted(**values: object) -> LiftedSite:
@@ -68,7 +72,6 @@ def test_the_end_of_the_inside_is_the_continuous_part_of_the_map() -> None:
 def test_no_digit_is_lost_as_the_damping_goes_to_zero(damping: float) -> None:
     """(1 − e^(−bT/m)) m/b as expm1 has it; the plain formula loses every digit."""
     system = paper(kc=0.0, kt=0.0, comm=8 * MS)
-    from dataclasses import replace
 
     system = replace(
         system,
@@ -80,3 +83,45 @@ def test_no_digit_is_lost_as_the_damping_goes_to_zero(damping: float) -> None:
     rate = damping / 0.1
     expected = -np.expm1(-rate * 0.008) / rate if rate else 0.008
     assert group.lifted.p[0, 1] == pytest.approx(expected, rel=1e-13)
+
+
+# ---- one peer, dx/dt = −x + u sampled every millisecond: Φ = e^(−T), Γ = 1 − e^(−T) ----
+
+PHI = float(np.exp(-0.001))
+GAMMA = float(-np.expm1(-0.001))
+
+
+def _alone(**values: Any) -> LiftedSite:
+    [group] = lifted_groups(alone(lambda x, u: -x + u, **values))
+    return group.lifted
+
+
+def test_a_remembered_sample_is_a_delay_of_one_tick() -> None:
+    """u[k] = −3 x[k−1], by previous() or by a computational delay of one tick."""
+    remembered = _alone(
+        tick=lambda x, u, m: casadi.vertcat(-3 * m[0], x), outputs=("f", "seen"), memories=(1,)
+    )
+    delayed = _alone(tick=lambda x, u, m: -3 * x, delay=MS)
+    assert remembered.z_names == ("x", "seen(-1 ms)")
+    np.testing.assert_allclose(remembered.p, [[PHI, -3 * GAMMA], [1, 0]], rtol=1e-14)
+    np.testing.assert_allclose(delayed.p, [[PHI, GAMMA], [-3, 0]], rtol=1e-14)
+
+
+def test_a_memory_that_nothing_reads_is_no_state() -> None:
+    lifted = _alone(
+        tick=lambda x, u, m: casadi.vertcat(-3 * x, m[0] + x), outputs=("f", "sum"), memories=(1,)
+    )
+    assert lifted.z_names == ("x",)
+
+
+def test_a_tick_that_reads_a_hold_reads_it_before_it_switches() -> None:
+    """f[k] = 0.5 u(t⁻) + 2 x with u(t⁻) = f[k−1]; then x[k+1] = Φ x + Γ f[k]."""
+    lifted = _alone(tick=lambda x, u, m: 0.5 * u[0] + 2 * x)
+    assert lifted.z_names == ("x", "f(-1 ms)")
+    np.testing.assert_allclose(lifted.p, [[PHI + 2 * GAMMA, 0.5 * GAMMA], [2, 0.5]], rtol=1e-14)
+
+
+def test_a_site_without_clocks_is_its_exponential() -> None:
+    [group] = lifted_groups(alone())
+    assert group.lifted.frame_s == 1.0
+    np.testing.assert_allclose(group.lifted.p, [[np.exp(-1.0)]], rtol=1e-15)

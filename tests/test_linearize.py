@@ -9,7 +9,8 @@ import casadi
 import numpy as np
 from apc.runtime.linearize import jacobians, linearize, linearize_exact, same_dynamics
 from apc.runtime.parameters import resolve
-from sites import NAMES, paper, user
+
+from tests.sites import NAMES, paper, user
 
 
 def _vector(**values: float) -> np.ndarray:

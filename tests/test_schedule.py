@@ -9,7 +9,8 @@ import pytest
 from apc.runtime.linearize import jacobians
 from apc.runtime.parameters import resolve
 from apc.runtime.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, Tick, Value, build_schedules
-from sites import MS, paper
+
+from tests.sites import MS, paper
 
 
 def _schedule(order: tuple[str, ...] = ORDER, **values: object) -> Schedule:

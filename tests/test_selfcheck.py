@@ -9,7 +9,8 @@ import apc.runtime.selfcheck as selfcheck
 import pytest
 from apc.runtime.lift import LiftedSite, lift
 from apc.runtime.selfcheck import check_frame
-from sites import MS, grouped, paper
+
+from tests.sites import MS, grouped, paper
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ MOVES_WIDTH = 30  # what the other columns leave of 80
 _WORDS = {
     "stable": "Every motion dies out.",
     "stable up to a common translation": (
-        "Nothing ties the peers to the ground: moved together, they stay where they are.\n"
+        "Nothing ties the peers to the ground; moved together they stay where they are.\n"
         "Every other motion dies out."
     ),
     "drifts": "Nothing slows a common motion down. Every other motion dies out.",

@@ -1,0 +1,109 @@
+"""`apc`: plain functions with frozen results, the same as the commands."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import apc
+import pytest
+from tests.topologies import SCENES, told
+
+PATH = SCENES / "three-users-average.yaml"
+
+
+@pytest.fixture(scope="module")
+def model() -> apc.CompiledSystem:
+    return apc.compile(PATH)
+
+
+def test_the_example_of_the_package_holds(model: apc.CompiledSystem) -> None:
+    assert "'stable up to a common translation'" in (apc.__doc__ or "")
+    assert apc.analyze(model).verdict == "stable up to a common translation"
+
+
+def test_every_public_name_is_there_and_nothing_else() -> None:
+    assert set(apc.__all__) <= set(dir(apc))
+    assert all(getattr(apc, name).__doc__ for name in apc.__all__)
+    assert apc.__version__
+    with pytest.raises(AttributeError, match="module 'apc' has no attribute 'nothing'"):
+        apc.nothing  # noqa: B018 # looking it up is the test
+
+
+def test_a_saved_model_analyses_as_the_one_it_was(model: apc.CompiledSystem, tmp_path: Path) -> None:
+    path = tmp_path / "scene.apc"
+    apc.save(model, path)
+    assert apc.analyze(apc.load(path)) == apc.analyze(model)
+    assert apc.analyze(path) == apc.analyze(str(PATH)) == apc.analyze(model)
+
+
+def test_setting_changes_a_copy_only(model: apc.CompiledSystem) -> None:
+    changed = apc.set_parameters(model, {"coordination.stiffness": "5 N/mm", "lan.delay": "16 ms"})
+    assert changed is not model
+    stiffness = {p.name: p.value for p in changed.parameters}["coordination.stiffness"]
+    assert stiffness == 5000
+    assert {p.name: p.value for p in model.parameters}["coordination.stiffness"] == 500
+    assert apc.analyze(changed).verdict == "unstable"
+    assert apc.analyze(model, set={"coordination.stiffness": "5 N/mm", "lan.delay": "16 ms"}) == apc.analyze(
+        changed
+    )
+
+
+def test_setting_a_value_is_as_good_as_writing_it(model: apc.CompiledSystem, tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(PATH.read_text(encoding="utf-8").replace("500 N/m,", "800 N/m,"), encoding="utf-8")
+    written = apc.analyze(path)
+    assert apc.analyze(model, set={"coordination.stiffness": "800 N/m"}) == written
+
+
+def test_the_methods_agree(model: apc.CompiledSystem) -> None:
+    modes, dense = apc.analyze(model), apc.analyze(model, method="dense")
+    assert (modes.method, dense.method) == ("modes", "dense")
+    assert modes.verdict == dense.verdict
+    assert abs(modes.spectral_radius - dense.spectral_radius) < 1e-12
+
+
+def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
+    result = apc.analyze(model)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        result.verdict = "stable"  # type: ignore[misc] # that it can't be done is the test
+    document = result.to_dict()
+    assert set(document) >= {
+        *("topology", "peers", "frame_s", "states_per_peer", "method", "verdict", "stable"),
+        *("spectral_radius", "spectral_radius_error", "rigid_modes", "modes"),
+    }
+    assert sum(mode["multiplicity"] for mode in document["modes"]) == 3 * 8 - 1, "all but the translation"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"coordination.stifness": "1 N/m"},
+            "override: E502 coordination.stifness is no parameter of three-users-average. "
+            "Write: coordination.stiffness",
+        ),
+        ({"device.mass": "0 kg"}, "override: E504 device.mass wants more than 0 kg, got 0 kg."),
+        (
+            {"device.mass": "1"},
+            "override: E204 device.mass wants kg, got 1 (no unit). Write: device.mass: 1 kg",
+        ),
+        (
+            {"peers": "4"},
+            "override: E503 peers is the number of peers: change a count and compile again.",
+        ),
+        ({"haptic.period": "0 s"}, "override: E505 haptic.period wants a time above 0 s, got 0.0 s."),
+    ],
+)
+def test_a_setting_that_cannot_be_is_told(
+    model: apc.CompiledSystem, settings: dict[str, str], message: str
+) -> None:
+    assert told(apc.set_parameters, model, settings) == [message]
+
+
+def test_a_faulty_file_raises_all_its_mistakes(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text("topology: a\n", encoding="utf-8")
+    with pytest.raises(apc.ApcError) as caught:
+        apc.compile(path)
+    assert [mistake.code for mistake in caught.value.mistakes] == ["E201", "E201"]

@@ -1,0 +1,142 @@
+"""The plan of the house: data flows one way, each command loads what it needs, nothing is evaluated."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from tests.topologies import AVERAGE, ROOT
+
+# Every module, earliest first: each may import only those before it.
+ORDER = (
+    *("apc.compiler.errors", "apc.compiler.source", "apc.compiler.expression", "apc.compiler.units"),
+    *("apc.compiler.dimensions", "apc.compiler.reading", "apc.compiler.library", "apc.compiler.scene"),
+    *("apc.compiler.flatten", "apc.compiler.clocks", "apc.compiler.symbolic", "apc.compiler.structure"),
+    *("apc.compiler.compiled", "apc.compiler.functions", "apc.compiler.pipeline", "apc.compiler.listing"),
+    "apc.compiler.store",
+    *("apc.runtime.threads", "apc.runtime.parameters", "apc.runtime.exact", "apc.runtime.linearize"),
+    *("apc.runtime.schedule", "apc.runtime.lift", "apc.runtime.modes", "apc.runtime.rigid"),
+    *("apc.runtime.spectrum", "apc.runtime.selfcheck", "apc.runtime.analysis", "apc.runtime.needs"),
+    *("apc.inputs", "apc.api", "apc.report", "apc.cli", "apc.__main__"),
+)
+PACKAGES = {"compiler": "apc.compiler", "runtime": "apc.runtime", "runtime/apc": "apc"}
+FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "sympify", "parse_expr", "lambdify", "S"}
+FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "sympy.parsing"}
+
+
+def modules() -> dict[str, Path]:
+    return {
+        f"{package}.{path.stem}": path
+        for folder, package in PACKAGES.items()
+        for path in sorted((ROOT / folder).glob("*.py"))
+        if path.stem != "__init__"
+    }
+
+
+def imports(path: Path) -> set[str]:
+    """Return the names of our own modules that a file imports, anywhere in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name} imports relatively"
+            found.add(node.module or "")
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found & set(ORDER)
+
+
+def test_every_module_has_its_place_in_the_order() -> None:
+    assert sorted(modules()) == sorted(ORDER)
+
+
+@pytest.mark.parametrize("module", ORDER)
+def test_a_module_imports_only_what_comes_before_it(module: str) -> None:
+    allowed = set(ORDER[: ORDER.index(module)])
+    assert imports(modules()[module]) <= allowed
+
+
+@pytest.mark.parametrize("module", [name for name in ORDER if name.startswith("apc.compiler.")])
+def test_the_compiler_never_imports_the_runtime(module: str) -> None:
+    text = modules()[module].read_text(encoding="utf-8")
+    assert "apc.runtime" not in text
+
+
+def test_nothing_is_evaluated_or_unpickled() -> None:
+    for name, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call):
+                function = node.func
+                called = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+                # `re.compile` and our own `api.compile` are no Python `compile`.
+                own = called == "compile" and isinstance(function, ast.Attribute)
+                assert own or called not in FORBIDDEN_CALLS, f"{name}:{node.lineno}: {called}"
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            assert not FORBIDDEN_MODULES & set(names), f"{name}: {names}"
+
+
+def python(code: str, folder: Path) -> str:
+    """Run Python in a fresh process and return what it prints."""
+    ran = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def loaded(code: str, folder: Path) -> set[str]:
+    """Return the names of the top modules that are loaded after running code."""
+    out = python(code + "\nimport sys; print('LOADED', *sorted({n.split('.')[0] for n in sys.modules}))", folder)
+    return set(out.splitlines()[-1].split())
+
+
+def test_importing_the_package_costs_nothing(tmp_path: Path) -> None:
+    heavy = {"numpy", "casadi", "scipy", "sympy", "pint", "yaml", "click", "rich", "flint"}
+    assert not heavy & loaded("import apc", tmp_path)
+
+
+def test_analysing_a_compiled_model_needs_no_algebra_and_no_units(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    run = "from apc.__main__ import run\nassert run([{}]) == 0"
+    compiled = loaded(run.format("'compile'"), tmp_path)
+    assert {"sympy", "pint", "casadi"} <= compiled
+    for words in ("'analyze'", "'analyze', 'scene.apc'", "'analyze', '--json'"):
+        assert not {"sympy", "pint"} & loaded(run.format(words), tmp_path)
+
+
+def test_the_text_of_a_scene_is_not_computed_with_numbers_of_the_runtime(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    code = "from apc.compiler.pipeline import run_stages\nfrom pathlib import Path\n"
+    code += "run_stages(Path('scene.yaml'), until='compiled')\nimport sys\n"
+    code += "assert not [n for n in sys.modules if n.startswith('apc.runtime')]"
+    python(code, tmp_path)
+
+
+def test_the_wheel_brings_one_name_to_site_packages_and_every_model(tmp_path: Path) -> None:
+    pytest.importorskip("setuptools", minversion="77")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist")]
+    copy = tmp_path / "source"
+    for name in ("pyproject.toml", "README.md", "compiler", "runtime", "models"):
+        for path in [ROOT / name] if (ROOT / name).is_file() else sorted((ROOT / name).rglob("*.*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                target = copy / path.relative_to(ROOT)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(path.read_bytes())
+    ran = subprocess.run([*command, str(copy)], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    tops = {name.split("/")[0] for name in names}
+    assert {top for top in tops if not re.fullmatch(r"apc-[\d.]+\.dist-info", top)} == {"apc"}
+    packed = {name.removeprefix("apc/models/") for name in names if name.endswith(".yaml")}
+    here = {str(path.relative_to(ROOT / "models")) for path in (ROOT / "models").rglob("*.yaml")}
+    assert packed == here
+    assert "apc/py.typed" in names

@@ -1,0 +1,148 @@
+"""`clocks`: every variable gets one clock, every crossing is said and named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from apc.compiler.clocks import ClockedKind
+from apc.compiler.expression import format_expression
+from tests.topologies import AVERAGE, MESH, ONE_MASS, clocked, library, replaced, told
+
+# A component whose equations are the test's; `s` and `w` may belong to a clock or to none.
+PART = """\
+component: Part
+connectors: {{flange: Flange}}
+parameters: {{clock: clock, k: {{unit: N/m, default: 1}}}}
+variables: {{s: {{unit: m}}, w: {{unit: m}}}}
+equations:
+  - {first}
+  - {second}
+  - {third}
+"""
+TEXT = ONE_MASS + "clocks: {tick: 1 ms, tock: 2 ms}\nhands:\n  hand: {type: Part, flange: device, clock: tick}\n"
+
+
+def only(text: str) -> ClockedKind:
+    (kind,) = clocked(text).kinds
+    return kind
+
+
+def of_part(folder: Path, *equations: str) -> ClockedKind:
+    first, second, third = equations
+    own = library(folder, PART.format(first=first, second=second, third=third))
+    (kind,) = clocked(TEXT, own).kinds
+    return kind
+
+
+def told_of(folder: Path, *equations: str) -> list[str]:
+    first, second, third = equations
+    own = library(folder, PART.format(first=first, second=second, third=third))
+    return [line.rpartition("/")[2] for line in told(clocked, TEXT, own)]
+
+
+@pytest.mark.parametrize("text", [AVERAGE, MESH])
+def test_the_papers_scene_is_one_continuous_and_one_haptic_partition(text: str) -> None:
+    kind = only(text)
+    assert [partition.clock for partition in kind.partitions] == ["continuous", "haptic"]
+    assert kind.partitions[1].variables == (
+        *("contact.f", "coordination.own", "coordination.received", "coordination.f"),
+    )
+    for partition in kind.partitions:
+        assert len(partition.variables) == len(partition.equations)
+
+
+def test_every_crossing_of_the_papers_scene_is_named() -> None:
+    kind = only(AVERAGE)
+    assert [sample.symbol for sample in kind.samples] == [
+        "sample(contact.a.x, haptic)",
+        "sample(contact.b.x, haptic)",
+        "sample(der(contact.a.x), haptic)",
+        "sample(der(contact.b.x), haptic)",
+        "sample(coordination.object.x, haptic)",
+        "sample(der(coordination.object.x), haptic)",
+    ]
+    assert [(hold.variable, hold.clock, format_expression(hold.delay)) for hold in kind.holds] == [
+        ("contact.f", "haptic", "contact.delay"),
+        ("coordination.f", "haptic", "coordination.delay"),
+    ]
+    assert [(r.operator, r.send, r.link, r.clock) for r in kind.receives] == [
+        ("mean", "coordination.x", "lan", "haptic"),
+        ("mean", "coordination.v", "lan", "haptic"),
+    ]
+    assert [(send.name, send.link, format_expression(send.expression)) for send in kind.sends] == [
+        ("coordination.x", "lan", "coordination.object.x"),
+        ("coordination.v", "lan", "der(coordination.object.x)"),
+    ]
+    assert kind.previous == ()
+
+
+def test_one_value_held_with_two_delays_is_two_holds() -> None:
+    own = only(replaced(AVERAGE, ("link: lan", "link: lan, delays: own")))
+    assert [(hold.variable, format_expression(hold.delay)) for hold in own.holds] == [
+        ("contact.f", "contact.delay"),
+        ("coordination.own", "coordination.delay"),
+        ("coordination.received", "0"),
+    ]
+
+
+def test_previous_is_a_crossing_to_the_tick_before(tmp_path: Path) -> None:
+    kind = of_part(tmp_path, "s = previous(s) + sample(flange.x)", "w = 2*s", "flange.f = k*hold(w)")
+    assert [(p.symbol, p.variable, p.clock) for p in kind.previous] == [
+        ("previous(hand.s)", "hand.s", "tick")
+    ]
+    assert kind.partitions[1].variables == ("hand.s", "hand.w")
+
+
+def test_an_expression_that_is_held_gets_a_variable_of_its_own(tmp_path: Path) -> None:
+    kind = of_part(tmp_path, "s = sample(flange.x)", "w = s", "flange.f = k*hold(s - 2*w)")
+    assert [hold.variable for hold in kind.holds] == ["hand.held1"]
+    assert "hand.held1" in kind.partitions[1].variables
+
+
+def test_a_continuous_variable_needs_sample_to_be_read_at_a_tick(tmp_path: Path) -> None:
+    assert told_of(tmp_path, "s = sample(flange.x)", "w = s + flange.x", "flange.f = k*hold(w)") == [
+        "part0.yaml:7:5: E505 in `hand.w = hand.s + hand.flange.x` of hand, hand.flange.x is continuous "
+        "and the rest is on clock tick. Write: sample(hand.flange.x)"
+    ]
+
+
+def test_a_clocked_variable_needs_hold_to_act(tmp_path: Path) -> None:
+    assert told_of(tmp_path, "s = sample(flange.x)", "w = s", "flange.f = k*w") == [
+        "scene.yaml:7:3: E505 in `device.flange.f + hand.flange.f = 0` of connection, hand.flange.f is on "
+        "clock tick and the rest is continuous. Write: hold(hand.flange.f)"
+    ]
+
+
+def test_what_is_continuous_already_cannot_be_held(tmp_path: Path) -> None:
+    (line,) = told_of(tmp_path, "s = flange.x", "w = s", "flange.f = k*hold(w)")
+    assert line == (
+        "part0.yaml:8:5: E505 hold(hand.w, 0) of hand holds hand.w, which is continuous already. Write: hand.w"
+    )
+
+
+def test_the_others_are_heard_one_value_at_a_time(tmp_path: Path) -> None:
+    text = (
+        "component: Follower\nconnectors: {flange: Flange}\nsends: {x: sample(flange.x)}\n"
+        "parameters: {clock: clock, link: link, k: {unit: N/m}}\n"
+        "equations: [f = k*mean(2*others.x), flange.f = hold(f)]\n"
+    )
+    scene = (
+        ONE_MASS.replace("count: 1", "count: 2")
+        + "clocks: {tick: 1 ms}\nlinks: {lan: {clock: tick}}\n"
+        + "couplers: {all: {type: Follower, flange: device, k: 1 N/m, clock: tick, link: lan}}\n"
+    )
+    (line,) = told(clocked, scene, library(tmp_path, text))
+    assert line.rpartition("/")[2] == (
+        "part0.yaml:5:13: E506 mean(2*others.all.x) of all wants one value that the others send, "
+        "such as others.x."
+    )
+
+
+def test_the_time_convention_stands_in_the_docstring_of_this_stage() -> None:
+    import apc.compiler.clocks as stage
+
+    assert stage.__doc__ is not None
+    order = [stage.__doc__.index(word) for word in ("are sampled", "network clocks tick", "force clocks tick")]
+    assert order == sorted(order)
+    assert "a tick at exactly t + T_d sees it" in stage.__doc__

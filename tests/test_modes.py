@@ -1,0 +1,175 @@
+"""Claims about `apc.runtime.modes`."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis import lifted_groups
+from apc.runtime.modes import dense, modes
+
+from tests.bruteforce import Scene, frame_matrix
+from tests.sites import MS, grouped, paper
+
+# Queues that run empty make defective eigenvalues at zero, which rounding scatters by its n-th root: all that
+# is smaller than this per frame is compared by number only.
+SMALL = 1e-2
+
+
+def _split(system: CompiledSystem) -> np.ndarray:
+    """Return all eigenvalues of the split system, each as often as it counts."""
+    return np.concatenate(
+        [np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in modes(lifted_groups(system))]
+    )
+
+
+def _apart(one: np.ndarray, other: np.ndarray, *, same_size: bool = True) -> float:
+    """Return the largest distance when two spectra are paired, nearest first; small ones are counted only."""
+    if same_size:
+        assert len(one) == len(other)
+    mine, yours = one[np.abs(one) > SMALL], list(other[np.abs(other) > SMALL])
+    assert len(mine) == len(yours)
+    worst = 0.0
+    for value in mine:
+        nearest = min(range(len(yours)), key=lambda place: abs(yours[place] - value))
+        worst = max(worst, abs(yours.pop(nearest) - value))
+    return worst
+
+
+GAINS = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
+
+
+@pytest.mark.parametrize("peers", range(2, 31))
+def test_common_and_difference_modes_are_the_whole_spectrum(peers: int) -> None:
+    operator = "mean" if peers % 2 else "sum"
+    gains = GAINS if operator == "mean" else {**GAINS, "kt": 800.0 / peers, "bt": 2.0 / peers}
+    comp = MS if peers <= 8 else Fraction(0)
+    system = paper(operator, peers=peers, comp=comp, **gains)
+    whole = np.linalg.eigvals(dense(lifted_groups(system)).matrix)
+    assert _apart(_split(system), whole) < 1e-12
+
+
+def test_groups_are_the_whole_spectrum_too() -> None:
+    system = grouped(
+        paper("sum", kt=300.0, bt=1.0, kc=1500.0, bc=2.0, comm=11 * MS),
+        ("left", 2, {"device.mass": 0.15}),
+        ("right", 3, {"contact.stiffness": 900.0}),
+        ("alone", 1, {"cube.damping": 7.0}),
+    )
+    groups = lifted_groups(system)
+    assert [(one.name, one.multiplicity) for one in modes(groups)] == [
+        ("common", 1),
+        ("difference left", 1),
+        ("difference right", 2),
+    ]
+    assert modes(groups)[0].names[:2] == ("left.device.x", "left.device.v")
+    assert _apart(_split(system), np.linalg.eigvals(dense(groups).matrix)) < 1e-12
+
+
+def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
+    system = grouped(paper(), ("left", 2, {"device.x.start": 0.1}), ("right", 1, {"hand.force": 2.0}))
+    [group] = lifted_groups(system)
+    assert (group.name, group.count) == ("left+right", 3)
+    assert [one.name for one in modes([group])] == ["common", "difference"]
+
+
+CONVENTIONS: list[dict[str, object]] = [
+    {},
+    {"operator": "sum"},
+    {"comm": 4 * MS},
+    {"comm": 11 * MS},
+    {"comp": MS * 2 / 5},
+    {"comp": MS * 5 / 2},
+    {"comp": 3 * MS, "comm": 24 * MS},
+    {"comp": Fraction(0), "comm": Fraction(0)},
+    {"comp": Fraction(0), "comm": Fraction(0), "haptic_phase": MS / 2},
+    {"haptic_phase": MS * 3 / 10, "network_phase": MS * 5 / 2, "comm": 5 * MS},
+    {"haptic": 2 * MS, "network": 5 * MS, "comm": 7 * MS},
+    {"haptic": 2 * MS, "network": 3 * MS},
+    {"haptic": 3 * MS, "network": 2 * MS, "comm": Fraction(0), "comp": Fraction(0)},
+    {"haptic": 2 * MS, "network": MS, "comm": MS / 2},
+    {"haptic": MS, "network": MS, "comm": Fraction(0)},
+    {"own_delay": True},
+    {"own_delay": True, "operator": "sum", "comm": Fraction(0)},
+]
+
+
+@pytest.mark.parametrize("values", CONVENTIONS)
+def test_peers_stepped_one_by_one_have_the_same_spectrum(values: dict[str, object]) -> None:
+    system = paper(**GAINS, **values)  # type: ignore[arg-type]
+    whole = np.linalg.eigvals(np.array(frame_matrix(Scene(**GAINS, **values))))  # type: ignore[arg-type]
+    assert _apart(_split(system), whole, same_size=False) < 1e-12
+
+
+def test_different_peers_stepped_one_by_one_have_the_same_spectrum() -> None:
+    system = grouped(
+        paper(comm=5 * MS, **GAINS), ("light", 2, {}), ("heavy", 1, {"device.mass": 0.3, "cube.mass": 0.4})
+    )
+    scene = Scene(comm=5 * MS, **GAINS, users=({}, {}, {"device": 0.3, "cube": 0.4}))
+    whole = np.linalg.eigvals(np.array(frame_matrix(scene)))
+    assert _apart(_split(system), whole, same_size=False) < 1e-12
+
+
+@pytest.mark.parametrize("peers", [2, 3, 5, 20])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"comp": Fraction(0), "comm": Fraction(0)},
+        {"comm": 11 * MS, "comp": MS * 2 / 5},
+        {"own_delay": True},
+    ],
+)
+def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values: dict[str, object]) -> None:
+    others = peers - 1
+    gains = {"kc": 1500.0, "bc": 2.0}
+    mesh = paper("sum", peers=peers, kt=900.0 / others, bt=3.0 / others, **gains, **values)  # type: ignore[arg-type]
+    mean = paper("mean", peers=peers, kt=900.0, bt=3.0, **gains, **values)  # type: ignore[arg-type]
+    for one, other in zip(modes(lifted_groups(mesh)), modes(lifted_groups(mean)), strict=True):
+        size = np.abs(other.matrix).max()
+        np.testing.assert_allclose(one.matrix, other.matrix, rtol=1e-12, atol=1e-12 * size)
+        assert _apart(np.linalg.eigvals(one.matrix), np.linalg.eigvals(other.matrix)) < 1e-12
+
+
+def test_two_peers_cannot_tell_a_mean_from_a_sum() -> None:
+    for one, other in zip(
+        modes(lifted_groups(paper("sum", peers=2))), modes(lifted_groups(paper("mean", peers=2))), strict=True
+    ):
+        np.testing.assert_array_equal(one.matrix, other.matrix)
+
+
+def test_a_million_peers_are_two_small_systems() -> None:
+    systems = modes(lifted_groups(paper(peers=1_000_000)))
+    assert [(len(one.matrix), one.multiplicity) for one in systems] == [(8, 1), (8, 999_999)]
+
+
+def test_the_error_bound_covers_the_matrix() -> None:
+    """The truth is the same map at 50 digits, entry by entry, of one mode's own matrix."""
+    mpmath = pytest.importorskip("mpmath")
+    with mpmath.workdps(50):
+        rows = frame_matrix(Scene(peers=2, **GAINS, comp=Fraction(0)), number=_number, exp=mpmath.exp)
+    system = paper(peers=2, comp=Fraction(0), **GAINS)
+    whole = dense(lifted_groups(system))
+    assert [name.split(".", 1)[1] for name in whole.names[:6]] == [
+        "device.x",
+        "device.v",
+        "cube.x",
+        "cube.v",
+        "coordination.v sent(-8 ms)",
+        "coordination.x sent(-8 ms)",
+    ]
+    size = len(rows) // 2
+    packet = 4 + 3 * 1
+    own = [0, 1, 2, 3, packet + 1, packet]
+    places = [*own, *(size + place for place in own)]
+    for i, row in enumerate(places):
+        for j, column in enumerate(places):
+            assert abs(rows[row][column] - mpmath.mpf(whole.matrix[i, j])) <= whole.error[i, j]
+
+
+def _number(value: object) -> object:
+    import mpmath
+
+    return mpmath.mpf(value)

@@ -1,0 +1,79 @@
+"""`report`: what decides stands with its error, in 80 columns."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+from apc.report import WIDTH, analysis_report, compile_report
+from apc.runtime.analysis import analyze_modes
+from apc.runtime.needs import needs
+from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
+
+LONG = replaced(AVERAGE, ("user: {count: 3}", "a_long_name_of_a_group: {count: 2, set: {device.mass: 1 kg}}"))
+LONG += "  # and more\n"
+
+
+@pytest.mark.parametrize("text", [AVERAGE, MESH, ONE_MASS, LONG])
+def test_no_line_is_wider_than_a_terminal(text: str) -> None:
+    system = compiled(text)
+    for told in (
+        compile_report(system, needs(system), Path("scene.apc"), 2e-16),
+        analysis_report(analyze_modes(system)),
+    ):
+        assert max(len(line) for line in told.splitlines()) <= WIDTH
+
+
+def test_compiling_tells_what_the_scene_needs() -> None:
+    system = compiled(AVERAGE)
+    assert compile_report(system, needs(system), Path("scene.apc"), 2.22e-16).splitlines() == [
+        "three-users-average → scene.apc",
+        "  8 states a peer (4 motion, 2 delayed force, 2 network), 3 peers; analysed as",
+        "    2 modes of 8",
+        "  frame 8 ms: haptic ticks 8 times, network once",
+        "  self-check: one frame event by event and lifted differ by 2e-16",
+    ]
+
+
+def test_compiling_tells_what_was_left_out() -> None:
+    system = compiled(replaced(AVERAGE, ("  lan: {", "  wan: {clock: network}\n  lan: {")))
+    lines = compile_report(system, needs(system), Path("scene.apc"), 0.0).splitlines()
+    assert lines[-1] == "  left out: wan, as nobody hears what it would carry"
+
+
+def test_a_scene_without_clocks_says_so() -> None:
+    system = compiled(ONE_MASS)
+    told = compile_report(system, needs(system), Path("scene.apc"), 0.0)
+    assert "  frame 1 s: no clock is used, any frame will do" in told.splitlines()
+
+
+def test_an_analysis_names_verdict_radius_and_error() -> None:
+    result = analyze_modes(compiled(AVERAGE))
+    lines = analysis_report(result).splitlines()
+    assert lines[0] == "three-users-average: stable up to a common translation"
+    radius = next(line for line in lines if "spectral radius" in line)
+    assert f"{result.spectral_radius:.12g} ± {result.spectral_radius_error:.0e} per frame of 8 ms" in radius
+    assert "  peers            3, 8 states each" in lines
+    assert "  method           modes, 1 translation left out" in lines
+
+
+def test_a_conjugate_pair_is_one_row_and_the_rest_is_counted() -> None:
+    result = analyze_modes(compiled(AVERAGE))
+    rows = [line for line in analysis_report(result).splitlines() if " Hz " in line or " – " in line]
+    shown = [mode for mode in result.modes if mode.eigenvalue.imag >= 0 and mode.magnitude > 1e-6]
+    assert len(rows) == len(shown)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [
+        ("stable", "Every motion dies out."),
+        ("drifts", "Nothing slows a common motion down."),
+        ("unstable", "Some motion grows"),
+        ("undecided: |ρ−1| below the error bound", "lies nearer to 1 than its error bound"),
+    ],
+)
+def test_every_verdict_is_told_in_words(verdict: str, words: str) -> None:
+    result = dataclasses.replace(analyze_modes(compiled(ONE_MASS)), verdict=verdict)
+    assert words in analysis_report(result)

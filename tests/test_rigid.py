@@ -1,0 +1,114 @@
+"""Claims about `apc.runtime.rigid`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis import lifted_groups
+from apc.runtime.modes import ClosedSystem, dense, modes
+from apc.runtime.rigid import find_rigid_modes
+
+from tests.sites import MS, grouped, paper
+
+
+def _closed(system: CompiledSystem) -> Sequence[ClosedSystem]:
+    return modes(lifted_groups(system))
+
+
+def _undamped(**values: object) -> CompiledSystem:
+    system = paper(**values)  # type: ignore[arg-type]
+    return grouped(system, ("user", system.peers, {"device.damping": 0.0, "cube.damping": 0.0}))
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+def test_tied_peers_translate_together_and_in_no_other_way(operator: str) -> None:
+    common, difference = _closed(paper(operator))
+    [name] = find_rigid_modes(common).names
+    assert name == "device.x, cube.x, coordination.x sent(-8 ms)"
+    assert find_rigid_modes(common).drifts == 0
+    assert find_rigid_modes(difference).directions.shape == (8, 0)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"kt": 0.0, "bt": 0.0}, [1, 1]),  # nothing ties the peers
+        ({"kt": 0.0, "bt": 2.0}, [1, 1]),  # a damper holds no position
+        ({"kt": 0.0, "bt": 2.0, "kc": 0.0}, [2, 2]),  # device and cube apart
+        ({"kt": 1e-300}, [1, 0]),  # the weakest spring holds
+        ({"kc": 1e-300}, [1, 0]),
+        ({"kc": 0.0}, [2, 1]),
+    ],
+)
+def test_a_stiffness_of_exactly_zero_frees_what_it_held(
+    values: dict[str, float], expected: list[int]
+) -> None:
+    found = [find_rigid_modes(system).directions.shape[1] for system in _closed(paper(**values))]
+    assert found == expected
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"operator": "sum", "own_delay": True},
+        {"kt": 0.0, "bt": 0.0, "kc": 0.0},
+        {"comp": MS * 5 / 2, "comm": 11 * MS},
+        {"comp": Fraction(0), "comm": Fraction(0)},
+        {
+            "haptic": 3 * MS,
+            "network": 2 * MS,
+            "haptic_phase": MS / 3,
+            "network_phase": MS / 2,
+            "comm": 5 * MS,
+        },
+    ],
+)
+def test_a_direction_is_an_eigenvector_with_eigenvalue_one(values: dict[str, object]) -> None:
+    for system in _closed(paper(**values)):  # type: ignore[arg-type]
+        for direction in find_rigid_modes(system).directions.T:
+            moved = system.matrix @ direction
+            size = np.abs(system.matrix) @ np.abs(direction)
+            assert np.all(np.abs(moved - direction) <= 1e-13 * np.maximum(size, 1))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"kt": 0.0, "bt": 0.0}, [1, 1]),
+        ({"kt": 0.0, "bt": 2.0}, [1, 0]),  # apart, the damper brakes
+        ({"kt": 0.0, "bt": 2.0, "own_delay": True, "comp": MS}, [1, 0]),
+        ({"kt": 0.0, "bt": 2.0, "operator": "sum", "comm": 11 * MS}, [1, 0]),
+        ({"kt": 100.0, "bt": 2.0}, [0, 0]),  # the late network brakes, see Facts: K_eff((T_n − T_c)/2 + T_d)
+        ({"kt": 0.0, "bt": 0.0, "kc": 0.0}, [2, 2]),
+    ],
+)
+def test_undamped_peers_drift_as_far_as_nothing_brakes_them(
+    values: dict[str, object], expected: list[int]
+) -> None:
+    for system, drifts in zip(_closed(_undamped(**values)), expected, strict=True):
+        rigid = find_rigid_modes(system)
+        assert rigid.drifts == drifts
+        # A Jordan pair: M w − w lies in the span of the directions and does not vanish.
+        for vector in rigid.generalized.T:
+            step = system.matrix @ vector - vector
+            part = np.linalg.lstsq(rigid.directions, step, rcond=None)[0]
+            assert np.abs(rigid.directions @ part - step).max() < 1e-12
+            assert np.abs(step).max() > 1e-4
+
+
+def test_a_damped_drift_is_none() -> None:
+    assert [find_rigid_modes(system).drifts for system in _closed(paper(kt=0.0))] == [0, 0]
+
+
+def test_groups_and_the_dense_system_have_the_same_rigid_modes() -> None:
+    system = grouped(
+        paper(kt=0.0), ("left", 2, {"device.mass": 0.2}), ("right", 3, {"contact.stiffness": 0.0})
+    )
+    groups = lifted_groups(system)
+    split = sum(one.multiplicity * find_rigid_modes(one).directions.shape[1] for one in modes(groups))
+    assert split == find_rigid_modes(dense(groups)).directions.shape[1] == 2 + 3 * 2

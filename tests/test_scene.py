@@ -1,0 +1,264 @@
+"""`scene`: every quantity in SI and exact, every name resolved, every mistake of the file at once."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import pytest
+from apc.compiler.scene import LARGEST_COUNT
+from tests.topologies import AVERAGE, MESH, ONE_MASS, replaced, scene, told
+
+GROUPS = replaced(
+    AVERAGE,
+    (
+        "  user: {count: 3}",
+        "  right: {count: 1, set: {device.mass: 200 g, device.x: 30 mm}}\n  left: {count: 2}",
+    ),
+)
+
+
+def messages(*pairs: tuple[str, str], text: str = AVERAGE) -> list[str]:
+    """Return what is told about a scene with pieces of its text replaced, without the file's name."""
+    return [line.removeprefix("scene.yaml:") for line in told(scene, replaced(text, *pairs))]
+
+
+def test_the_papers_scene_is_read_whole_and_in_exact_si() -> None:
+    found = scene(AVERAGE)
+    assert found.name == "three-users-average"
+    assert found.peers == 3
+    assert [(c.name, c.period.number, c.phase.number) for c in found.clocks] == [
+        ("haptic", Fraction(1, 1000), 0),
+        ("network", Fraction(1, 125), 0),
+    ]
+    assert [(part.name, part.section, part.component.name) for part in found.parts] == [
+        ("device", "masses", "Mass"),
+        ("cube", "masses", "Mass"),
+        ("contact", "couplers", "SampledSpringDamper"),
+        ("coordination", "couplers", "AveragePosition"),
+        ("lan", "links", "Link"),
+    ]
+    device = dict(found.part("device").values)
+    assert device["mass"].number == Fraction(1, 10)
+    assert found.part("cube").shared
+    assert not found.part("device").shared
+    assert found.part("contact").connections == (("a", "device", "flange"), ("b", "cube", "flange"))
+    coordination = found.part("coordination")
+    assert (coordination.reference("clock"), coordination.reference("link")) == ("haptic", "lan")
+    assert dict(coordination.values)["damping"].number == 0, "a default"
+    assert dict(coordination.options) == {"delays": "all"}
+    assert [(axis.parameter, axis.low, axis.high) for axis in found.region] == [
+        ("contact.stiffness", 0, 5000),
+        ("coordination.stiffness", 0, 1500),
+    ]
+
+
+def test_units_convert_exactly() -> None:
+    found = scene(
+        replaced(
+            AVERAGE, ("mass: 0.1 kg", "mass: 100 g"), ("1000 N/m", "1 N/mm"), ("haptic: 1 ms", "haptic: 1/90 s")
+        )
+    )
+    assert dict(found.part("device").values)["mass"].number == Fraction(1, 10)
+    assert dict(found.part("contact").values)["stiffness"].number == 1000
+    assert found.clocks[0].period.number == Fraction(1, 90)
+
+
+def test_a_rate_serves_as_a_period_and_a_clock_may_have_a_phase() -> None:
+    found = scene(replaced(AVERAGE, ("haptic: 1 ms", "haptic: {period: 1 kHz, phase: 0.25 ms}")))
+    clock = found.clocks[0]
+    assert (clock.period.number, clock.phase.number) == (Fraction(1, 1000), Fraction(1, 4000))
+
+
+def test_an_expression_may_name_parameters_and_the_number_of_peers() -> None:
+    found = scene(
+        replaced(
+            AVERAGE,
+            ("clocks:", "parameters: {half: whole/2, whole: 2000 N/m}\nclocks:"),
+            ("500 N/m,", "half/(peers - 1),"),
+        )
+    )
+    assert dict(found.parameters)["half"].number == 1000, "whichever stands first"
+    value = dict(found.part("coordination").values)["stiffness"]
+    assert (value.number, value.expression) == (500, "half/(peers - 1)")
+
+
+def test_a_group_sets_parameters_and_start_values_of_its_own() -> None:
+    found = scene(GROUPS)
+    assert found.peers == 3
+    right, left = found.groups
+    assert {name: value.number for name, value in right.values} == {
+        "device.mass": Fraction(1, 5),
+        "device.x": Fraction(3, 100),
+    }
+    assert left.values == ()
+    assert found.part("device").groups == ("right", "left")
+
+
+def test_a_part_may_be_at_some_groups_only() -> None:
+    found = scene(
+        GROUPS + "hands:\n  hand: {type: ConstantForce, flange: device, force: -4 N, at: [right]}\n"
+    )
+    assert found.part("hand").groups == ("right",)
+
+
+def test_start_values_stand_with_their_part() -> None:
+    found = scene(ONE_MASS.replace("2 kg,", "2 kg, x: 5 mm,"))
+    assert [(name, value.number) for name, value in found.part("device").starts] == [("x", Fraction(1, 200))]
+
+
+def test_an_experiment_has_a_duration_and_a_seed() -> None:
+    found = scene(ONE_MASS + "experiment: {duration: 3 s, seed: 7}\n")
+    assert (found.duration, found.seed) == (3, 7)
+    assert (scene(ONE_MASS).duration, scene(ONE_MASS).seed) == (None, 0)
+
+
+def test_all_mistakes_of_a_file_come_together_in_its_order() -> None:
+    assert messages(
+        ("haptic: 1 ms", "haptic: 1 kg"), ("0.1 kg", "0.1"), ("link: lan", "link: lam"), ("8 ms}", "-8 ms}")
+    ) == [
+        "4:11: E204 haptic wants s, got 1 kg. Write: haptic: 1 s",
+        "9:18: E204 mass wants kg, got 0.1 (no unit). Write: mass: 0.1 kg",
+        "13:109: E206 coordination names link lam, which isn't in links; the nearest is lan. Write: lan",
+        "15:32: E207 delay wants 0 s or more, got -0.008 s.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "1000 N/m",
+            "1000 N*m",
+            "12:76: E204 stiffness wants N/m, got 1000 N*m. Write: stiffness: 1000 N/m",
+        ),
+        ("stiffness: 1000 N/m, ", "", "12:3: E201 contact has no stiffness. Write: stiffness: 1 N/m"),
+        ("clock: haptic, delay: 1 ms}", "delay: 1 ms}", "12:3: E201 contact has no clock. Write: clock: haptic"),
+        ("a: device, ", "", "12:3: E210 contact does not say what its a is joined to. Write: a: device"),
+        (
+            "a: device",
+            "a: devise",
+            "12:48: E206 contact joins its a to devise, which is no part of this topology; "
+            "the nearest is device. Write: device",
+        ),
+        (
+            "a: device",
+            "a: device.flang",
+            "12:48: E206 device (Mass) has no Flange called flang; the nearest is flange. Write: flange",
+        ),
+        (
+            "a: device",
+            "a: lan",
+            "12:48: E210 lan (Link) has no connector of type Flange to join a to.",
+        ),
+        (
+            "type: AveragePosition",
+            "type: Flange",
+            "13:24: E206 there is no component Flange; there are: AveragePosition, ConstantForce, FullMesh, "
+            "Link, Mass, SampledSpringDamper.",
+        ),
+        ("type: SampledSpringDamper, ", "", "12:3: E201 contact has no type. Write: type: SampledSpringDamper"),
+        (
+            "link: lan",
+            "link: lan, delays: som",
+            "13:122: E206 delays wants all or own, got som. Write: delays: all",
+        ),
+        ("shared: true", "shared: yes", "10:52: E203 shared wants true or false, got yes. Write: shared: true"),
+        (
+            "clock: network, delay",
+            "clock: network, shared: true, delay",
+            "15:33: E210 lan can't be shared: nothing of a Link is divided.",
+        ),
+        (
+            "count: 3",
+            f"count: {LARGEST_COUNT + 1}",
+            "7:17: E208 count wants a whole number from 1 to 1000000000, got 1000000001. Write: count: 3",
+        ),
+        (
+            "{count: 3}",
+            "{}",
+            "7:9: E201 group user has no count. Write: count: 3",
+        ),
+        (
+            "{count: 3}",
+            "{count: 3, set: {device.mas: 1 kg}}",
+            "7:26: E206 set names device.mas, which is no parameter or variable of a part; "
+            "the nearest is device.mass. Write: device.mass",
+        ),
+        (
+            "{count: 3}",
+            "{count: 3, set: {device.mass: 0 kg}}",
+            "7:39: E207 mass wants more than 0 kg, got 0 kg.",
+        ),
+        (
+            "haptic: 1 ms",
+            "haptic: {period: 1 ms, phase: 1 ms}",
+            "4:33: E207 the phase of clock haptic wants 0 s or more and less than its period, got 0.001 s.",
+        ),
+        ("haptic: 1 ms", "haptic: 0 Hz", "4:11: E207 haptic wants a rate above 0 Hz, got 0 Hz."),
+        ("haptic: 1 ms", "1haptic: 1 ms", "4:3: E205 the name of a clock wants a letter followed by"),
+        ("  cube:   {", "  haptic: {", "10:3: E205 the name haptic is used twice in this topology."),
+        (
+            "[0 N/m, 5000 N/m]",
+            "[5000 N/m, 0 N/m]",
+            "17:35: E207 the range of contact.stiffness wants its lower end first, got 5000 N/m to 0 N/m.",
+        ),
+        ("[0 N/m, 5000 N/m]", "5000 N/m", "17:35: E203 contact.stiffness wants a list of two values"),
+        (
+            "clocks:",
+            "parameters: {a: b, b: c, c: a}\nclocks:",
+            "3:17: E209 parameters depend in a circle: a → b → c → a.",
+        ),
+        (
+            "clocks:",
+            "parameters: {kt: kp}\nclocks:",
+            "3:18: E206 kt names kp, which is no parameter of this topology; there are: peers.",
+        ),
+        (
+            "500 N/m,",
+            "peers,",
+            "13:66: E204 stiffness wants N/m, got peers, which is in 1. Write: stiffness: 1 N/m",
+        ),
+        (
+            "clocks:",
+            "experiment: {duration: 0 s}\nclocks:",
+            "3:24: E207 duration wants more than 0 s, got 0 s.",
+        ),
+        (
+            "clocks:",
+            "experiment: {seed: -1}\nclocks:",
+            "3:20: E203 seed wants a whole number, 0 or more, got -1.",
+        ),
+        ("studies:", "studis:", "16:1: E202 a topology has no key studis; the nearest is studies. Write: studies"),
+        (
+            "couplers:",
+            "coupler:",
+            "11:1: E202 a topology has no key coupler; the nearest is couplers. Write: couplers",
+        ),
+    ],
+)
+def test_a_mistake_is_told_once_at_its_place(old: str, new: str, message: str) -> None:
+    lines = messages((old, new))
+    if "E205" in message:  # what has no good name can't be found by the others either
+        lines = lines[:1]
+    (line,) = lines
+    assert line.startswith(message)
+
+
+def test_at_names_groups() -> None:
+    assert messages(("a: device,", "a: device, at: [usr],")) == [
+        "12:61: E206 contact is at usr, which is no group of peers; the nearest is user. Write: user"
+    ]
+
+
+def test_one_peer_cannot_follow_the_others() -> None:
+    assert messages(("count: 3", "count: 1"), text=MESH) == [
+        "13:3: E208 coordination (FullMesh) follows the other peers and wants at least 2 peers, got 1. "
+        "Write: count: 2"
+    ]
+
+
+def test_what_is_not_a_mapping_is_no_topology() -> None:
+    assert told(scene, "- a\n") == [
+        "scene.yaml:1:1: E203 a topology wants a mapping of keys to values, got a list. "
+        "Write: topology: my-scene"
+    ]

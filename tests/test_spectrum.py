@@ -1,0 +1,299 @@
+"""Claims about `apc.runtime.spectrum`."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import flint
+import mpmath
+import numpy as np
+import pytest
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis import Analysis, analyze_dense, analyze_modes
+from apc.runtime.spectrum import _eigen
+
+from tests.bruteforce import Scene, frame_matrix
+from tests.sites import MS, grouped, paper
+
+# Rakhsha and Constantinescu's section III: device 0.1 kg, copy 0.2 kg, both 5 N·s/m, 1 ms and 8 ms; limits
+# were computed apart from this project by propagating the full map.
+BOTH = {"comp": MS, "comm": 8 * MS}
+NONE = {"comp": Fraction(0), "comm": Fraction(0)}
+OWN = {**BOTH, "own_delay": True}
+
+
+@pytest.mark.parametrize(
+    ("operator", "peers", "delays", "radius"),
+    [
+        ("mean", 3, BOTH, 0.8982367557),
+        ("sum", 3, BOTH, 0.9121448917),
+        ("mean", 5, NONE, 0.8513958715),
+        ("sum", 5, NONE, 0.805679409),
+    ],
+)
+def test_the_reference_radii_come_out(operator: str, peers: int, delays: dict, radius: float) -> None:
+    found = analyze_modes(paper(operator, peers=peers, kt=800.0, bt=2.0, kc=1500.0, bc=2.0, **delays))
+    assert found.spectral_radius == pytest.approx(radius, abs=1e-8)
+    assert found.verdict == "stable up to a common translation"
+    assert found.rigid_modes == 1
+
+
+def _crossing(build: object, low: float, high: float) -> float:
+    """Return where the radius crosses 1 between two values, by bisection."""
+    assert analyze_modes(build(low)).spectral_radius < 1 < analyze_modes(build(high)).spectral_radius  # type: ignore[operator]
+    while high - low > 1e-5:
+        middle = (low + high) / 2
+        if analyze_modes(build(middle)).spectral_radius < 1:  # type: ignore[operator]
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@pytest.mark.parametrize(
+    ("delays", "damping", "kc", "average", "mesh"),
+    [
+        (NONE, 0.0, 100.0, 2127.449, 1063.725),
+        (NONE, 0.0, 2000.0, 2868.148, 1434.074),
+        (NONE, 2.0, 100.0, 4488.004, 2959.062),
+        (NONE, 2.0, 2000.0, 5869.746, 3479.811),
+        (BOTH, 0.0, 100.0, 708.186, 354.093),
+        (BOTH, 0.0, 1000.0, 1096.411, 548.205),
+        (BOTH, 2.0, 100.0, 1493.128, 962.734),
+        (BOTH, 2.0, 1000.0, 2477.935, 1378.111),
+        (OWN, 0.0, 100.0, 743.165, 371.582),
+    ],
+)
+def test_the_largest_coordination_stiffness_is_the_reference_one(
+    delays: dict, damping: float, kc: float, average: float, mesh: float
+) -> None:
+    for operator, limit in (("mean", average), ("sum", mesh)):
+
+        def build(kt: float, operator: str = operator) -> CompiledSystem:
+            return paper(operator, kt=kt, bt=damping, kc=kc, bc=damping, **delays)
+
+        assert _crossing(build, limit * 0.99, limit * 1.01) == pytest.approx(limit, abs=6e-4)
+        for kt in np.linspace(1.0, limit * 0.99, 8):
+            assert analyze_modes(build(float(kt))).stable
+
+
+@pytest.mark.parametrize(("damping", "limit"), [(0.0, 1865.424), (2.0, 3175.018)])
+def test_the_largest_contact_stiffness_alone_is_the_reference_one(damping: float, limit: float) -> None:
+    found = _crossing(lambda kc: paper(kc=kc, kt=0.0, bt=0.0, bc=damping, **BOTH), limit * 0.99, limit * 1.01)
+    assert found == pytest.approx(limit, abs=6e-4)
+
+
+def test_a_network_delay_can_help() -> None:
+    """K_C = 2000, B = 2, and the computational delay: 2602 without, 3041 with a network delay of 8 ms."""
+    for comm, limit in ((Fraction(0), 2602), (8 * MS, 3041)):
+
+        def build(kt: float, comm: Fraction = comm) -> CompiledSystem:
+            return paper(kt=kt, bt=2.0, kc=2000.0, bc=2.0, comp=MS, comm=comm)
+
+        assert _crossing(build, limit * 0.99, limit * 1.01) == pytest.approx(limit, abs=0.5)
+
+
+@pytest.mark.parametrize("comp", [Fraction(0), MS])
+@pytest.mark.parametrize(("operator", "viscosity"), [("mean", 2.3), ("sum", 4.6)])
+def test_a_slow_late_network_brakes_like_a_damper(operator: str, viscosity: float, comp: Fraction) -> None:
+    """K_eff ((T_n − T_c)/2 + T_d) at low frequency: a copy so heavy that v decays as e^(−B t/m)."""
+    mass = 1e5
+    system = grouped(
+        paper(operator, kt=200.0, kc=0.0, cube=mass, comp=comp), ("user", 3, {"cube.damping": 0.0})
+    )
+    slow = next(mode for mode in analyze_modes(system).modes if mode.shape == "common")
+    assert -mass * math.log(slow.magnitude) / 0.008 == pytest.approx(viscosity, rel=1e-4)
+
+
+# ---- error bounds ----
+
+
+def _arb(value: object) -> flint.arb:
+    if isinstance(value, Fraction):
+        return flint.arb(flint.fmpq(value.numerator, value.denominator))
+    return flint.arb(value)
+
+
+def _truth(scene: Scene) -> list[flint.acb]:
+    """Return the eigenvalues of the full map at 60 digits."""
+    before, flint.ctx.dps = flint.ctx.dps, 60
+    try:
+        rows = frame_matrix(scene, number=_arb, exp=lambda value: value.exp())
+        return flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
+    finally:
+        flint.ctx.dps = before
+
+
+def _random(generator: np.random.Generator, number: int) -> dict:
+    """Return gains and delays, each of them exactly zero now and then."""
+
+    def gain(largest: float, every: int) -> float:
+        return 0.0 if number % every == every - 1 else float(generator.uniform(0, largest))
+
+    return {
+        "operator": "sum" if number % 2 else "mean",
+        "kt": gain(4000, 4),
+        "bt": gain(5, 3),
+        "kc": gain(4000, 5),
+        "bc": gain(4, 2),
+        "comp": [Fraction(0), MS, MS * 2 / 5, MS * 5 / 2][number % 4],
+        "comm": [Fraction(0), 8 * MS, 11 * MS][number % 3],
+    }
+
+
+def _check_against_truth(values: dict) -> Analysis:
+    """Assert that truth is within every bound, and that no verdict contradicts it; return the analysis."""
+    found = analyze_modes(paper(peers=2, **values))
+    truth = _truth(Scene(peers=2, **values))
+    for mode in found.modes:
+        place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
+        assert min(float(abs(place - value).mid()) for value in truth) <= mode.error
+    apart = sorted(truth, key=lambda value: float(abs(value - 1).mid()))
+    rigid = sum(float(abs(value - 1).mid()) < 1e-40 for value in truth)
+    assert rigid == found.rigid_modes
+    radius = max(abs(value).mid() for value in apart[rigid:])
+    assert abs(float(radius - flint.arb(found.spectral_radius))) <= found.spectral_radius_error
+    if found.stable is not None:
+        assert found.stable == bool(radius < 1)
+    return found
+
+
+def test_the_truth_at_60_digits_is_within_every_bound() -> None:
+    generator = np.random.default_rng(0)
+    bounds = [_check_against_truth(_random(generator, number)).spectral_radius_error for number in range(200)]
+    assert np.median(bounds) < 1e-10
+    assert max(bounds) < 1e-6
+
+
+@pytest.mark.parametrize("kt", [0.0, 0.05, 400.0])
+def test_a_long_queue_that_hardly_anyone_answers_spoils_no_bound(kt: float) -> None:
+    """Eleven packets on their way are a Jordan block: rounding scatters it to the eleventh root of 1e-16."""
+    values = {"operator": "mean", "kt": kt, "kc": 1.0, "bc": 2.0, "comp": Fraction(0), "comm": 11 * MS}
+    found = _check_against_truth({**values, "network": MS})
+    assert found.spectral_radius_error < 1e-8
+    assert found.stable
+
+
+def test_near_the_boundary_the_verdict_is_right_or_undecided() -> None:
+    generator = np.random.default_rng(1)
+    verdicts = set()
+    for number in range(6):
+        values = {**_random(generator, number), "bt": 1.0, "bc": 2.0, "kc": 500.0, "comp": MS}
+        low, high = 1.0, 20000.0
+        while np.nextafter(low, high) < high:
+            middle = (low + high) / 2
+            if analyze_modes(paper(peers=2, **{**values, "kt": middle})).spectral_radius < 1:
+                low = middle
+            else:
+                high = middle
+        for step in (-1e-9, -1e-13, 0.0, 1e-13, 1e-9):
+            found = _check_against_truth({**values, "kt": low * (1 + step)})
+            verdicts.add(found.verdict)
+    assert verdicts == {
+        "stable up to a common translation",
+        "undecided: |ρ−1| below the error bound",
+        "unstable",
+    }
+
+
+def test_mpmath_at_50_digits_agrees() -> None:
+    values = {"kt": 900.0, "bt": 1.0, "kc": 1200.0, "bc": 1.0, "comp": Fraction(0), "comm": Fraction(0)}
+    with mpmath.workdps(50):
+        rows = frame_matrix(Scene(peers=2, **values), number=mpmath.mpf, exp=mpmath.exp)
+        truth = mpmath.eig(mpmath.matrix(rows), left=False, right=False)
+        found = analyze_modes(paper(peers=2, **values))
+        radius = max(abs(value) for value in truth if abs(value - 1) > mpmath.mpf(10) ** -30)
+        assert abs(radius - found.spectral_radius) <= found.spectral_radius_error
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-12, 1e-6])
+def test_the_bound_of_a_nearly_defective_pair_is_honest(spread: float) -> None:
+    """[a 1; ε a] has eigenvalues a ± √ε, however close."""
+    matrix = np.array([[0.5, 1.0], [spread, 0.5]])
+    error = np.full((2, 2), 1e-14)
+    moved = matrix.copy()
+    moved[1, 0] += 1e-14
+    values, _, _, errors, low, high = _eigen(matrix, error)
+    truth = [0.5 + math.sqrt(spread + 1e-14), 0.5 - math.sqrt(spread + 1e-14)]
+    for value, bound in zip(values, errors, strict=True):
+        assert min(abs(value - one) for one in truth) <= bound
+    assert low <= truth[0] <= high
+
+
+def test_the_bound_of_a_large_jordan_block_is_honest() -> None:
+    """An entry ε in the corner of a nilpotent block of n moves its eigenvalues to the n-th roots of ε."""
+    n = 6
+    matrix, error = np.eye(n, k=1), np.zeros((n, n))
+    error[-1, 0] = 1e-12
+    values, _, _, errors, _, high = _eigen(matrix, error)
+    assert high >= 1e-12 ** (1 / n)
+    assert all(bound + abs(value) >= 1e-12 ** (1 / n) for value, bound in zip(values, errors, strict=True))
+
+
+# ---- what a mode is called ----
+
+
+def test_a_fast_shake_in_a_slow_frame_keeps_its_frequency() -> None:
+    """Device and cube on a spring: ω² = K (1/m + 1/m_O); forces every 0.1 ms, 1.5 turns a frame."""
+    stiffness = 1e5
+    found = analyze_modes(paper(kc=stiffness, kt=0.0, haptic=MS / 10, comp=Fraction(0)))
+    expected = math.sqrt(stiffness * 15) / (2 * math.pi)
+    assert expected > 1.5 / 0.008
+    assert found.modes[0].frequency_hz == pytest.approx(expected, rel=3e-3)
+    assert found.modes[0].damping_ratio < 0
+
+
+def test_an_oscillator_has_its_textbook_frequency_and_damping() -> None:
+    """A soft spring sampled fast: s² + (b/m) s + K (1/m + 1/m_O) with b/m equal for both masses."""
+    system = grouped(
+        paper(kc=100.0, kt=0.0, haptic=MS / 100, network=MS, comp=Fraction(0)),
+        ("user", 3, {"device.damping": 2.0, "cube.damping": 4.0}),
+    )
+    [first, *_] = [mode for mode in analyze_modes(system).modes if mode.frequency_hz > 0]
+    natural = math.sqrt(100.0 * 15)
+    ratio = 20.0 / (2 * natural)
+    assert first.damping_ratio == pytest.approx(ratio, rel=2e-3)
+    assert first.frequency_hz == pytest.approx(natural * math.sqrt(1 - ratio**2) / (2 * math.pi), rel=1e-3)
+
+
+def test_shares_name_the_states_that_take_part_and_add_up() -> None:
+    found = analyze_modes(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
+    for mode in found.modes:
+        assert sum(share for _, share in mode.participation) == pytest.approx(1, abs=1e-12)
+        assert [name for name, _ in mode.participation][:2] == ["device.x", "device.v"]
+    free = analyze_modes(paper(kc=0.0, kt=0.0, comp=Fraction(0)))
+    slow = next(mode for mode in free.modes if abs(mode.eigenvalue - math.exp(-0.2)) < 1e-9)  # b/m_O = 25/s
+    assert dict(slow.participation)["cube.v"] == pytest.approx(1, abs=1e-9)
+
+
+def test_a_mode_that_ends_in_finite_time_has_no_frequency() -> None:
+    found = analyze_modes(paper(kc=0.0, kt=0.0))
+    dead = [mode for mode in found.modes if mode.magnitude < 1e-9]
+    assert dead
+    assert {(mode.frequency_hz, mode.damping_ratio) for mode in dead} == {(0.0, 1.0)}
+
+
+# ---- verdicts ----
+
+
+def _undamped(**values: object) -> CompiledSystem:
+    return grouped(paper(**values), ("user", 3, {"device.damping": 0.0, "cube.damping": 0.0}))  # type: ignore[arg-type]
+
+
+def test_every_verdict_says_what_it_says() -> None:
+    assert analyze_modes(paper()).verdict == "stable up to a common translation"
+    assert analyze_modes(paper(kc=2500.0)).verdict == "unstable"
+    drifting = analyze_modes(_undamped(kt=0.0, bt=2.0, bc=2.0, comp=Fraction(0)))
+    assert (drifting.verdict, drifting.stable) == ("drifts", False)
+    assert drifting.spectral_radius < 1
+    shaking = analyze_modes(_undamped(kt=0.0, bt=0.0, kc=3000.0))
+    assert (shaking.verdict, shaking.stable) == ("unstable", False)
+
+
+def test_the_dense_system_gives_the_same_answer() -> None:
+    for values in ({}, {"kt": 0.0}, {"operator": "sum", "kc": 2500.0}):
+        split, whole = analyze_modes(paper(**values)), analyze_dense(paper(**values))  # type: ignore[arg-type]
+        assert split.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-12)
+        assert (split.verdict, split.rigid_modes) == (whole.verdict, whole.rigid_modes)
+        assert sum(mode.multiplicity for mode in split.modes) == len(whole.modes)

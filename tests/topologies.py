@@ -1,0 +1,77 @@
+"""Topologies as text, and each stage's value of a text: no file, no command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from apc.compiler.clocks import ClockedSystem, partition
+from apc.compiler.compiled import CompiledSystem, Origin
+from apc.compiler.errors import ApcError
+from apc.compiler.flatten import FlatSystem, flatten
+from apc.compiler.functions import build_functions
+from apc.compiler.library import Library
+from apc.compiler.scene import Scene, build_scene
+from apc.compiler.source import Source, parse_source
+from apc.compiler.structure import SortedSystem, sort
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENES = ROOT / "models" / "scenes"
+AVERAGE = (SCENES / "three-users-average.yaml").read_text(encoding="utf-8")
+MESH = (SCENES / "three-users-mesh.yaml").read_text(encoding="utf-8")
+
+# One part alone at one peer: what it does is all that happens.
+ONE_MASS = """\
+topology: one-mass
+peers: {user: {count: 1}}
+masses:
+  device: {mass: 2 kg, damping: 3 N*s/m}
+"""
+
+
+def source(text: str) -> Source:
+    return parse_source(text.encode(), file="scene.yaml")
+
+
+def scene(text: str, library: Library | None = None) -> Scene:
+    return build_scene(source(text), library or Library())
+
+
+def flat(text: str, library: Library | None = None) -> FlatSystem:
+    return flatten(scene(text, library))
+
+
+def clocked(text: str, library: Library | None = None) -> ClockedSystem:
+    return partition(flat(text, library))
+
+
+def ordered(text: str, library: Library | None = None) -> SortedSystem:
+    return sort(clocked(text, library))
+
+
+def compiled(text: str, library: Library | None = None) -> CompiledSystem:
+    return build_functions(ordered(text, library), Origin("scene.yaml", ()))
+
+
+def library(folder: Path, *texts: str) -> Library:
+    """Return the built-in library and components of our own, written to a folder."""
+    for number, text in enumerate(texts):
+        (folder / f"part{number}.yaml").write_text(text, encoding="utf-8")
+    return Library((folder,))
+
+
+def told(function: Callable[..., object], *arguments: object) -> list[str]:
+    """Return the first line of every mistake that a call raises: place, code and sentence."""
+    try:
+        function(*arguments)
+    except ApcError as error:
+        return [str(mistake).splitlines()[0] for mistake in error.mistakes]
+    return []
+
+
+def replaced(text: str, *pairs: tuple[str, str]) -> str:
+    """Return the text with each (old, new) pair replaced; every old one must be there."""
+    for old, new in pairs:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    return text
