@@ -21,6 +21,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 PEERS = "peers"  # the parameter that holds the number of peers
 
 
@@ -33,14 +36,40 @@ class Clock:
     phase: str
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Graph:
+    """Who hears whom: "complete", "ring", "star" (the first peer is the centre), or "arcs".
+
+    `arcs` (M, 2) are then (sender, receiver) pairs, peers counted from 0 over the groups in order, and
+    `weights` (M,) what a receiver multiplies that sender's packets by; for the other shapes both are empty.
+    """
+
+    shape: str
+    arcs: NDArray[np.int64]
+    weights: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PairDelay:
+    """The delay of a link from one group of peers to another; `delay` is the name of a timing."""
+
+    sender: str
+    receiver: str
+    delay: str
+
+
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Carries every sender's channels to the others; `delay` is the name of a timing, `clock` of a clock."""
+    """Carries every sender's channels to those who hear it; `delay` is the name of a timing, `clock` of a clock.
+
+    `delays` are those pairs of groups for which another delay holds.
+    """
 
     name: str
     clock: str
     delay: str
-    graph: str  # "complete"
+    graph: Graph
+    delays: tuple[PairDelay, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +122,19 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Receive:
-    """Row of r: the `operator` ("mean" or "sum") over the other peers of a channel of a link.
+    """Row of r: the `operator` over the others that the peer hears over a link; the newest delivered values.
 
-    `channel` is the row of that link's `SendPartition` outputs. Read at a tick: the newest delivered value.
+    "mean" and "sum" are weighted by the link's graph. Without an `edge` they are of row `channel` of the
+    link's `SendPartition`, so that a complete graph of N peers costs N. With an `edge`, and always for "max",
+    "min" and "count", the operator runs over `edge(x, u, m, s, p, t)`, one evaluation a pair of peers: x, u, m,
+    p, t are the hearing peer's, s (n_c,) the sending peer's channels of the link.
     """
 
     name: str
     operator: str
     link: str
     channel: int
+    edge: Any | None = None  # casadi.Function
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,17 +176,27 @@ class Kind:
     sends: tuple[SendPartition, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Column:
+    """A parameter that differs from peer to peer: `values` (count,) in SI."""
+
+    name: str
+    values: NDArray[np.float64]
+
+
 @dataclass(frozen=True, slots=True)
 class Group:
     """`count` peers of kind `kind` (an index); `values` overrides parameters, by name, for this group.
 
-    An override is a `Parameter` of the same name, so that it can be an expression too.
+    An override is a `Parameter` of the same name, so that it can be an expression too; `columns` override
+    parameters peer by peer.
     """
 
     name: str
     count: int
     kind: int
     values: tuple[Parameter, ...] = ()
+    columns: tuple[Column, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -202,5 +202,10 @@ class _Checker:
                         assert found is not None
                         self.add("E405", delay, "s, as a delay", found)
                 return self.dimension(first)
+            case "interpolate":
+                if (found := self.dimension(expr.arguments[1])) not in (None, ANY, SECOND):
+                    assert found is not None
+                    self.add("E405", expr.arguments[1], "s, as tables are over time", found)
+                return self.dimension(first)
             case _:  # sample, previous, initial, mean, sum, abs: the same quantity
                 return self.dimension(first)

@@ -152,7 +152,7 @@ class Equation:
 # function -> (fewest arguments, most arguments)
 FUNCTIONS: dict[str, tuple[int, int]] = {
     "der": (1, 1),
-    "sample": (1, 1),
+    "sample": (1, 2),
     "hold": (1, 2),
     "previous": (1, 1),
     "initial": (1, 1),
@@ -167,6 +167,7 @@ FUNCTIONS: dict[str, tuple[int, int]] = {
     "cos": (1, 1),
     "tanh": (1, 1),
     "floor": (1, 1),
+    "interpolate": (2, 2),
     "mean": (1, 1),
     "sum": (1, 1),
     "count": (1, 1),

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
+from apc.compiler.component import Component, Option, Reference, option_test
+from apc.compiler.component import Number as NumberParameter
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.expression import (
     Binary,
@@ -22,11 +24,12 @@ from apc.compiler.expression import (
     Number,
     format_expression,
     transform,
+    walk,
 )
-from apc.compiler.library import Component, Option, Reference, option_test
-from apc.compiler.library import Number as NumberParameter
-from apc.compiler.scene import Part, Scene
+from apc.compiler.parts import GROUND
+from apc.compiler.scene import Part, PeerGroup, Scene
 from apc.compiler.units import Dimension
+from apc.compiler.values import Value
 
 PEERS = Name(("peers",))
 OTHERS = "others"
@@ -70,10 +73,14 @@ class FlatSend:
 
 @dataclass(frozen=True, slots=True)
 class FlatKind:
-    """The equations of all peers of one structure."""
+    """The equations of all peers of one structure.
+
+    `delays` are computational delays that these groups set for themselves: (whole name, group, value).
+    """
 
     name: str
     groups: tuple[str, ...]
+    delays: tuple[tuple[str, str, Value], ...]
     parts: tuple[str, ...]
     variables: tuple[FlatVariable, ...]
     equations: tuple[FlatEquation, ...]
@@ -91,50 +98,86 @@ class FlatSystem:
 def flatten(scene: Scene) -> FlatSystem:
     """Write out the equations of every kind. Raises ApcError with every mistake found on the way."""
     mistakes = Mistakes()
-    structures: dict[tuple[str, ...], list[str]] = {}
+    delays = _delay_names(scene)
+    structures: dict[object, list[PeerGroup]] = {}
     for group in scene.groups:
-        present = tuple(part.name for part in scene.parts if group.name in part.groups)
-        structures.setdefault(present, []).append(group.name)
-    kinds = tuple(
-        _flatten_kind(scene, present, tuple(groups), mistakes) for present, groups in structures.items()
-    )
+        structures.setdefault(_structure(scene, group, delays), []).append(group)
+    kinds = tuple(_flatten_kind(scene, groups, delays, mistakes) for groups in structures.values())
     mistakes.raise_if_any()
     return FlatSystem(scene, kinds)
 
 
-def _flatten_kind(
-    scene: Scene, present: tuple[str, ...], groups: tuple[str, ...], mistakes: Mistakes
-) -> FlatKind:
-    # A link is no part of a site: it lies between sites.
-    parts = [scene.part(name) for name in present if scene.part(name).section != "links"]
+def _structure(scene: Scene, group: PeerGroup, delays: set[str]) -> object:
+    """Return what must be equal for two groups to share their equations: parts, words and delays."""
+    present = tuple(part.name for part in scene.parts if group.name in part.groups)
+    own = tuple((name, value.number) for name, value in group.values if name in delays)
+    return present, tuple(sorted(group.words)), tuple(sorted(own))
+
+
+def _delay_names(scene: Scene) -> set[str]:
+    """Return the parameters that are the delay of a hold: part of the schedule, not of the equations."""
+    found = set()
+    for part in scene.parts:
+        for equation in part.component.equations:
+            for side in (equation.left, equation.right):
+                for node in walk(side):
+                    if isinstance(node, Call) and node.function == "hold":
+                        for delay in node.arguments[1:]:
+                            names = (one for one in walk(delay) if isinstance(one, Name))
+                            found |= {f"{part.name}.{name.parts[0]}" for name in names}
+    return found
+
+
+def _flatten_kind(scene: Scene, groups: list[PeerGroup], delays: set[str], mistakes: Mistakes) -> FlatKind:
+    first = groups[0]
+    words = dict(first.words)
+    parts = [part for part in scene.parts if first.name in part.groups]
     variables: list[FlatVariable] = []
     equations: list[FlatEquation] = []
     sends: list[FlatSend] = []
     for part in parts:
-        instance = _Instance(part, mistakes)
+        instance = _Instance(part, words, mistakes)
         variables += instance.variables()
         equations += instance.equations()
         sends += instance.sends()
     equations += _connections(parts, mistakes)
-    name = " and ".join(groups)
+    for group in groups:
+        for name, _ in group.columns:
+            if name in delays:
+                what = f"{name} can't differ from peer to peer within a group"
+                mistakes.add("E211", group.place, what, hint="a group of its own for each delay")
+    own = tuple((name, first.name, value) for name, value in first.values if name in delays)
     return FlatKind(
-        name, groups, tuple(part.name for part in parts), tuple(variables), tuple(equations), tuple(sends)
+        " and ".join(group.name for group in groups),
+        tuple(group.name for group in groups),
+        own,
+        tuple(part.name for part in parts),
+        tuple(variables),
+        tuple(equations),
+        tuple(sends),
     )
 
 
 class _Instance:
     """One part: its component's text in whole names."""
 
-    def __init__(self, part: Part, mistakes: Mistakes) -> None:
+    def __init__(self, part: Part, words: dict[str, str], mistakes: Mistakes) -> None:
         self.part = part
         self.component: Component = part.component
         self.mistakes = mistakes
-        self.clock = part.reference("clock")
-        self.link = part.reference("link")
         self.options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
-        self.chosen = dict(part.options)
-        self.references = dict(part.references)
-        self.roles = {p.name for p in self.component.parameters if isinstance(p, Reference)}
+        own = {
+            name.rpartition(".")[2]: word
+            for name, word in words.items()
+            if name.rpartition(".")[0] == part.name
+        }
+        self.chosen = dict(part.options) | own
+        self.references = dict(part.references) | {n: w for n, w in own.items() if n not in self.options}
+        roles = {p.name: p.role for p in self.component.parameters if isinstance(p, Reference)}
+        self.clocks = {name for name, role in roles.items() if role == "clock"}
+        self.clock = self._only("clock", roles)
+        self.link = self._only("link", roles)
+        self.passed = {connector: (inner, its) for connector, inner, its in self.component.passed}
         self.words = {
             word: value
             for p in self.component.parameters
@@ -145,6 +188,15 @@ class _Instance:
             p.name for p in self.component.parameters if isinstance(p, NumberParameter) and p.divided
         }
 
+    def _only(self, wanted: str, roles: dict[str, str]) -> str | None:
+        """Return the clock or link that is named, when there is exactly one."""
+        named = [
+            self.references[name]
+            for name, role in roles.items()
+            if role == wanted and name in self.references
+        ]
+        return named[0] if len(named) == 1 else None
+
     def variables(self) -> Iterator[FlatVariable]:
         for variable in self.component.variables:
             yield FlatVariable(
@@ -153,6 +205,8 @@ class _Instance:
         for name, dimension in self.component.locals:
             yield FlatVariable(self._whole(name), dimension, False)
         for name, connector in self.component.connectors:
+            if name in self.passed:
+                continue  # it is the inner part's
             for variable in (*connector.potentials, *connector.flows):
                 yield FlatVariable(self._whole(name, variable.name), variable.unit.dimension, False)
 
@@ -169,7 +223,7 @@ class _Instance:
                 self.mistakes.add("E504", send.place, what, hint="parameters: {link: link}")
                 continue
             expression = self._qualified(send.expression, send.place, self.link)
-            yield FlatSend(self._whole(send.name), self.link, expression, send.unit_dimension, send.place)
+            yield FlatSend(self._whole(send.name), self.link, expression, send.dimension, send.place)
 
     def _whole(self, *parts: str) -> str:
         return ".".join((self.part.name, *parts))
@@ -199,19 +253,19 @@ class _Instance:
         argument = self._qualified(node.arguments[0], place, clock)
         if len(node.arguments) == 2:
             named = node.arguments[1]
-            if isinstance(named, Name) and named.parts[0] in self.roles:
+            if isinstance(named, Name) and named.parts[0] in self.clocks:
                 clock = self.references[named.parts[0]]
             else:
                 self.mistakes.add(
                     "E504",
-                    place.shifted(named.start),
+                    place,
                     "the second argument of sample",
                     expected="a parameter of this component that is a clock",
                     got=format_expression(named),
                 )
         if clock is None:
             what = f"{self.component.name} samples but has no parameter that names one clock"
-            self.mistakes.add("E504", place.shifted(node.start), what, hint="parameters: {clock: clock}")
+            self.mistakes.add("E504", place, what, hint="parameters: {clock: clock}")
             clock = "?"
         return Call("sample", (argument, Name((clock,))))
 
@@ -219,51 +273,95 @@ class _Instance:
         head = node.parts[0]
         if node.parts in (("peers",), ("time",)):
             return Name(node.parts)
+        if any(table.name == head for table in self.part.tables) and len(node.parts) == 1:
+            return Name((*self.part.name.split("."), head))
         if head == OTHERS:
-            return Name((OTHERS, self.part.name, *node.parts[1:]))
+            return Name((OTHERS, *self.part.name.split("."), *node.parts[1:]))
         if len(node.parts) == 1 and head in self.words and self.component.parameter(head) is None:
             return Number(self.words[head])
-        whole = Name((self.part.name, *node.parts))
+        if head in self.passed:
+            inner, its = self.passed[head]
+            node = Name((inner, its, *node.parts[1:]))
+        whole = Name((*self.part.name.split("."), *node.parts))
         if self.part.shared and len(node.parts) == 1 and head in self.divided:
             return Binary("/", whole, PEERS)
         return whole
 
 
+Node = tuple[str, str]  # (part, connector)
+
+
 def _connections(parts: list[Part], mistakes: Mistakes) -> Iterator[FlatEquation]:
-    """Yield, for each set of connectors that meet: potentials equal in a chain, flows summing to zero."""
+    """Yield, for each set of connectors that meet: potentials equal, flows summing to zero.
+
+    In a set with the ground the potentials are zero and the flows are whatever they must be.
+    """
     here = {part.name: part for part in parts}
-    sets: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    passed = {
+        (part.name, connector): (f"{part.name}.{inner}", its)
+        for part in parts
+        for connector, inner, its in part.component.passed
+    }
+    for members in _meeting(parts, here, passed, mistakes):
+        grounded = (GROUND, "") in members
+        joined = [node for node in members if node[0] != GROUND and node not in passed]
+        first_part, first_connector = joined[0]
+        type_ = dict(here[first_part].component.connectors)[first_connector]
+        place = here[joined[-1][0]].place
+        for variable in type_.potentials:
+            names = [_whole_name(node, variable.name) for node in joined]
+            if grounded:
+                for name in names:
+                    yield FlatEquation(name, Number(Fraction(0)), "connection", None, place)
+            else:
+                for name in names[1:]:
+                    yield FlatEquation(name, names[0], "connection", None, place)
+        if grounded:
+            continue
+        for variable in type_.flows:
+            total: Expr = _whole_name(joined[0], variable.name)
+            for node in joined[1:]:
+                total = Binary("+", total, _whole_name(node, variable.name))
+            yield FlatEquation(total, Number(Fraction(0)), "connection", None, place)
+
+
+def _whole_name(node: Node, variable: str) -> Name:
+    return Name((*node[0].split("."), node[1], variable))
+
+
+def _meeting(
+    parts: list[Part], here: dict[str, Part], passed: dict[Node, Node], mistakes: Mistakes
+) -> Iterator[list[Node]]:
+    """Yield the sets of connectors that meet, each read from what is joined to outwards."""
+    sets: dict[Node, list[Node]] = {}
     for part in parts:
         for connector, _ in part.component.connectors:
             sets[(part.name, connector)] = [(part.name, connector)]
+
+    def join(one: Node, two: Node) -> None:
+        mine, other = sets[one], sets[two]
+        if mine is not other:
+            # What is joined to comes first, so that a set reads from the mass outwards.
+            other.extend(mine)
+            for member in mine:
+                sets[member] = other
+
+    for outer, inner in passed.items():
+        join(outer, inner)
     for part in parts:
         for connector, other, its_connector in part.connections:
-            if other not in here:
+            own = (part.name, connector)
+            if other == GROUND:
+                if (GROUND, "") not in sets[own]:
+                    sets[own].append((GROUND, ""))  # each set has its own: the ground joins nothing
+            elif other not in here:
                 what = f"{part.name} is at groups where {other}, which it joins, is not"
-                mistakes.add(
-                    "E210", part.place, what, hint=f"at: the same groups at both {part.name} and {other}"
-                )
-                continue
-            one, two = sets[(part.name, connector)], sets[(other, its_connector)]
-            if one is not two:
-                # The part joined to comes first, so that a set reads from the mass outwards.
-                two.extend(one)
-                for member in one:
-                    sets[member] = two
+                hint = f"at: the same groups at both {part.name} and {other}"
+                mistakes.add("E210", part.place, what, hint=hint)
+            else:
+                join(own, (other, its_connector))
     seen: set[int] = set()
     for members in sets.values():
-        if id(members) in seen:
-            continue
-        seen.add(id(members))
-        first_part, first_connector = members[0]
-        type_ = dict(here[first_part].component.connectors)[first_connector]
-        place = here[members[-1][0]].place
-        for variable in type_.potentials:
-            first = Name((*members[0], variable.name))
-            for member in members[1:]:
-                yield FlatEquation(Name((*member, variable.name)), first, "connection", None, place)
-        for variable in type_.flows:
-            total: Expr = Name((*members[0], variable.name))
-            for member in members[1:]:
-                total = Binary("+", total, Name((*member, variable.name)))
-            yield FlatEquation(total, Number(Fraction(0)), "connection", None, place)
+        if id(members) not in seen:
+            seen.add(id(members))
+            yield members

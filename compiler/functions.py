@@ -10,37 +10,27 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Sequence
-from fractions import Fraction
 from typing import Any
 
 import casadi
 import sympy
-from apc.compiler.clocks import HoldCrossing
+from apc.compiler.clocks import OTHERS, HoldCrossing, ReceiveCrossing
 from apc.compiler.compiled import (
-    PEERS,
-    Clock,
     ClockPartition,
     CompiledSystem,
-    Group,
     Hold,
     Kind,
-    Link,
     Origin,
-    Parameter,
     Receive,
     SendPartition,
     State,
-    Timing,
 )
-from apc.compiler.errors import Mistakes, Place
-from apc.compiler.expression import Expr, Name, Number, evaluate, format_expression
-from apc.compiler.library import Number as NumberParameter
-from apc.compiler.scene import Part, Scene, Value
+from apc.compiler.exchange import Timings, all_parameters, compiled_groups, used_clocks, used_links
+from apc.compiler.scene import Scene, TimeTable
 from apc.compiler.structure import SortedKind, SortedSystem
-from apc.compiler.symbolic import derivative_symbol, symbol
+from apc.compiler.symbolic import derivative_symbol, no_derivative, symbol, to_sympy
 from apc.compiler.units import format_dimension
 
-NO_DELAY = "no delay"
 _CASADI: dict[str, Callable[..., Any]] = {
     "min": casadi.fmin,
     "max": casadi.fmax,
@@ -66,176 +56,71 @@ _CASADI: dict[str, Callable[..., Any]] = {
 
 
 def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
-    """Write every kind as CasADi functions. Raises ApcError if a setting can't vary as asked."""
+    """Write every kind as CasADi functions, and what lies between the sites beside them."""
     scene = system.scene
-    mistakes = Mistakes()
-    timings = _Timings(scene)
-    kinds = []
-    dropped: list[tuple[str, str]] = []
-    for kind in system.kinds:
-        builder = _KindBuilder(kind, timings)
-        kinds.append(builder.build())
-        dropped += builder.dropped
-    used_links = {receive.link for kind in kinds for clock in kind.clocks for receive in clock.receives}
-    links = []
-    for part in scene.parts:
-        if part.section == "links":
-            if part.name in used_links:
-                links.append(_link(part, timings))
-            else:
-                dropped.append((part.name, "nobody hears what it would carry"))
-    used_clocks = {link.clock for link in links} | {clock.clock for kind in kinds for clock in kind.clocks}
-    clocks = []
-    for clock in scene.clocks:
-        if clock.name in used_clocks:
-            names = (f"{clock.name}.period", f"{clock.name}.phase")
-            clocks.append(
-                Clock(
-                    clock.name,
-                    timings.use(*_timed(names[0], clock.period)),
-                    timings.use(*_timed(names[1], clock.phase)),
-                )
-            )
-        else:
-            dropped.append((clock.name, "nothing ticks with it"))
-    _check_common(scene, timings, mistakes)
-    mistakes.raise_if_any()
-    groups = tuple(
-        Group(group.name, group.count, _kind_of(system, group.name), _settings(scene, group.values))
-        for group in scene.groups
-    )
+    timings = Timings(scene)
+    builders = [_KindBuilder(scene, kind, timings) for kind in system.kinds]
+    rows = _shared_rows(builders)
+    kinds = [builder.build(rows) for builder in builders]
+    dropped = [item for builder in builders for item in builder.dropped]
+    links, unheard = used_links(scene, kinds, timings)
+    clocks, silent = used_clocks(scene, kinds, links, timings)
+    numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
     return CompiledSystem(
         scene.name,
         scene.about,
         tuple(clocks),
         tuple(links),
         timings.found,
-        _parameters(scene, kinds),
+        all_parameters(scene, kinds),
         tuple(kinds),
-        groups,
-        tuple(dict.fromkeys(dropped)),
+        compiled_groups(scene, kinds, numbers, links, timings),
+        tuple(dict.fromkeys([*dropped, *unheard, *silent])),
         origin,
     )
 
 
-def _timed(name: str, value: Value) -> tuple[str, Fraction, str | None]:
-    return name, value.number, value.expression
+def _shared_rows(builders: Sequence[_KindBuilder]) -> dict[str, str]:
+    """Return, for each send that some kind hears, the send whose row it travels in.
 
-
-def _kind_of(system: SortedSystem, group: str) -> int:
-    return next(i for i, kind in enumerate(system.kinds) if group in kind.clocked.flat.groups)
-
-
-def _link(part: Part, timings: _Timings) -> Link:
-    values = dict(part.values)
-    clock = part.reference("clock")
-    assert clock is not None
-    name = f"{part.name}.delay"
-    return Link(part.name, clock, timings.use(*_timed(name, values["delay"])), dict(part.options)["graph"])
-
-
-class _Timings:
-    """The periods, phases and delays that the model refers to, each once."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        self._found: dict[str, Timing] = {}
-
-    @property
-    def found(self) -> tuple[Timing, ...]:
-        """All timings in use, in the order of first use."""
-        return tuple(self._found.values())
-
-    def use(self, name: str, value: Fraction, expression: str | None) -> str:
-        """Register a timing and return its name."""
-        self._found.setdefault(name, Timing(name, value, expression))
-        return name
-
-    def delay(self, hold: HoldCrossing) -> str:
-        """Register the delay of a hold: a constant, or a parameter of a part."""
-        expression = hold.delay
-        if isinstance(expression, Number) and expression.value == 0:
-            return self.use(NO_DELAY, Fraction(0), None)
-        if isinstance(expression, Name):
-            part, name = expression.parts
-            value = dict(self.scene.part(part).values)[name]
-            return self.use(f"{part}.{name}", value.number, value.expression)
-        return self.use(f"{hold.variable} delay", self._evaluate(expression), format_expression(expression))
-
-    def _evaluate(self, expression: Expr) -> Fraction:
-        def number(parts: tuple[str, ...]) -> Fraction:
-            if parts == (PEERS,):
-                return Fraction(self.scene.peers)
-            return dict(self.scene.part(parts[0]).values)[parts[1]].number
-
-        return Fraction(evaluate(expression, number, place=Place(self.scene.name)))
-
-
-def _check_common(scene: Scene, timings: _Timings, mistakes: Mistakes) -> None:
-    names = {timing.name for timing in timings.found}
-    for group in scene.groups:
-        for name, value in group.values:
-            if name in names:
-                what = f"{name} is the same for all peers: a group can't set it"
-                mistakes.add(
-                    "E211",
-                    value.place,
-                    what,
-                    hint=f"{name.partition('.')[2]}: … where {name.partition('.')[0]} is described",
+    Two sends over one link share a row when every kind sends the same under both names.
+    """
+    rows: dict[str, str] = {}
+    for builder in builders:
+        for name in builder.heard_sends():
+            if name not in rows:
+                rows[name] = next(
+                    (
+                        other
+                        for other in dict.fromkeys(rows.values())
+                        if _same_everywhere(name, other, builders)
+                    ),
+                    name,
                 )
+    return rows
 
 
-def _settings(scene: Scene, values: Iterable[tuple[str, Value]]) -> tuple[Parameter, ...]:
-    return tuple(_parameter(scene, name, value) for name, value in values)
-
-
-def _parameter(scene: Scene, name: str, value: Value) -> Parameter:
-    unit = format_dimension(value.dimension)
-    number = float(value.number)
-    part, _, own = name.partition(".")
-    if own:
-        component = scene.part(part).component
-        declared = component.parameter(own)
-        if isinstance(declared, NumberParameter):
-            return Parameter(
-                name,
-                unit,
-                number,
-                value.expression,
-                None if declared.minimum is None else float(declared.minimum),
-                declared.open_minimum,
-                None if declared.maximum is None else float(declared.maximum),
-                declared.about,
-            )
-        variable = component.variable(own)
-        assert variable is not None
-        return Parameter(name, unit, number, value.expression, about=f"start value: {variable.about}")
-    return Parameter(name, unit, number, value.expression)
-
-
-def _parameters(scene: Scene, kinds: Sequence[Kind]) -> tuple[Parameter, ...]:
-    """Return every parameter of the scene: named ones, then each part's, then the start values of states."""
-    found = {name: _parameter(scene, name, value) for name, value in scene.parameters}
-    starts = {state.start: state for kind in kinds for state in kind.states}
-    for part in scene.parts:
-        for own, value in part.values:
-            name = f"{part.name}.{own}"
-            found[name] = _parameter(scene, name, value)
-        given = dict(part.starts)
-        for variable in part.component.variables:
-            name = f"{part.name}.{variable.name}"
-            if name in starts and variable.start is not None:
-                default = Value(variable.start, variable.unit.dimension, None, part.place)
-                found[name] = _parameter(scene, name, given.get(variable.name, default))
-    found[PEERS] = Parameter(PEERS, "1", float(scene.peers), about="number of peers")
-    return tuple(found.values())
+def _same_everywhere(name: str, other: str, builders: Sequence[_KindBuilder]) -> bool:
+    for builder in builders:
+        one, two = builder.sends.get(name), builder.sends.get(other)
+        if one is None and two is None:
+            continue
+        if one is None or two is None or one.link != two.link or one.expression != two.expression:
+            return False
+    return True
 
 
 class _KindBuilder:
     """One kind's functions: first what is needed is found, then it is written."""
 
-    def __init__(self, kind: SortedKind, timings: _Timings) -> None:
+    def __init__(self, scene: Scene, kind: SortedKind, timings: Timings) -> None:
         self.kind = kind
+        self.tables = {
+            f"{part.name}.{table.name}": table
+            for part in scene.parts
+            if part.name in kind.clocked.flat.parts
+            for table in part.tables
+        }
         self.timings = timings
         self.dropped: list[tuple[str, str]] = []
         self.continuous = {symbol(name): expression for name, expression in kind.partitions[0].assignments}
@@ -247,9 +132,27 @@ class _KindBuilder:
         self.known_previous = {symbol(previous.symbol): previous for previous in kind.previous}
         self.known_receives = {symbol(receive.symbol): receive for receive in kind.receives}
         self.sends = {send.name: send for send in kind.sends}
+        self.edges = {
+            symbol(receive.symbol): to_sympy(receive.edge, no_derivative)
+            for receive in kind.receives
+            if receive.edge is not None
+        }
 
-    def build(self) -> Kind:
-        reached = self._reach()
+        self.reached = self._reach()
+
+    def heard_sends(self) -> list[str]:
+        """Return the names this kind hears of the others, each once."""
+        found: dict[str, None] = {}
+        for s, receive in self.known_receives.items():
+            if s in self.reached:
+                found[receive.send] = None
+                if s in self.edges:
+                    found.update(dict.fromkeys(_others(self.edges[s])))
+        return list(found)
+
+    def build(self, rows: dict[str, str]) -> Kind:
+        """Write the kind's functions; `rows` says in which row each send that is heard travels."""
+        reached = self.reached
         holds = [hold for s, hold in self.known_holds.items() if s in reached]
         self.dropped += [
             (hold.variable, "nobody reads this force")
@@ -258,16 +161,20 @@ class _KindBuilder:
         ]
         receives = {s: receive for s, receive in self.known_receives.items() if s in reached}
         outputs = self._outputs(holds, reached)
-        channels = self._channels(receives.values())
+        channels = self._channels(rows)
         states = self.kind.states
-        self.dropped += [(name, "nobody hears it") for name in self.sends if name not in channels]
+        self.dropped += [(name, "nobody hears it") for name in self.sends if name not in rows]
         x = {symbol(name): casadi.SX.sym(name) for name in states}
         u = {symbol(hold.symbol): casadi.SX.sym(hold.symbol) for hold in holds}
-        parameters = self._parameters(reached, x, u)
-        p = {s: casadi.SX.sym(s.name) for s in parameters}
+        names = self._parameter_names(reached, {*x, *u})
+        p = {name: casadi.SX.sym(name) for name in names}
         time = casadi.SX.sym("time")
-        writer = _Writer({**x, **u, **p, symbol("time"): time}, {**self.continuous, **self.samples})
-        inputs = {"x": _column(x), "u": _column(u), "p": _column(p), "t": time}
+        known = {symbol(name): value for name, value in p.items()} | {
+            symbol(f"initial({name})"): value for name, value in p.items()
+        }
+        known |= {**x, **u, symbol("time"): time}
+        writer = _Writer(known, {**self.continuous, **self.samples}, self.tables)
+        inputs = {"x": _column(x), "u": _column(u), "p": _stack(p.values()), "t": time}
         derivative = casadi.Function(
             "derivative",
             [inputs["x"], inputs["u"], inputs["p"], time],
@@ -292,11 +199,11 @@ class _KindBuilder:
                     self._hold_name(hold, holds),
                     hold.clock,
                     outputs[hold.clock].index(hold.variable),
-                    self.timings.delay(hold),
+                    self.timings.delay(hold, self.kind.clocked.flat),
                 )
                 for hold in holds
             ),
-            tuple(s.name for s in parameters),
+            tuple(names),
             derivative,
             clocks,
             sends,
@@ -327,8 +234,16 @@ class _KindBuilder:
                 work.append(symbol(self.known_holds[s].variable))
             if s in self.known_previous:
                 work.append(symbol(self.known_previous[s].variable))
+            if s in self.edges:
+                work += self.edges[s].free_symbols
             if s in self.known_receives:
-                work += self.sends[self.known_receives[s].send].expression.free_symbols
+                heard = [self.known_receives[s].send, *_others(self.edges.get(s))]
+                work += [
+                    t
+                    for name in heard
+                    if name in self.sends
+                    for t in self.sends[name].expression.free_symbols
+                ]
         return seen
 
     def _outputs(self, holds: Sequence[HoldCrossing], reached: set[sympy.Symbol]) -> dict[str, list[str]]:
@@ -340,23 +255,28 @@ class _KindBuilder:
                 outputs[previous.clock][previous.variable] = None
         return {clock: list(names) for clock, names in outputs.items()}
 
-    def _channels(self, receives: Iterable[Any]) -> dict[str, tuple[str, int]]:
-        """Return for each send that is heard its link and row; equal expressions on a link share a row."""
-        rows: dict[str, list[sympy.Expr]] = {}
-        found = {}
-        for name in dict.fromkeys(receive.send for receive in receives):
-            send = self.sends[name]
-            row = rows.setdefault(send.link, [])
-            if send.expression not in row:
-                row.append(send.expression)
-            found[name] = (send.link, row.index(send.expression))
-        return found
+    def _channels(self, rows: dict[str, str]) -> dict[str, tuple[str, int]]:
+        """Return for each send that is heard its link and its row among what this kind sends over it."""
+        own = [name for name in rows if name in self.sends]
+        by_link: dict[str, list[str]] = {}
+        for name in own:
+            listed = by_link.setdefault(self.sends[name].link, [])
+            if rows[name] not in listed:
+                listed.append(rows[name])
+        return {
+            name: (self.sends[name].link, by_link[self.sends[name].link].index(rows[name])) for name in own
+        }
 
-    def _parameters(self, reached: set[sympy.Symbol], *others: Iterable[sympy.Symbol]) -> list[sympy.Symbol]:
-        defined = {*self.continuous, *self.clocked, *self.samples, *self.known_holds}
+    def _parameter_names(self, reached: set[sympy.Symbol], inputs: set[sympy.Symbol]) -> list[str]:
+        """Return the parameters of the kind: those its functions read, and its start values."""
+        defined = {*self.continuous, *self.clocked, *self.samples, *self.known_holds, *inputs}
         defined |= {*self.known_previous, *self.known_receives, symbol("time")}
-        defined |= {s for other in others for s in other}
-        return sorted(reached - defined, key=lambda s: s.name)
+        defined |= {symbol(name) for name in self.tables}
+        free = {s.name for s in reached - defined if not s.name.startswith(f"{OTHERS}.")}
+        starts = set(self.kind.states)
+        starts |= {previous.variable for s, previous in self.known_previous.items() if s in reached}
+        starts |= {name[8:-1] for name in free if name.startswith("initial(")}
+        return sorted({name for name in free if not name.startswith("initial(")} | starts)
 
     def _clock(
         self,
@@ -376,6 +296,7 @@ class _KindBuilder:
         r = {s: casadi.SX.sym(s.name) for s in heard}
         m = {s: casadi.SX.sym(s.name) for s in remembered}
         own = writer.extended({**r, **m}, self.clocked)
+        alone = writer.extended(m, self.clocked)  # what one pair of peers knows: nothing that is heard
         tick = casadi.Function(
             f"tick_{clock}",
             [inputs["x"], inputs["u"], _column(m), _column(r), inputs["p"], inputs["t"]],
@@ -389,10 +310,42 @@ class _KindBuilder:
             tuple(outputs.index(previous.variable) for previous in remembered.values()),
             tuple(previous.variable for previous in remembered.values()),
             tuple(
-                Receive(receive.symbol, receive.operator, receive.link, channels[receive.send][1])
-                for receive in heard.values()
+                Receive(
+                    receive.symbol,
+                    receive.operator,
+                    receive.link,
+                    channels[receive.send][1],
+                    self._edge(s, receive, channels, alone, m, inputs) if s in self.edges else None,
+                )
+                for s, receive in heard.items()
             ),
             tick,
+        )
+
+    def _edge(
+        self,
+        s: sympy.Symbol,
+        receive: ReceiveCrossing,
+        channels: dict[str, tuple[str, int]],
+        writer: _Writer,
+        remembered: dict[sympy.Symbol, casadi.SX],
+        inputs: dict[str, casadi.SX],
+    ) -> Any:
+        """Write what a reduction runs over, for one peer that hears and one that is heard."""
+        size = 1 + max(row for link, row in channels.values() if link == receive.link)
+        sent = casadi.SX.sym("s", size)
+        theirs = {
+            symbol(f"{OTHERS}.{name}"): sent[row]
+            for name, (link, row) in channels.items()
+            if link == receive.link
+        }
+        own = writer.extended(theirs, {})
+        return casadi.Function(
+            "edge",
+            [inputs["x"], inputs["u"], _column(remembered), sent, inputs["p"], inputs["t"]],
+            [own.translate(self.edges[s])],
+            ["x", "u", "m", "s", "p", "t"],
+            ["value"],
         )
 
     def _send(
@@ -413,6 +366,14 @@ class _KindBuilder:
         return SendPartition(link, tuple(names), tuple(self.sends[name].unit for name in names), send)
 
 
+def _others(expression: sympy.Expr | None) -> list[str]:
+    """Return what an expression reads of another peer."""
+    if expression is None:
+        return []
+    prefix = f"{OTHERS}."
+    return sorted(s.name.removeprefix(prefix) for s in expression.free_symbols if s.name.startswith(prefix))
+
+
 def _column(symbols: dict[sympy.Symbol, casadi.SX]) -> casadi.SX:
     return _stack(symbols.values())
 
@@ -427,16 +388,20 @@ class _Writer:
     """Translates SymPy expressions to CasADi, each definition once."""
 
     def __init__(
-        self, known: dict[sympy.Symbol, casadi.SX], definitions: dict[sympy.Symbol, sympy.Expr]
+        self,
+        known: dict[sympy.Symbol, casadi.SX],
+        definitions: dict[sympy.Symbol, sympy.Expr],
+        tables: dict[str, TimeTable],
     ) -> None:
         self.known = dict(known)
         self.definitions = definitions
+        self.tables = tables
 
     def extended(
         self, known: dict[sympy.Symbol, casadi.SX], definitions: dict[sympy.Symbol, sympy.Expr]
     ) -> _Writer:
         """Return a writer that knows more."""
-        return _Writer({**self.known, **known}, {**self.definitions, **definitions})
+        return _Writer({**self.known, **known}, {**self.definitions, **definitions}, self.tables)
 
     def write(self, wanted: sympy.Symbol) -> casadi.SX:
         """Return the value of a symbol, writing what it depends on first.
@@ -449,7 +414,7 @@ class _Writer:
             if s in self.known:
                 work.pop()
                 continue
-            missing = [t for t in sorted(self.definitions[s].free_symbols, key=str) if t not in self.known]
+            missing = [t for t in self._needed(self.definitions[s]) if t not in self.known]
             if missing:
                 work += missing
             else:
@@ -459,9 +424,12 @@ class _Writer:
 
     def translate(self, expression: sympy.Expr) -> casadi.SX:
         """Return the value of an expression."""
-        for s in sorted(expression.free_symbols, key=str):
+        for s in self._needed(expression):
             self.write(s)
         return self._build(expression)
+
+    def _needed(self, expression: sympy.Expr) -> list[sympy.Symbol]:
+        return sorted((s for s in expression.free_symbols if s.name not in self.tables), key=str)
 
     def _build(self, expression: sympy.Expr) -> casadi.SX:
         if expression.is_Symbol:
@@ -471,12 +439,22 @@ class _Writer:
             return casadi.SX(float(expression))
         if expression.is_Mul:
             return self._product(expression)
+        if expression.func.__name__ == "interpolate":
+            return self._interpolated(*expression.args)
         arguments = [self._build(argument) for argument in expression.args]
         if expression.is_Add:
             return _fold(arguments, operator.add)
         if expression.is_Pow:
             return _power(arguments[0], expression.exp, arguments[1])
         value: casadi.SX = _CASADI[expression.func.__name__](*arguments)
+        return value
+
+    def _interpolated(self, table: sympy.Symbol, time: sympy.Expr) -> casadi.SX:
+        """Return a table's value, linear between its rows and constant beyond its ends."""
+        found = self.tables[table.name]
+        start, end = found.times[0], found.times[-1]
+        inside = casadi.fmin(casadi.fmax(self._build(time), start), end)
+        value: casadi.SX = casadi.pw_lin(inside, found.times.tolist(), found.numbers.tolist())
         return value
 
     def _product(self, expression: sympy.Expr) -> casadi.SX:

@@ -17,10 +17,11 @@ from apc.compiler.clocks import ClockedSystem
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.expression import format_expression
 from apc.compiler.flatten import FlatKind, FlatSystem
-from apc.compiler.scene import Scene, Value
+from apc.compiler.scene import Scene
+from apc.compiler.values import Value
 from apc.compiler.source import Mapping, Node, Scalar, Source
 from apc.compiler.structure import SortedSystem
-from apc.compiler.units import format_dimension, format_si
+from apc.compiler.units import format_dimension
 
 
 @singledispatch
@@ -58,6 +59,8 @@ def _(scene: Scene) -> str:
     for group in scene.groups:
         lines.append(f"group {group.name}: {group.count} peers")
         lines += [f"  {name} = {_quantity(value)}" for name, value in group.values]
+        lines += [f"  {name} = {word}" for name, word in group.words]
+        lines += [f"  {name}: a value a peer" for name, _ in group.columns]
     for part in scene.parts:
         shared = ", shared" if part.shared else ""
         lines.append(
@@ -65,13 +68,17 @@ def _(scene: Scene) -> str:
         )
         lines += [f"  {name} = {_quantity(value)}" for name, value in (*part.values, *part.starts)]
         lines += [f"  {name} = {word}" for name, word in (*part.options, *part.references)]
-        lines += [f"  {own} joins {other}.{its}" for own, other, its in part.connections]
+        lines += [
+            f"  {own} joins {f'{other}.{its}' if its else other}" for own, other, its in part.connections
+        ]
+    for link in scene.links:
+        lines.append(f"link {link.name}: {link.graph.shape}, on {link.clock}, delay {_quantity(link.delay)}")
+        lines += [f"  from {d.sender} to {d.receiver}: {_quantity(d.delay)}" for d in link.delays]
     return "\n".join(lines)
 
 
 def _quantity(value: Value) -> str:
-    number = format_si(float(value.number), value.dimension)
-    return f"{value.expression} = {number}" if value.expression else number
+    return f"{value.expression} = {value}" if value.expression else str(value)
 
 
 @describe.register

@@ -15,7 +15,7 @@ from apc.compiler.compiled import CompiledSystem, Origin
 from apc.compiler.flatten import FlatSystem, flatten
 from apc.compiler.functions import build_functions
 from apc.compiler.library import Library
-from apc.compiler.scene import Scene, build_scene
+from apc.compiler.scene import Scene, build_scene, library_folders
 from apc.compiler.source import Source, read_source
 from apc.compiler.structure import SortedSystem, sort
 
@@ -36,7 +36,7 @@ def run_stages(path: Path, *, until: Stage) -> StageValue:
     source = read_source(path)
     if until == "source":
         return source
-    library = Library()
+    library = Library(library_folders(source))
     scene = build_scene(source, library)
     if until == "scene":
         return scene
@@ -49,4 +49,6 @@ def run_stages(path: Path, *, until: Stage) -> StageValue:
     sorted_system = sort(clocked)
     if until == "sorted":
         return sorted_system
-    return build_functions(sorted_system, Origin(path.name, ((path.name, source.digest), *library.texts)))
+    return build_functions(
+        sorted_system, Origin(path.name, ((path.name, source.digest), *scene.texts, *library.texts))
+    )

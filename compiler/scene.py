@@ -2,30 +2,27 @@
 
 Takes: the YAML source of a topology and a library. Gives: `Scene`.
 Guarantees: parts, clocks, links, parameters and connections that are named exist; quantities have the unit
-their parameter wants and lie within its bounds; all mistakes of the file are reported together.
+their parameter wants and lie within its bounds; parts inside parts and arrays are written out; all mistakes
+of the file are reported together.
 Does not: look into a component's equations.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
 
-from apc.compiler.dimensions import ANY, SECOND, dimension_of
+import numpy as np
+from apc.compiler.component import Component, Number, Option, Reference, Variable
+from apc.compiler.definitions import read_type
+from apc.compiler.dimensions import SECOND
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.expression import Expr, Name, evaluate, parse_expression, walk
-from apc.compiler.library import (
-    Component,
-    Library,
-    Number,
-    Option,
-    Reference,
-    numbers,
-    text_place,
-    unknown_component,
-)
+from apc.compiler.graphs import COMPLETE, Graph, PairDelay, read_graph, read_pairs
+from apc.compiler.groups import Columns, GroupBody, read_counts, read_settings
+from apc.compiler.library import Library
+from apc.compiler.parts import LARGEST_ARRAY, Scope, read_entry
 from apc.compiler.reading import (
     add_unknown,
     brief,
@@ -36,29 +33,41 @@ from apc.compiler.reading import (
     read_name,
     read_text,
 )
-from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source, place_in
-from apc.compiler.units import DIMENSIONLESS, Dimension, format_dimension, format_si, parse_quantity, quantity
+from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source
+from apc.compiler.tables import read_table
+from apc.compiler.units import DIMENSIONLESS, Dimension
+from apc.compiler.values import (
+    PEERS,
+    Binding,
+    Value,
+    read_binding,
+    read_free,
+    renamed,
+    resolve_in_order,
+    settle,
+)
+from numpy.typing import NDArray
 
 SECTIONS = ("masses", "couplers", "links", "hands")
-KEYS = ("topology", "about", "clocks", "parameters", "peers", *SECTIONS, "experiment", "studies")
-DEFAULT_TYPES = {"masses": "Mass", "links": "Link"}
-LARGEST_COUNT = 10**9
-# A quantity starts with a number; what follows is nothing, a unit, or a ratio such as 1/90 s. An operator
-# behind the number makes it an expression.
-_QUANTITY = re.compile(
-    r"[+-]?\s*(\d|\.\d)[\d.]*([eE][+-]?\d+)?(\s*/\s*\d[\d.]*)?\s*([^\W\d_].*|[°%µΩ].*)?\Z", re.DOTALL
+KEYS = (
+    "topology",
+    "about",
+    "library",
+    "clocks",
+    "parameters",
+    "peers",
+    *SECTIONS,
+    "experiment",
+    "studies",
 )
-_WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
-
-
-@dataclass(frozen=True, slots=True)
-class Value:
-    """A number given in the file, in SI; `expression` is its text when it depends on other parameters."""
-
-    number: Fraction
-    dimension: Dimension
-    expression: str | None
-    place: Place
+DEFAULT_TYPES = {"masses": "Mass", "links": "Link"}
+EXAMPLES = {
+    "masses": "device: {mass: 0.1 kg}",
+    "links": "lan: {clock: network}",
+    "couplers": "contact: {type: SampledSpringDamper}",
+    "hands": "hand: {type: ConstantForce}",
+}
+PART_KEYS = ("at", "shared", "count")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +80,21 @@ class SceneClock:
 
 
 @dataclass(frozen=True, slots=True)
+class TimeTable:
+    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI."""
+
+    name: str
+    times: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
 class Part:
-    """An instance of a component at every peer of `groups`.
+    """An instance of a component at every peer of `groups`; parts inside parts are parts of their own.
 
     `values` holds a value for every number the component declares, `options` and `references` a word for
-    every option and reference, `starts` the start values given here; `connections` join a connector of this
-    part to (part, connector).
+    every option and every clock or link it names, `starts` the start values given here; `connections` join
+    a connector of this part to (part, connector), the part "ground" being fixed.
     """
 
     name: str
@@ -85,26 +103,45 @@ class Part:
     values: tuple[tuple[str, Value], ...]
     options: tuple[tuple[str, str], ...]
     references: tuple[tuple[str, str], ...]
+    tables: tuple[TimeTable, ...]
     starts: tuple[tuple[str, Value], ...]
     connections: tuple[tuple[str, str, str], ...]
     shared: bool
     groups: tuple[str, ...]
     place: Place
 
-    def reference(self, target: str) -> str | None:
+    def reference(self, role: str) -> str | None:
         """Return the clock or link this part names, when it names exactly one."""
-        roles = {p.name for p in self.component.parameters if isinstance(p, Reference) and p.target == target}
-        named = [word for role, word in self.references if role in roles]
+        names = {p.name for p in self.component.parameters if isinstance(p, Reference) and p.role == role}
+        named = [word for name, word in self.references if name in names]
         return named[0] if len(named) == 1 else None
 
 
 @dataclass(frozen=True, slots=True)
+class SceneLink:
+    """Who hears whom over a link, and how late."""
+
+    name: str
+    clock: str
+    delay: Value
+    graph: Graph
+    delays: tuple[PairDelay, ...]
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
 class PeerGroup:
-    """`count` peers; `values` are its own settings, by full name such as `contact.stiffness`."""
+    """`count` peers.
+
+    `values` are the group's own settings by whole name (`contact.stiffness`), `words` its own options and
+    clocks, `columns` settings that differ from peer to peer.
+    """
 
     name: str
     count: int
     values: tuple[tuple[str, Value], ...]
+    words: tuple[tuple[str, str], ...]
+    columns: Columns
     place: Place
 
 
@@ -119,7 +156,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A topology, whole."""
+    """A topology, whole. `texts` are the digests of the files it names."""
 
     name: str
     about: str
@@ -127,9 +164,11 @@ class Scene:
     parameters: tuple[tuple[str, Value], ...]
     groups: tuple[PeerGroup, ...]
     parts: tuple[Part, ...]
+    links: tuple[SceneLink, ...]
     duration: Fraction | None
     seed: int
     region: tuple[Axis, ...]
+    texts: tuple[tuple[str, str], ...]
     place: Place
 
     @property
@@ -142,6 +181,17 @@ class Scene:
         return next(part for part in self.parts if part.name == name)
 
 
+@dataclass(frozen=True, slots=True)
+class _Body:
+    """A part's entry before it is read."""
+
+    section: str
+    body: Mapping
+    component: Component
+    place: Place
+    count: int | None
+
+
 def build_scene(source: Source, library: Library) -> Scene:
     """Read a topology. Raises ApcError with every mistake of the file."""
     reader = _Reader(source, library)
@@ -151,6 +201,30 @@ def build_scene(source: Source, library: Library) -> Scene:
     return scene
 
 
+def library_folders(source: Source) -> tuple[Path, ...]:
+    """Return the folders of components that a topology names. Raises ApcError for one that isn't there."""
+    if not isinstance(source.root, Mapping):
+        return ()
+    node = source.root.get("library")
+    nodes = node.items if isinstance(node, Sequence) else () if node is None else (node,)
+    mistakes = Mistakes()
+    found = []
+    for item in nodes:
+        text = read_text(item, "library", mistakes, hint="library: ./parts")
+        if text is not None:
+            folder = _folder_of(source) / text
+            if folder.is_dir():
+                found.append(folder)
+            else:
+                mistakes.add("E214", item.place, f"the library folder {brief(text)} does not exist")
+    mistakes.raise_if_any()
+    return tuple(found)
+
+
+def _folder_of(source: Source) -> Path:
+    return source.path.parent if source.path is not None else Path()
+
+
 class _Reader:
     """The state of one reading: what is known so far, and the mistakes."""
 
@@ -158,12 +232,17 @@ class _Reader:
         self.library = library
         self.mistakes = Mistakes()
         self.source = source
+        self.folder = _folder_of(source)
         self.clocks: dict[str, SceneClock] = {}
         self.parameters: dict[str, Value] = {}
-        self.bodies: dict[str, tuple[str, Mapping, Component, Place]] = {}
-        self.groups: dict[str, int] = {}
+        self.bodies: dict[str, _Body] = {}
+        self.groups: dict[str, GroupBody] = {}
         self.faulty: set[str] = set()  # parts that are there but can't be read: reported once, there
-        self.missing: set[str] = set()  # sections that are named but not there: reported once
+        self.texts: dict[str, str] = {}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {name: group.count for name, group in self.groups.items()}
 
     def read(self) -> Scene | None:
         mistakes = self.mistakes
@@ -171,214 +250,96 @@ class _Reader:
         if root is None:
             return None
         root = check_keys(root, KEYS, "a topology", mistakes)
-        name = self._required(root, "topology", "topology: my-scene")
-        title = read_text(name, "topology", mistakes, hint="topology: my-scene") or ""
+        title = read_text(self._required(root, "topology", "topology: my-scene"), "topology", mistakes) or ""
         about = read_text(root.get("about"), "about", mistakes) or ""
         peers = self._required(root, "peers", "peers: {user: {count: 3}}")
-        group_bodies = self._read_counts(peers)
-        if self._required(root, "masses", "masses: {device: {mass: 0.1 kg}}") is None:
-            self.missing.add("masses")
+        self.groups = read_counts(peers, self.folder, mistakes, self.texts)
+        self._required(root, "masses", "masses: {device: {mass: 0.1 kg}}")
         self._read_parameters(root.get("parameters"))
         self._read_clocks(root.get("clocks"))
         for section in SECTIONS:
             self._read_section(section, root.get(section))
-        parts = tuple(
-            part
-            for part_name, (section, body, component, place) in self.bodies.items()
-            if (part := self._read_part(part_name, section, body, component, place, root)) is not None
-        )
-        groups = self._read_groups(group_bodies)
+        parts = [part for name, body in self.bodies.items() for part in self._read_part(name, body, root)]
+        links = tuple(self._link(part) for part in parts if part.section == "links" and "." not in part.name)
+        settable = _settable(parts)
+        groups = tuple(self._group(group, settable) for group in self.groups.values())
         duration, seed = self._read_experiment(root.get("experiment"))
-        region = self._read_studies(root.get("studies"))
-        clocks = tuple(self.clocks.values())
-        given = tuple(self.parameters.items())
-        return Scene(title, about, clocks, given, groups, parts, duration, seed, region, root.place)
+        region = self._read_studies(root.get("studies"), settable)
+        return Scene(
+            title,
+            about,
+            tuple(self.clocks.values()),
+            tuple(self.parameters.items()),
+            groups,
+            tuple(part for part in parts if part.section != "links"),
+            tuple(link for link in links if link is not None),
+            duration,
+            seed,
+            region,
+            tuple(sorted(self.texts.items())),
+            root.place,
+        )
 
     def _required(self, root: Mapping, key: str, hint: str) -> Node | None:
         node = root.get(key)
         if node is None:
-            self.mistakes.add(
-                "E201",
-                root.place,
-                f"the topology has no {key}" + ("" if key == "topology" else " section"),
-                hint=hint,
-            )
+            what = f"the topology has no {key}" + ("" if key == "topology" else " section")
+            self.mistakes.add("E201", root.place, what, hint=hint)
         return node
 
-    # ---- values ----
+    # ---- named numbers ----
 
-    def _value(
-        self,
-        node: Node | None,
-        what: str,
-        dimension: Dimension,
-        unit: str,
-        *,
-        words: Collection[tuple[str, Fraction]] = (),
-    ) -> Value | None:
-        """Read a quantity, a word that stands for a number, or an expression over the parameters."""
-        text = read_text(node, what, self.mistakes, hint=f"{what}: 1 {unit}")
-        if node is None or text is None:
+    def _dimension(self, parts: tuple[str, ...]) -> Dimension | None:
+        if parts == PEERS:
+            return DIMENSIONLESS
+        value = self.parameters.get(".".join(parts))
+        return None if value is None else value.dimension
+
+    def _number(self, parts: tuple[str, ...]) -> Fraction:
+        return (
+            Fraction(sum(self.counts.values())) if parts == PEERS else self.parameters[".".join(parts)].number
+        )
+
+    def _value(self, node: Node | None, what: str, dimension: Dimension, unit: str) -> Value | None:
+        names = ("peers", *self.parameters)
+        return self._settled(read_binding(node, what, dimension, unit, self._dimension, names, self.mistakes))
+
+    def _settled(self, binding: Binding | None) -> Value | None:
+        if binding is None:
             return None
-        named = dict(words)
-        if text in named:
-            return Value(named[text], dimension, None, node.place)
         try:
-            if _QUANTITY.match(text) or _WORD_NUMBER.match(text):
-                return Value(
-                    quantity(text, node.place, what=what, unit=unit).value, dimension, None, node.place
-                )
-            return self._expression(text, text_place(node), what, dimension, unit)
+            return settle(binding, self._number)
         except ApcError as error:
             self.mistakes.take(error)
             return None
 
-    def _expression(self, text: str, place: Place, what: str, dimension: Dimension, unit: str) -> Value:
-        expression = parse_expression(text, place)
-        self._check_names(expression, text, place, what)
-        found = dimension_of(expression, self._dimension_of_name, text, place)
-        if found not in (None, ANY, dimension) and any(isinstance(n, Name) for n in walk(expression)):
-            hint = f"{what}: 1 {unit}"
-            mistakes = Mistakes()
-            got = f"{brief(text)}, which is in {format_dimension(found or dimension)}"
-            mistakes.add("E204", place, what, expected=unit, got=got, hint=hint)
-            mistakes.raise_if_any()
-        number = evaluate(expression, self._number_of_name, place=place)
-        return Value(Fraction(number), dimension, text, place)
-
-    def _check_names(self, expression: Expr, text: str, place: Place, what: str) -> None:
-        mistakes = Mistakes()
-        for node in walk(expression):
-            if isinstance(node, Name) and node.parts[0] not in self.parameters and node.parts != ("peers",):
-                shown = ".".join(node.parts)
-                known = ("peers", *self.parameters)
-                told = f"{what} names {brief(shown)}, which is no parameter of this topology"
-                add_unknown("E206", place_in(place, text, node.start), told, shown, known, mistakes)
-        mistakes.raise_if_any()
-
-    def _dimension_of_name(self, name: Name) -> Dimension | None:
-        if name.parts == ("peers",):
-            return DIMENSIONLESS
-        return self.parameters[name.parts[0]].dimension
-
-    def _number_of_name(self, parts: tuple[str, ...]) -> Fraction:
-        if parts == ("peers",):
-            return Fraction(sum(self.groups.values()))
-        return self.parameters[parts[0]].number
-
     def _time(self, node: Node | None, what: str) -> Value | None:
         """Read a duration; a rate in Hz counts as its reciprocal."""
-        if isinstance(node, Scalar) and node.text.rstrip().endswith("Hz"):
-            rate = self._value(node, what, SECOND.power(Fraction(-1)), "Hz")
-            if rate is None:
-                return None
-            if rate.number == 0:
-                self.mistakes.add(
-                    "E207", node.place, what, expected="a rate above 0 Hz", got=brief(node.text)
-                )
-                return None
-            return Value(1 / rate.number, SECOND, None, rate.place)
-        return self._value(node, what, SECOND, "s")
-
-    # ---- sections ----
-
-    def _read_counts(self, node: Node | None) -> list[tuple[str, Mapping]]:
-        bodies = []
-        hint = "peers: {user: {count: 3}}"
-        section = read_mapping(node, "peers", self.mistakes, hint=hint)
-        if section is not None and not section.entries:
-            self.mistakes.add("E201", section.place, "peers names no group", hint=hint)
-        for key, value in entries(section):
-            name = read_name(key, "a group of peers", self.mistakes)
-            body = read_mapping(value, key.text, self.mistakes, hint=f"{key.text}: {{count: 3}}")
-            if name is None or body is None:
-                continue
-            body = check_keys(body, ("count", "set"), f"group {name}", self.mistakes)
-            count = self._read_count(body, name)
-            if count is not None:
-                self.groups[name] = count
-                bodies.append((name, body))
-        return bodies
-
-    def _read_count(self, body: Mapping, name: str) -> int | None:
-        node = body.get("count")
-        if node is None:
-            self.mistakes.add("E201", body.place, f"group {name} has no count", hint="count: 3")
+        if not (isinstance(node, Scalar) and node.text.rstrip().endswith("Hz")):
+            return self._value(node, what, SECOND, "s")
+        rate = self._value(node, what, SECOND.power(-1), "Hz")
+        if rate is None:
             return None
-        if (
-            isinstance(node, Scalar)
-            and node.plain
-            and isinstance(node.value, int)
-            and not isinstance(node.value, bool)
-            and 1 <= node.value <= LARGEST_COUNT
-        ):
-            return node.value
-        self.mistakes.add(
-            "E208",
-            node.place,
-            "count",
-            expected=f"a whole number from 1 to {LARGEST_COUNT}",
-            got=form(node),
-            hint="count: 3",
-        )
-        return None
+        if rate.number == 0:
+            got = brief(node.text)
+            self.mistakes.add("E207", node.place, what, expected="a rate above 0 Hz", got=got)
+            return None
+        return Value(1 / rate.number, SECOND, None, rate.place)
 
     def _read_parameters(self, node: Node | None) -> None:
         section = read_mapping(node, "parameters", self.mistakes, hint="parameters: {kt: 2000 N/m}")
-        waiting: dict[str, tuple[str, Place]] = {}
+        waiting: dict[str, Binding] = {}
         for key, value in entries(section):
             name = read_name(key, "a parameter", self.mistakes)
-            text = read_text(value, key.text, self.mistakes, hint=f"{key.text}: 2000 N/m")
-            if name is None or text is None:
-                continue
+            binding = read_free(value, key.text, self.mistakes)
             if name in ("peers", "time", "others", "ground"):
                 self.mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
-            elif _QUANTITY.match(text) or _WORD_NUMBER.match(text):
-                try:
-                    found = parse_quantity(text, value.place)
-                    self.parameters[name] = Value(found.value, found.unit.dimension, None, value.place)
-                except ApcError as error:
-                    self.mistakes.take(error)
-            else:
-                waiting[name] = (text, text_place(value))
-        self._resolve_parameters(waiting)
-
-    def _resolve_parameters(self, waiting: dict[str, tuple[str, Place]]) -> None:
-        """Evaluate parameters that depend on parameters, in the order in which they can be known."""
-        trees: dict[str, Expr] = {}
-        for name, (text, place) in waiting.items():
-            try:
-                trees[name] = parse_expression(text, place)
-            except ApcError as error:
-                self.mistakes.take(error)
-        while trees:
-            ready = [name for name, tree in trees.items() if not self._needs(tree, trees)]
-            if not ready:
-                chain = _cycle({name: self._needs(tree, trees) for name, tree in trees.items()})
-                self.mistakes.add(
-                    "E209", waiting[chain[0]][1], f"parameters depend in a circle: {' → '.join(chain)}"
-                )
-                return
-            for name in ready:
-                tree = trees.pop(name)
-                text, place = waiting[name]
-                try:
-                    self._check_names(tree, text, place, name)
-                    dimension = dimension_of(tree, self._dimension_of_name, text, place)
-                    number = Fraction(evaluate(tree, self._number_of_name, place=place))
-                    self.parameters[name] = Value(
-                        number, DIMENSIONLESS if dimension in (None, ANY) else dimension, text, place
-                    )
-                except ApcError as error:
-                    self.mistakes.take(error)
-
-    @staticmethod
-    def _needs(tree: Expr, waiting: Collection[str]) -> list[str]:
-        return [node.parts[0] for node in walk(tree) if isinstance(node, Name) and node.parts[0] in waiting]
+            elif name is not None and binding is not None:
+                waiting[name] = binding
+        self.parameters = resolve_in_order(waiting, {}, sum(self.counts.values()), self.mistakes)
 
     def _read_clocks(self, node: Node | None) -> None:
-        section = read_mapping(node, "clocks", self.mistakes, hint="clocks: {haptic: 1 ms}")
-        for key, value in entries(section):
+        for key, value in entries(read_mapping(node, "clocks", self.mistakes, hint="clocks: {haptic: 1 ms}")):
             name = read_name(key, "a clock", self.mistakes)
             if name is None:
                 continue
@@ -387,283 +348,265 @@ class _Reader:
                 body = check_keys(value, ("period", "phase"), f"clock {name}", self.mistakes)
                 period = self._time(body.get("period"), "period")
                 if body.get("period") is None:
-                    self.mistakes.add("E201", body.place, f"clock {name} has no period", hint="period: 1 ms")
+                    self.mistakes.add("E201", value.place, f"clock {name} has no period", hint="period: 1 ms")
                 if body.get("phase") is not None:
                     phase = self._time(body.get("phase"), "phase")
             else:
                 period = self._time(value, name)
-            if period is None or phase is None:
-                continue
-            if period.number <= 0:
-                self.mistakes.add(
-                    "E207",
-                    period.place,
-                    f"the period of clock {name}",
-                    expected="more than 0 s",
-                    got=_shown(period),
-                    hint=f"{name}: 1 ms",
-                )
-            elif not 0 <= phase.number < period.number:
-                self.mistakes.add(
-                    "E207",
-                    phase.place,
-                    f"the phase of clock {name}",
-                    expected="0 s or more and less than its period",
-                    got=_shown(phase),
-                )
-            else:
+            if period is not None and phase is not None and self._check_clock(name, period, phase):
                 self.clocks[name] = SceneClock(name, period, phase)
+
+    def _check_clock(self, name: str, period: Value, phase: Value) -> bool:
+        if period.number <= 0:
+            what, got = f"the period of clock {name}", str(period)
+            self.mistakes.add(
+                "E207", period.place, what, expected="more than 0 s", got=got, hint=f"{name}: 1 ms"
+            )
+            return False
+        if not 0 <= phase.number < period.number:
+            what, expected = f"the phase of clock {name}", "0 s or more and less than its period"
+            self.mistakes.add("E207", phase.place, what, expected=expected, got=str(phase))
+            return False
+        return True
+
+    # ---- parts ----
 
     def _read_section(self, section: str, node: Node | None) -> None:
         """Collect the parts of a section and their components, so that names can be resolved."""
-        example = {"masses": "device: {mass: 0.1 kg}", "links": "lan: {clock: network}"}
-        hint = f"{section}: {{{example.get(section, 'name: {type: …}')}}}"
+        hint = f"{section}: {{{EXAMPLES[section]}}}"
         for key, value in entries(read_mapping(node, section, self.mistakes, hint=hint)):
             name = read_name(key, f"a part of {section}", self.mistakes)
-            body = read_mapping(
-                value, key.text, self.mistakes, hint=example.get(section, f"{key.text}: {{type: …}}")
-            )
-            if name is not None:
-                self.faulty.add(name)  # until it has been read
+            body = read_mapping(value, key.text, self.mistakes, hint=EXAMPLES[section])
+            if key.text not in self.bodies:
+                self.faulty.add(key.text)  # until it has been read
             if name is None or body is None:
                 continue
             if name in self.bodies or name in self.clocks or name in self.parameters or name in self.groups:
                 self.mistakes.add("E205", key.place, f"the name {name} is used twice in this topology")
                 continue
-            type_node = body.get("type")
-            type_name = (
-                DEFAULT_TYPES.get(section)
-                if type_node is None
-                else read_text(type_node, "type", self.mistakes)
-            )
-            if type_node is None and type_name is None:
-                self.mistakes.add("E201", key.place, f"{name} has no type", hint="type: SampledSpringDamper")
-            if type_name is None:
+            if name in ("peers", "time", "others", "ground"):
+                self.mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
                 continue
-            try:
-                component = self.library.component(type_name)
-            except ApcError as error:
-                self.mistakes.take(error)
-                continue
-            if component is None:
-                place = type_node.place if type_node is not None else key.place
-                unknown_component(place, type_name, self.library, self.mistakes)
-                continue
-            self.bodies[name] = (section, body, component, key.place)
-            self.faulty.discard(name)
+            component = read_type(key, body, DEFAULT_TYPES.get(section), self.library, self.mistakes)
+            if component is not None:
+                self.bodies[name] = _Body(
+                    section, body, component, key.place, self._count(name, section, body)
+                )
+                self.faulty.discard(name)
 
-    def _read_part(
-        self, name: str, section: str, body: Mapping, component: Component, place: Place, root: Mapping
-    ) -> Part | None:
-        connectors = dict(component.connectors)
-        names = [p.name for p in component.parameters]
-        variables = [v.name for v in component.variables if v.start is not None]
-        allowed = ("type", "at", "shared", *connectors, *names, *variables)
-        body = check_keys(body, allowed, f"{name} ({component.name})", self.mistakes)
-        values: list[tuple[str, Value]] = []
-        options: list[tuple[str, str]] = []
-        references: list[tuple[str, str]] = []
-        for parameter in component.parameters:
-            node = body.get(parameter.name)
+    def _count(self, name: str, section: str, body: Mapping) -> int | None:
+        """Return how many of a part there are; None for one that is no array."""
+        node = body.get("count")
+        if node is None:
+            return None
+        count = node.value if isinstance(node, Scalar) and node.plain else None
+        usable = isinstance(count, int) and not isinstance(count, bool) and section != "links"
+        if usable and isinstance(count, int) and 1 <= count <= LARGEST_ARRAY:
+            return count
+        expected = (
+            f"a whole number from 1 to {LARGEST_ARRAY}"
+            if section != "links"
+            else "no count, as a link is one"
+        )
+        self.mistakes.add("E208", node.place, f"the count of {name}", expected=expected, got=form(node))
+        return None
+
+    def _scope(self, root: Mapping) -> Scope:
+        links = [name for name, body in self.bodies.items() if body.section == "links"]
+
+        def references(role: str, word: str, place: Place) -> Collection[str] | None:
+            section = f"{role}s"
+            if word and root.get(section) is None:
+                example = f"{section}: {{{brief(word)}: " + (
+                    "1 ms}" if role == "clock" else "{clock: network}}"
+                )
+                what = f"the topology has no {section} section"
+                self.mistakes.add("E201", root.place, what, hint=example)
+                return None
+            known = self.clocks if role == "clock" else links
+            node = root.get(section)
+            named = isinstance(node, Mapping) and node.get(word) is not None
+            return None if word not in known and named else known  # a faulty clock or link was reported there
+
+        return Scope(
+            dimension=self._dimension,
+            names=("peers", *self.parameters),
+            references=references,
+            parts={name: body.component for name, body in self.bodies.items()},
+            counts={name: body.count for name, body in self.bodies.items() if body.count is not None},
+            faulty=self.faulty,
+        )
+
+    def _read_part(self, name: str, entry: _Body, root: Mapping) -> list[Part]:
+        """Read a part's entry, once for each element of an array, and write out the parts inside."""
+        shared = self._shared(name, entry.component, entry.body.get("shared"))
+        groups = self._groups_of(name, entry.body.get("at"))
+        peers = sum(self.counts.get(group, 0) for group in groups)
+        if entry.component.hears_others and peers == 1:
+            what = f"{name} ({entry.component.name}) follows the other peers and"
+            self.mistakes.add(
+                "E208", entry.place, what, expected="at least 2 peers", got="1", hint="count: 2"
+            )
+        scope = self._scope(root)
+        found: list[Part] = []
+        for index in range(1, (entry.count or 1) + 1):
+            read = read_entry(
+                name,
+                entry.body,
+                entry.component,
+                entry.place,
+                scope,
+                self.mistakes,
+                more_keys=PART_KEYS,
+                index=index,
+                count=entry.count,
+                free_connectors=entry.section == "masses",
+            )
+            part = Part(
+                name if entry.count is None else f"{name}[{index}]",
+                entry.section,
+                entry.component,
+                self._settled_all(read.values, entry.component),
+                read.options,
+                read.references,
+                self._tables(entry.component, read.described),
+                self._settled_all(read.starts, None),
+                read.connections,
+                shared,
+                groups,
+                entry.place,
+            )
+            found += self._with_inner(part)
+        return found
+
+    def _settled_all(
+        self, bindings: Collection[tuple[str, Binding]], component: Component | None
+    ) -> tuple[tuple[str, Value], ...]:
+        found = []
+        for name, binding in bindings:
+            value = self._settled(binding)
+            if value is None:
+                continue
+            parameter = component.parameter(name) if component is not None else None
             if isinstance(parameter, Number):
-                value = self._number(name, parameter, node, place)
-                if value is not None:
-                    values.append((parameter.name, value))
-            elif isinstance(parameter, Option):
-                word = self._option(name, parameter, node, place)
-                if word is not None:
-                    options.append((parameter.name, word))
-            else:
-                target = self._reference(name, parameter, node, place, root)
-                if target is not None:
-                    references.append((parameter.name, target))
-        starts = [
-            (variable.name, value)
-            for variable in component.variables
-            if variable.start is not None
-            and (
-                value := self._value(
-                    body.get(variable.name), variable.name, variable.unit.dimension, variable.unit.text
-                )
+                parameter.bounds.check(value, name, self.mistakes)
+            found.append((name, value))
+        return tuple(found)
+
+    def _with_inner(self, part: Part) -> list[Part]:
+        """Return a part and the parts inside it; an inner part's numbers are expressions over the outer's."""
+        found = [part]
+        values = dict(part.values)
+        references = dict(part.references)
+
+        def number(parts: tuple[str, ...]) -> Fraction:
+            own = parts[-1]
+            return Fraction(sum(self.counts.values())) if parts == PEERS else values[own].number
+
+        def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
+            return parts if parts == PEERS else (*part.name.split("."), *parts)
+
+        for inner in part.component.inner:
+
+            def settled(bindings: Collection[tuple[str, Binding]]) -> tuple[tuple[str, Value], ...]:
+                listed = []
+                for name, binding in bindings:
+                    tree = None if binding.expression is None else renamed(binding.expression, whole)
+                    moved = Binding(binding.number, tree, binding.dimension, part.place)
+                    try:
+                        listed.append((name, settle(moved, number)))
+                    except (ApcError, KeyError):
+                        continue  # the outer number it depends on was reported
+                return tuple(listed)
+
+            entry = inner.entry
+            instance = Part(
+                f"{part.name}.{inner.name}",
+                part.section,
+                inner.component,
+                settled(entry.values),
+                entry.options,
+                tuple((own, references.get(outer, "?")) for own, outer in entry.references),
+                (),
+                settled(entry.starts),
+                tuple(
+                    (own, other if other == "ground" else f"{part.name}.{other}", its)
+                    for own, other, its in entry.connections
+                    if other
+                ),
+                part.shared,
+                part.groups,
+                part.place,
             )
-        ]
-        connections = [
-            found
-            for connector, type_ in component.connectors
-            if (found := self._connection(name, connector, type_.name, body.get(connector), section, place))
-        ]
-        shared = self._shared(name, component, body.get("shared"))
-        groups = self._groups_of(name, body.get("at"))
-        peers = sum(self.groups.get(group, 0) for group in groups)
-        if component.hears_others and peers == 1:
-            self.mistakes.add(
-                "E208",
-                place,
-                f"{name} ({component.name}) follows the other peers and",
-                expected="at least 2 peers",
-                got="1",
-                hint="count: 2",
-            )
-        return Part(
-            name,
-            section,
-            component,
-            tuple(values),
-            tuple(options),
-            tuple(references),
-            tuple(starts),
-            tuple(connections),
-            shared,
-            groups,
-            place,
-        )
+            found += self._with_inner(instance)
+        return found
 
-    def _number(self, part: str, parameter: Number, node: Node | None, place: Place) -> Value | None:
-        dimension = parameter.unit.dimension
-        if node is None:
-            if parameter.default is not None:
-                return Value(parameter.default, dimension, None, place)
-            hint = f"{parameter.name}: 1 {parameter.unit.text}"
-            self.mistakes.add("E201", place, f"{part} has no {parameter.name}", hint=hint)
-            return None
-        value = self._value(node, parameter.name, dimension, parameter.unit.text, words=parameter.words)
-        if value is not None:
-            self._check_bounds(parameter, value)
-        return value
-
-    def _check_bounds(self, parameter: Number, value: Value) -> None:
-        unit = parameter.unit.text
-        number = value.number / parameter.unit.scale
-        minimum, maximum = parameter.minimum, parameter.maximum
-        expected = ""
-        if minimum is not None and (
-            value.number < minimum or (parameter.open_minimum and value.number == minimum)
-        ):
-            least = _plain(minimum / parameter.unit.scale)
-            expected = f"more than {least} {unit}" if parameter.open_minimum else f"{least} {unit} or more"
-        elif maximum is not None and value.number > maximum:
-            expected = f"{_plain(maximum / parameter.unit.scale)} {unit} or less"
-        if expected:
-            self.mistakes.add(
-                "E207", value.place, parameter.name, expected=expected, got=f"{_plain(number)} {unit}"
-            )
-
-    def _option(self, part: str, parameter: Option, node: Node | None, place: Place) -> str | None:
-        if node is None:
-            if parameter.default is None:
-                hint = f"{parameter.name}: {parameter.words[0]}"
-                self.mistakes.add("E201", place, f"{part} has no {parameter.name}", hint=hint)
-            return parameter.default
-        word = read_text(node, parameter.name, self.mistakes, hint=f"{parameter.name}: {parameter.words[0]}")
-        if word is None or word in parameter.words:
-            return word
-        self.mistakes.add(
-            "E206",
-            node.place,
-            parameter.name,
-            expected=" or ".join(parameter.words),
-            got=brief(word),
-            hint=f"{parameter.name}: {parameter.default or parameter.words[0]}",
-        )
-        return None
-
-    def _reference(
-        self, part: str, parameter: Reference, node: Node | None, place: Place, root: Mapping
-    ) -> str | None:
-        known: Collection[str] = (
-            self.clocks
-            if parameter.target == "clock"
-            else [n for n, b in self.bodies.items() if b[0] == "links"]
-        )
-        section = parameter.target + "s"
-        if node is None:
-            hint = f"{parameter.name}: {next(iter(known), 'name')}"
-            self.mistakes.add("E201", place, f"{part} has no {parameter.name}", hint=hint)
-            return None
-        word = read_text(node, parameter.name, self.mistakes)
-        if word is None or word in known:
-            return word
-        if root.get(section) is None:
-            if section not in self.missing:
-                self.missing.add(section)
-                example = "1 ms" if section == "clocks" else "{clock: network}"
-                self._required(root, section, f"{section}: {{{brief(word)}: {example}}}")
-        elif not self._may_be_in(root.get(section), word):  # a faulty clock or link was reported there
-            what = f"{part} names {parameter.target} {brief(word)}, which isn't in {section}"
-            add_unknown("E206", node.place, what, word, list(known), self.mistakes)
-        return None
-
-    @staticmethod
-    def _may_be_in(section: Node | None, word: str) -> bool:
-        return not isinstance(section, Mapping) or section.get(word) is not None
-
-    def _connection(
-        self, part: str, connector: str, type_name: str, node: Node | None, section: str, place: Place
-    ) -> tuple[str, str, str] | None:
-        if node is None:
-            if section != "masses":
-                candidates = [n for n, b in self.bodies.items() if b[0] == "masses"]
-                hint = f"{connector}: {candidates[0] if candidates else 'device'}"
+    def _tables(self, component: Component, described: Collection[tuple[str, Node]]) -> tuple[TimeTable, ...]:
+        nodes = dict(described)
+        found = []
+        for parameter in component.parameters:
+            if not (isinstance(parameter, Reference) and parameter.role == "table"):
+                continue
+            node = nodes.get(parameter.name)
+            text = read_text(node, parameter.name, self.mistakes, hint=f"{parameter.name}: force.csv")
+            if node is None:
+                hint = f"{parameter.name}: force.csv"
                 self.mistakes.add(
-                    "E210", place, f"{part} does not say what its {connector} is joined to", hint=hint
+                    "E201", component.place, f"{component.name} needs its {parameter.name}", hint=hint
                 )
+            elif text is not None:
+                table = self._time_table(parameter, node, text)
+                if table is not None:
+                    found.append(table)
+        return tuple(found)
+
+    def _time_table(self, parameter: Reference, node: Node, text: str) -> TimeTable | None:
+        try:
+            table = read_table(self.folder / text, node.place)
+        except ApcError as error:
+            self.mistakes.take(error)
             return None
-        text = read_text(node, connector, self.mistakes, hint=f"{connector}: device")
-        if text is None:
+        self.texts[text] = table.digest
+        unit = parameter.unit
+        assert unit is not None
+        if len(table.columns) != 2 or table.columns[0].unit.dimension != SECOND:
+            what = "a table over time"
+            expected = f"two columns, time [s] and {parameter.name} [{unit.text}]"
+            self.mistakes.add("E702", table.columns[0].place, what, expected=expected)
             return None
-        other, _, its_connector = text.partition(".")
-        if other in self.faulty:
+        times, numbers = table.columns
+        if numbers.unit.dimension != unit.dimension:
+            got = numbers.unit.text
+            self.mistakes.add("E702", numbers.place, numbers.name, expected=unit.text, got=got)
             return None
-        if other not in self.bodies:
-            if "masses" in self.missing:
-                return None  # one missing section is one mistake
-            what = f"{part} joins its {connector} to {brief(other)}, which is no part of this topology"
-            add_unknown("E206", node.place, what, other, [n for n in self.bodies if n != part], self.mistakes)
-            return None
-        component = self.bodies[other][2]
-        fitting = [name for name, type_ in component.connectors if type_.name == type_name]
-        if its_connector in fitting:
-            return connector, other, its_connector
-        if not its_connector and len(fitting) == 1:
-            return connector, other, fitting[0]
-        if its_connector:
-            what = f"{other} ({component.name}) has no {type_name} called {brief(its_connector)}"
-            add_unknown("E206", node.place, what, its_connector, fitting, self.mistakes)
-        elif fitting:
+        if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
             self.mistakes.add(
-                "E210",
-                node.place,
-                f"{other} ({component.name}) has {len(fitting)} connectors of type {type_name}",
-                hint=f"{connector}: {other}.{fitting[0]}",
+                "E703", times.place, "a table over time", expected="two or more rows of rising time"
             )
-        else:
-            self.mistakes.add(
-                "E210",
-                node.place,
-                f"{other} ({component.name}) has no connector of type {type_name} to join {connector} to",
-            )
-        return None
+            return None
+        return TimeTable(parameter.name, times.numbers, numbers.numbers)
 
     def _shared(self, name: str, component: Component, node: Node | None) -> bool:
         if node is None:
             return False
         if not (isinstance(node, Scalar) and node.plain and isinstance(node.value, bool)):
+            got = form(node)
             self.mistakes.add(
-                "E203", node.place, "shared", expected="true or false", got=form(node), hint="shared: true"
+                "E203", node.place, "shared", expected="true or false", got=got, hint="shared: true"
             )
             return False
-        if node.value and not any(parameter.divided for parameter in numbers(component)):
-            self.mistakes.add(
-                "E210", node.place, f"{name} can't be shared: nothing of a {component.name} is divided"
-            )
+        if node.value and not any(parameter.divided for parameter in component.numbers):
+            what = f"{name} can't be shared: nothing of a {component.name} is divided"
+            self.mistakes.add("E210", node.place, what)
         return node.value
 
     def _groups_of(self, name: str, node: Node | None) -> tuple[str, ...]:
         if node is None:
             return tuple(self.groups)
         if not isinstance(node, Sequence):
+            got = form(node)
             self.mistakes.add(
-                "E203", node.place, "at", expected="a list of groups", got=form(node), hint="at: [user]"
+                "E203", node.place, "at", expected="a list of groups", got=got, hint="at: [user]"
             )
             return ()
         found = []
@@ -676,39 +619,48 @@ class _Reader:
                 add_unknown("E206", item.place, what, group, list(self.groups), self.mistakes)
         return tuple(found)
 
-    def _read_groups(self, bodies: list[tuple[str, Mapping]]) -> tuple[PeerGroup, ...]:
-        found = []
-        for name, body in bodies:
-            values = []
-            section = read_mapping(body.get("set"), "set", self.mistakes, hint="set: {device.mass: 0.2 kg}")
-            for key, node in entries(section):
-                value = self._setting(key, node)
-                if value is not None:
-                    values.append((key.text, value))
-            found.append(PeerGroup(name, self.groups[name], tuple(values), body.place))
-        return tuple(found)
+    # ---- links, groups, studies ----
 
-    def _setting(self, key: Scalar, node: Node) -> Value | None:
-        part, _, name = key.text.partition(".")
-        known = [f"{p}.{n}" for p, body in self.bodies.items() for n in _settable(body[2])]
-        if part in self.faulty:
+    def _link(self, part: Part) -> SceneLink | None:
+        body = self.bodies[part.name].body
+        values = dict(part.values)
+        clock = part.reference("clock")
+        roles = {p.role: p.name for p in part.component.parameters if isinstance(p, Reference)}
+        graph = COMPLETE
+        if "graph" in roles:
+            node = body.get(roles["graph"])
+            graph = read_graph(node, self.counts, self.folder, self.mistakes, self.texts)
+        pairs = read_pairs(body.get(roles["delays"]), self.groups, self.mistakes) if "delays" in roles else []
+        delays = []
+        for sender, receiver, node in pairs:
+            value = self._value(node, f"the delay from {sender} to {receiver}", SECOND, "s")
+            if value is not None and value.number < 0:
+                self.mistakes.add("E207", value.place, "a delay", expected="0 s or more", got=str(value))
+            elif value is not None:
+                delays.append(PairDelay(sender, receiver, value))
+        if clock is None or "delay" not in values:
             return None
-        if key.text not in known:
-            what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
-            add_unknown("E206", key.place, what, key.text, known, self.mistakes)
-            return None
-        component = self.bodies[part][2]
-        parameter = component.parameter(name)
-        if isinstance(parameter, Number):
-            value = self._value(
-                node, key.text, parameter.unit.dimension, parameter.unit.text, words=parameter.words
-            )
-            if value is not None:
-                self._check_bounds(parameter, value)
-            return value
-        variable = component.variable(name)
-        assert variable is not None
-        return self._value(node, key.text, variable.unit.dimension, variable.unit.text)
+        return SceneLink(part.name, clock, values["delay"], graph, tuple(delays), part.place)
+
+    def _group(self, group: GroupBody, settable: dict[str, list[tuple[str, Settable]]]) -> PeerGroup:
+        settings = read_settings(group, settable, self.clocks, self._binding_of, self.mistakes)
+        return PeerGroup(
+            group.name, group.count, settings.values, settings.words, settings.columns, group.body.place
+        )
+
+    def _binding_of(self, node: Node, what: str, item: Settable) -> Value | None:
+        """Read a number for a parameter, or a start value for a variable."""
+        words = item.words if isinstance(item, Number) else ()
+        names = ("peers", *self.parameters)
+        unit = item.unit
+        assert unit is not None
+        binding = read_binding(
+            node, what, unit.dimension, unit.text, self._dimension, names, self.mistakes, words=words
+        )
+        value = self._settled(binding)
+        if value is not None and isinstance(item, Number):
+            item.bounds.check(value, what, self.mistakes)
+        return value
 
     def _read_experiment(self, node: Node | None) -> tuple[Fraction | None, int]:
         section = read_mapping(node, "experiment", self.mistakes, hint="experiment: {duration: 3 s}")
@@ -717,9 +669,8 @@ class _Reader:
         section = check_keys(section, ("duration", "seed"), "experiment", self.mistakes)
         duration = self._time(section.get("duration"), "duration")
         if duration is not None and duration.number <= 0:
-            self.mistakes.add(
-                "E207", duration.place, "duration", expected="more than 0 s", got=_shown(duration)
-            )
+            got = str(duration)
+            self.mistakes.add("E207", duration.place, "duration", expected="more than 0 s", got=got)
         seed = section.get("seed")
         number = 0
         if isinstance(seed, Scalar) and isinstance(seed.value, int) and 0 <= seed.value < 2**63:
@@ -730,62 +681,73 @@ class _Reader:
             )
         return (duration.number if duration is not None else None), number
 
-    def _read_studies(self, node: Node | None) -> tuple[Axis, ...]:
-        section = read_mapping(node, "studies", self.mistakes)
+    def _read_studies(
+        self, node: Node | None, settable: dict[str, list[tuple[str, Settable]]]
+    ) -> tuple[Axis, ...]:
+        section = read_mapping(node, "studies", self.mistakes, hint="studies: {region: {x: …, y: …}}")
         if section is None:
             return ()
         section = check_keys(section, ("region",), "studies", self.mistakes)
-        region = read_mapping(section.get("region"), "region", self.mistakes)
+        region = read_mapping(section.get("region"), "region", self.mistakes, hint="region: {x: …, y: …}")
         if region is None:
             return ()
         region = check_keys(region, ("x", "y"), "region", self.mistakes)
-        return tuple(axis for key in ("x", "y") if (axis := self._axis(key, region.get(key))) is not None)
+        axes = (self._axis(key, region.get(key), settable) for key in ("x", "y"))
+        return tuple(axis for axis in axes if axis is not None)
 
-    def _axis(self, key: str, node: Node | None) -> Axis | None:
+    def _axis(
+        self, key: str, node: Node | None, settable: dict[str, list[tuple[str, Settable]]]
+    ) -> Axis | None:
         hint = f"{key}: {{contact.stiffness: [0 N/m, 5000 N/m]}}"
         body = read_mapping(node, key, self.mistakes, hint=hint)
-        if body is None or len(body.entries) != 1:
-            if body is not None:
-                self.mistakes.add("E203", body.place, key, expected="one parameter and its range", hint=hint)
+        if body is None:
+            return None
+        if len(body.entries) != 1:
+            self.mistakes.add("E203", body.place, key, expected="one parameter and its range", hint=hint)
             return None
         name, span = body.entries[0]
         if not (isinstance(span, Sequence) and len(span.items) == 2):
+            got = form(span)
             self.mistakes.add(
-                "E203", span.place, name.text, expected="a list of two values", got=form(span), hint=hint
+                "E203", span.place, name.text, expected="a list of two values", got=got, hint=hint
             )
             return None
-        low, high = (self._setting(name, item) for item in span.items)
+        items = settable.get(name.text)
+        if not items or not isinstance(items[0][1], Number):
+            if name.text.partition(".")[0] not in self.faulty:
+                what = f"{key} names {brief(name.text)}, which is no parameter of a part"
+                known = [known for known, found in settable.items() if isinstance(found[0][1], Number)]
+                add_unknown("E206", name.place, what, name.text, known, self.mistakes)
+            return None
+        low, high = (self._binding_of(item, name.text, items[0][1]) for item in span.items)
         if low is None or high is None:
             return None
         if low.number >= high.number:
-            self.mistakes.add(
-                "E207",
-                span.place,
-                f"the range of {name.text}",
-                expected="its lower end first",
-                got=f"{_shown(low)} to {_shown(high)}",
-            )
+            what, got = f"the range of {name.text}", f"{low} to {high}"
+            self.mistakes.add("E207", span.place, what, expected="its lower end first", got=got)
             return None
         return Axis(name.text, low.number, high.number)
 
 
-def _settable(component: Component) -> list[str]:
-    return [p.name for p in numbers(component)] + [v.name for v in component.variables if v.start is not None]
+Settable = Number | Option | Reference | Variable
 
 
-def _shown(value: Value) -> str:
-    return format_si(float(value.number), value.dimension)
+def _settable(parts: Collection[Part]) -> dict[str, list[tuple[str, Settable]]]:
+    """Return what a group can set: by the name a person writes, the whole names it stands for.
 
-
-def _plain(number: Fraction) -> str:
-    return f"{float(number):.12g}"
-
-
-def _cycle(needs: dict[str, list[str]]) -> list[str]:
-    """Return a circle in a graph in which every node needs another, its first node repeated at the end."""
-    path: list[str] = []
-    name = next(iter(needs))
-    while name not in path:
-        path.append(name)
-        name = needs[name][0]
-    return [*path[path.index(name) :], name]
+    The name of an array stands for all its elements.
+    """
+    found: dict[str, list[tuple[str, Settable]]] = {}
+    for part in parts:
+        items: list[Settable] = [
+            p for p in part.component.parameters if not isinstance(p, Reference) or p.role == "clock"
+        ]
+        items += [v for v in part.component.variables if v.start is not None]
+        for item in items:
+            whole = f"{part.name}.{item.name}"
+            found.setdefault(whole, []).append((whole, item))
+            head, bracket, rest = part.name.partition("[")
+            if bracket:
+                alias = f"{head}{rest.partition(']')[2]}.{item.name}"
+                found.setdefault(alias, []).append((whole, item))
+    return found

@@ -6,13 +6,14 @@ than its topology is refused by name; nothing is unpickled, and no library or to
 Does not: compile.
 
 The file is a ZIP archive: `model.json` holds the structure, the numbers and the SHA-256 of every other
-member; each CasADi function is a member in CasADi's own serialization.
+member; each CasADi function is a member in CasADi's own serialization, each array one in NumPy's.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import json
 import lzma
 import os
@@ -28,10 +29,11 @@ from pathlib import Path
 from typing import Any
 
 import casadi
+import numpy as np
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 
-FORMAT = 1
+FORMAT = 2
 MEMBER = "model.json"
 # CasADi's reader can crash on text that isn't its own, so every member is checked against its digest first.
 LARGEST = 256 * 2**20
@@ -68,14 +70,14 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 
 def save(system: CompiledSystem, path: Path) -> None:
     """Write a compiled model. Raises ApcError if the file can't be written."""
-    functions: dict[str, str] = {}
-    document = _plain(system, functions)
-    digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in functions.items()}
-    text = json.dumps({"format": FORMAT, "system": document, "functions": digests}, indent=1, sort_keys=True)
+    members: dict[str, bytes] = {}
+    document = _plain(system, members)
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in members.items()}
+    text = json.dumps({"format": FORMAT, "system": document, "members": digests}, indent=1, sort_keys=True)
 
     def write(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in {MEMBER: text, **functions}.items():
+            for name, content in {MEMBER: text.encode(), **members}.items():
                 # A fixed date: the same model gives the same bytes.
                 archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
 
@@ -94,13 +96,13 @@ def load(path: Path) -> CompiledSystem:
             if document["format"] != FORMAT:
                 what = f"has format version {document['format']}, this program reads version {FORMAT}"
                 raise ApcError(Mistake("E603", Place(str(path)), what, hint=f"apc compile {path.stem}.yaml"))
-            functions = {}
-            for name, digest in document["functions"].items():
+            members = {}
+            for name, digest in document["members"].items():
                 content = archive.read(name)
                 if hashlib.sha256(content).hexdigest() != digest:
                     raise _damaged(path, f"its member {name} was changed")
-                functions[name] = casadi.Function.deserialize(content.decode())
-        system = _typed(CompiledSystem, document["system"], functions)
+                members[name] = _member(name, content)
+        system = _typed(CompiledSystem, document["system"], members)
     except FileNotFoundError as error:
         raise ApcError(Mistake("E602", Place(str(path)), "does not exist", hint="apc compile")) from error
     except OSError as error:
@@ -118,43 +120,56 @@ def _damaged(path: Path, why: str) -> ApcError:
     return ApcError(mistake)
 
 
-def _plain(value: Any, functions: dict[str, str]) -> Any:
-    """Return dataclasses as dictionaries, fractions as texts, CasADi functions as names of members."""
+def _member(name: str, content: bytes) -> Any:
+    """Return the CasADi function or the array that a member holds."""
+    if name.endswith(".npy"):
+        return np.load(io.BytesIO(content), allow_pickle=False)
+    return casadi.Function.deserialize(content.decode())
+
+
+def _plain(value: Any, members: dict[str, bytes]) -> Any:
+    """Return dataclasses as dictionaries, fractions as texts, functions and arrays as names of members."""
     if dataclasses.is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name), functions) for f in dataclasses.fields(value)}
+        return {f.name: _plain(getattr(value, f.name), members) for f in dataclasses.fields(value)}
     if isinstance(value, tuple):
-        return [_plain(item, functions) for item in value]
+        return [_plain(item, members) for item in value]
     if isinstance(value, Fraction):
         return str(value)
     if isinstance(value, casadi.Function):
-        name = f"function{len(functions)}.casadi"
-        functions[name] = value.serialize()
+        name = f"function{len(members)}.casadi"
+        members[name] = value.serialize().encode()
+        return name
+    if isinstance(value, np.ndarray):
+        name = f"array{len(members)}.npy"
+        buffer = io.BytesIO()
+        np.save(buffer, value, allow_pickle=False)
+        members[name] = buffer.getvalue()
         return name
     return value
 
 
-def _typed(wanted: Any, value: Any, functions: dict[str, Any]) -> Any:
+def _typed(wanted: Any, value: Any, members: dict[str, Any]) -> Any:
     """Build a value of the wanted type from its plain form."""
     origin = typing.get_origin(wanted)
     if dataclasses.is_dataclass(wanted) and isinstance(wanted, type):
         hints = typing.get_type_hints(wanted)
         return wanted(
-            **{f.name: _typed(hints[f.name], value[f.name], functions) for f in dataclasses.fields(wanted)}
+            **{f.name: _typed(hints[f.name], value[f.name], members) for f in dataclasses.fields(wanted)}
         )
     if origin is tuple:
         if not isinstance(value, list):
             raise TypeError(f"expected a list, got {value!r}")
         arguments = typing.get_args(wanted)
         if arguments[-1] is Ellipsis:
-            return tuple(_typed(arguments[0], item, functions) for item in value)
-        return tuple(_typed(a, item, functions) for a, item in zip(arguments, value, strict=True))
+            return tuple(_typed(arguments[0], item, members) for item in value)
+        return tuple(_typed(a, item, members) for a, item in zip(arguments, value, strict=True))
     if origin in (typing.Union, types.UnionType):
         inner = [a for a in typing.get_args(wanted) if a is not type(None)]
-        return None if value is None else _typed(inner[0], value, functions)
+        return None if value is None else _typed(inner[0], value, members)
     if wanted is Fraction:
         return Fraction(value)
-    if wanted is Any:
-        return functions[value]
+    if wanted is Any or origin is np.ndarray:
+        return members[value]
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if not isinstance(value, wanted):

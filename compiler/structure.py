@@ -1,44 +1,67 @@
-"""Each partition balanced, aliases removed, matched and sorted into blocks, linear blocks solved.
+"""Each partition balanced, aliases removed, index reduced, matched and sorted into blocks, blocks solved.
 
-Takes: `ClockedSystem`. Gives: `SortedSystem`: assignments in the order in which they can be computed.
+Takes: `ClockedSystem`. Gives: `SortedSystem`: assignments in the order in which they can be computed, and
+nonlinear loops as `ImplicitBlock`s among them.
 Guarantees: every unknown of a partition is assigned once, from states, crossings, parameters and unknowns
 assigned before it.
 Does not: put in numbers, or drop what nobody reads.
 
-Matching by augmenting paths (Kuhn's algorithm), blocks by strongly connected components (Tarjan, SIAM J.
-Comput. 1972); the usual way of Modelica compilers (Cellier and Kofman, Continuous System Simulation, ch. 7).
+Variables joined rigidly are one state. The start value that counts is that of the state kept: of the
+variables with a start value the one named first; those of the others are not looked at.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence, Set
 from dataclasses import dataclass
 
 import sympy
+from apc.compiler.blocks import Assignment, ImplicitBlock, Residual, Step, assigned, solve_blocks
 from apc.compiler.clocks import (
     CONTINUOUS,
     ClockedKind,
     ClockedSystem,
     HoldCrossing,
-    Partition,
     PreviousCrossing,
     ReceiveCrossing,
 )
 from apc.compiler.errors import Mistakes, Place
+from apc.compiler.expression import Name
 from apc.compiler.flatten import FlatEquation
+from apc.compiler.index import Jet, Jets, JumpError, reduce_index, report_jump
 from apc.compiler.scene import Scene
-from apc.compiler.symbolic import derivative_symbol, is_opaque_in, symbol, to_sympy
+from apc.compiler.symbolic import symbol, to_sympy
 from apc.compiler.units import format_dimension
 
-Assignments = tuple[tuple[str, sympy.Expr], ...]
+__all__ = [
+    "ImplicitBlock",
+    "SortedKind",
+    "SortedPartition",
+    "SortedSend",
+    "SortedSystem",
+    "sort",
+    "sort_kind",
+]
 
 
 @dataclass(frozen=True, slots=True)
 class SortedPartition:
-    """The unknowns of one clock (or the continuous ones), each with the expression that gives it."""
+    """The unknowns of one clock (or the continuous ones), in the order in which they can be computed.
+
+    A step is a pair of a name and the expression that gives it, or the `ImplicitBlock` of a nonlinear loop.
+    """
 
     clock: str
-    assignments: Assignments
+    assignments: tuple[Step, ...]
+
+    @property
+    def definitions(self) -> dict[sympy.Symbol, sympy.Expr | ImplicitBlock]:
+        """What gives each unknown its value."""
+        return {
+            symbol(name): step if isinstance(step, ImplicitBlock) else step[1]
+            for step in self.assignments
+            for name in assigned(step)
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +80,7 @@ class SortedKind:
 
     clocked: ClockedKind
     states: tuple[str, ...]
-    aliases: Assignments
+    aliases: tuple[Assignment, ...]
     partitions: tuple[SortedPartition, ...]
     samples: tuple[tuple[str, str, sympy.Expr], ...]  # (symbol, clock, expression)
     holds: tuple[HoldCrossing, ...]
@@ -74,310 +97,226 @@ class SortedSystem:
     kinds: tuple[SortedKind, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Residual:
-    """An equation as `expression = 0`, with its origin for messages."""
-
-    expression: sympy.Expr
-    equation: FlatEquation
-
-
 def sort(clocked: ClockedSystem) -> SortedSystem:
     """Sort and solve every partition. Raises ApcError naming the equations and unknowns left over."""
     mistakes = Mistakes()
-    kinds = tuple(_sort_kind(kind, mistakes) for kind in clocked.kinds)
+    nonzero = _positive_parameters(clocked.scene)
+    kinds = tuple(sort_kind(kind, mistakes, nonzero=nonzero) for kind in clocked.kinds)
     mistakes.raise_if_any()
     return SortedSystem(clocked.scene, kinds)
 
 
-def _sort_kind(kind: ClockedKind, mistakes: Mistakes) -> SortedKind:
+def _positive_parameters(scene: Scene) -> list[str]:
+    """Return the parameters that no number can make zero: they are safe to divide by."""
+    return ["peers"] + [
+        f"{part.name}.{declared.name}"
+        for part in scene.parts
+        for declared in part.component.parameters
+        if getattr(declared, "open_minimum", False) and getattr(declared, "minimum", None) == 0
+    ]
+
+
+def sort_kind(kind: ClockedKind, mistakes: Mistakes, *, nonzero: Collection[str] = ()) -> SortedKind:
+    """Sort and solve one kind.
+
+    Mistakes: E502, E503, E507 to E509 as in `solve_blocks` and `reduce_index`; E510 a state has no start
+    value. When there are any, the value returned is not whole.
+    """
     continuous = kind.partitions[0]
     assert continuous.clock == CONTINUOUS
-    variables = {symbol(name): name for name in continuous.variables}
-    differentiate = _differentiator(set(variables))
-    residuals = [_residual(equation, differentiate) for equation in continuous.equations]
-    replaced, residuals = _remove_aliases(residuals, variables, continuous.variables)
-    samples = [(s.symbol, s.clock, to_sympy(s.expression, differentiate)) for s in kind.samples]
-    sends = [(send, to_sympy(send.expression, differentiate)) for send in kind.sends]
-    replacements = _with_derivatives(replaced)
-    read = [r.expression for r in residuals] + [e.xreplace(replacements) for _, _, e in samples]
-    read += [e.xreplace(replacements) for _, e in sends]
-    derivatives = {derivative_symbol(name): name for name in continuous.variables}
-    differentiated = {
-        derivatives[s] for expression in read for s in expression.free_symbols if s in derivatives
-    }
-    states = tuple(name for name in continuous.variables if name in differentiated)
-    unknowns = [name for name in continuous.variables if symbol(name) not in replaced and name not in states]
-    symbols = [derivative_symbol(name) for name in states] + [symbol(name) for name in unknowns]
-    assignments = _solve(residuals, symbols, CONTINUOUS, continuous, mistakes)
-    partitions = [SortedPartition(CONTINUOUS, assignments)]
+    jets = Jets(continuous.variables, (hold.symbol for hold in kind.holds))
+    started = {variable.name for variable in kind.flat.variables if variable.start}
+    divisors = [symbol(name) for name in nonzero]
+    where = "the continuous equations"
+
+    residuals = _residuals(continuous.equations, jets.differentiate, mistakes)
+    origin = continuous.equations[0].place if continuous.equations else Place("topology")
+    read = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, origin) for s in kind.samples] + [
+        FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.sends
+    ]
+    values = [_right_side(equation, jets, mistakes) for equation in read]
+
+    aliases = _Aliases(jets, continuous.variables, started)
+    residuals = aliases.remove(residuals)
+    values = [aliases.substitute(value) for value in values]
+    # A derivative that is only sampled or sent has to be computed too: it gets an equation of its own.
+    probes = _probes(read, values, jets)
+    names = [*aliases.kept(), *probes]
+    reduced = reduce_index([*residuals, *probes.values()], names, started, jets, where, mistakes)
+    steps: tuple[Step, ...] = ()
+    states: tuple[str, ...] = ()
+    if reduced is not None:
+        found = solve_blocks(reduced.residuals, reduced.unknowns, where, mistakes, nonzero=divisors)
+        steps = tuple(step for step in found if probes.keys().isdisjoint(assigned(step)))
+        states = tuple(s.name for s in reduced.states)
+        _check_starts(states, started, reduced.residuals, mistakes)
+
+    partitions = [SortedPartition(CONTINUOUS, steps)]
     for clock in kind.partitions[1:]:
-        own = [_residual(equation, _no_derivative) for equation in clock.equations]
-        found = _solve(own, [symbol(name) for name in clock.variables], clock.clock, clock, mistakes)
+        own = _residuals(clock.equations, _no_derivative, mistakes)
+        unknowns = [symbol(name) for name in clock.variables]
+        where = f"the equations of clock {clock.clock}"
+        found = solve_blocks(own, unknowns, where, mistakes, nonzero=divisors)
         partitions.append(SortedPartition(clock.clock, found))
-    units = {send.name: send.dimension for send in kind.sends}
+    sampled, sent = values[: len(kind.samples)], values[len(kind.samples) :]
     return SortedKind(
         kind,
         states,
-        tuple((variables[s], e) for s, e in replaced.items()),
+        aliases.assignments(),
         tuple(partitions),
-        tuple((s, c, e.xreplace(replacements)) for s, c, e in samples),
+        tuple((s.symbol, s.clock, value) for s, value in zip(kind.samples, sampled, strict=True)),
         kind.holds,
         kind.previous,
         kind.receives,
         tuple(
-            SortedSend(send.name, send.link, format_dimension(units[send.name]), e.xreplace(replacements))
-            for send, e in sends
+            SortedSend(send.name, send.link, format_dimension(send.dimension), value)
+            for send, value in zip(kind.sends, sent, strict=True)
         ),
     )
 
 
-def _residual(equation: FlatEquation, differentiate: Callable[[sympy.Expr], sympy.Expr]) -> _Residual:
-    left, right = to_sympy(equation.left, differentiate), to_sympy(equation.right, differentiate)
-    return _Residual(left - right, equation)
+def _residuals(
+    equations: Iterable[FlatEquation],
+    differentiate: Callable[[sympy.Expr], sympy.Expr],
+    mistakes: Mistakes,
+) -> list[Residual]:
+    found = []
+    for equation in equations:
+        try:
+            difference = to_sympy(equation.left, differentiate) - to_sympy(equation.right, differentiate)
+        except JumpError as jump:
+            report_jump(Residual(sympy.S.Zero, equation), jump, mistakes)
+            difference = sympy.S.Zero
+        found.append(Residual(difference, equation))
+    return found
 
 
-def _differentiator(variables: set[sympy.Symbol]) -> Callable[[sympy.Expr], sympy.Expr]:
-    """Return d/dt by the chain rule: variables have derivatives, parameters have none."""
-
-    def differentiate(expression: sympy.Expr) -> sympy.Expr:
-        total: sympy.Expr = sympy.diff(expression, symbol("time"))
-        for variable in sorted(expression.free_symbols & variables, key=str):
-            total += sympy.diff(expression, variable) * derivative_symbol(variable.name)
-        return total
-
-    return differentiate
+def _right_side(equation: FlatEquation, jets: Jets, mistakes: Mistakes) -> sympy.Expr:
+    try:
+        return to_sympy(equation.right, jets.differentiate)
+    except JumpError as jump:
+        report_jump(Residual(sympy.S.Zero, equation), jump, mistakes)
+        return sympy.S.Zero
 
 
 def _no_derivative(expression: sympy.Expr) -> sympy.Expr:
     raise AssertionError("der stands in continuous equations only")
 
 
+def _probes(read: Sequence[FlatEquation], values: Sequence[sympy.Expr], jets: Jets) -> dict[str, Residual]:
+    """Return, for each derivative that is read, the equation `sampled der(x) = der(x)`, by its unknown."""
+    probes: dict[str, Residual] = {}
+    for equation, value in zip(read, values, strict=True):
+        for derivative, (_, order) in jets.jets(value).items():
+            name = f"sampled {derivative}"
+            if order and name not in probes:
+                probes[name] = Residual(jets.symbol(name, 0) - derivative, equation)
+    return probes
+
+
+def _check_starts(
+    states: Iterable[str], started: Set[str], residuals: Sequence[Residual], mistakes: Mistakes
+) -> None:
+    for state in states:
+        if state in started:
+            continue
+        holder = next(r for r in residuals if symbol(f"der({state})") in r.expression.free_symbols)
+        if state.startswith("der("):
+            what = f"{state} is a state of its own in {holder.shown} and has no start value"
+            hint = f"a variable with a start value for it: {state} = v"
+        else:
+            what = f"{state} is a state, by {holder.shown}, and has no start value"
+            hint = f"{state.rpartition('.')[2]}: {{…, start: …}}"
+        mistakes.add("E510", holder.equation.place, what, hint=hint)
+
+
 # ---- aliases ----
 
 
-def _remove_aliases(
-    residuals: Sequence[_Residual], variables: dict[sympy.Symbol, str], order: Sequence[str]
-) -> tuple[dict[sympy.Symbol, sympy.Expr], list[_Residual]]:
-    """Take out the equations a = b, a = -b and a = 0 between unknowns; return what stands for what.
+class _Aliases:
+    """The equations a = b, a = -b and a = 0 between unknowns taken out, and what stands for what.
 
-    Of two, the variable a component declares stays and the connector's goes: `device.x`, not
-    `device.flange.x`; otherwise the one named first stays.
+    Of two, the one with a start value stays; then the one a component declares, not the connector's:
+    `device.x`, not `device.flange.x`; then the one named first. Where der(x) = v, v also stands for der(x)
+    in all other equations, so that masses with one position are seen to have one velocity.
     """
-    rank = {symbol(name): (name.count("."), place) for place, name in enumerate(order)}
-    replaced: dict[sympy.Symbol, sympy.Expr] = {}
-    remaining: list[_Residual] = []
 
-    def resolve(expression: sympy.Expr) -> sympy.Expr:
-        while hits := expression.free_symbols & replaced.keys():
-            expression = expression.xreplace({hit: replaced[hit] for hit in hits})
-        return expression
+    def __init__(self, jets: Jets, names: Sequence[str], started: Set[str]) -> None:
+        self.jets = jets
+        self.names = names
+        self.rank = {name: (name not in started, name.count("."), j) for j, name in enumerate(names)}
+        self.parent: dict[str, tuple[str, int]] = {}  # name -> ± another; sign 0: zero
+        self.velocity: dict[str, tuple[str, int, int]] = {}  # x -> v, ±1, the row that says der(x) = ±v
 
-    for residual in residuals:
-        expression = residual.expression
-        pair = _alias_pair(expression, variables)
-        if pair is None:
-            remaining.append(residual)
-            continue
-        expression = resolve(expression)
-        pair = _alias_pair(expression, variables)
-        if pair is None or not pair:
-            remaining.append(_Residual(expression, residual.equation))
-            continue
-        goes = max(pair, key=lambda s: rank[s])
-        coefficient = expression.coeff(goes)
-        replaced[goes] = sympy.expand(-(expression - coefficient * goes) / coefficient)
-    final = {name: resolve(expression) for name, expression in replaced.items()}
-    table = _with_derivatives(final)
-    return final, [_Residual(r.expression.xreplace(table), r.equation) for r in remaining]
+    def kept(self) -> list[str]:
+        """Return the names that stand for themselves."""
+        return [name for name in self.names if name not in self.parent]
 
+    def assignments(self) -> tuple[Assignment, ...]:
+        """Return what each of the other names stands for."""
+        return tuple((name, self._value(name, 0, "")) for name in self.names if name in self.parent)
 
-def _alias_pair(
-    expression: sympy.Expr, variables: dict[sympy.Symbol, str]
-) -> tuple[sympy.Symbol, ...] | None:
-    """Return the unknowns of ±a ± b or ±a, or None when the expression has another form."""
-    terms = expression.as_ordered_terms() if expression.is_Add else [expression]
-    if len(terms) > 2:
-        return None
-    found = []
-    for term in terms:
-        coefficient, rest = term.as_coeff_Mul()
-        if abs(coefficient) != 1 or rest not in variables:
+    def substitute(self, expression: sympy.Expr, but: str = "") -> sympy.Expr:
+        """Return the expression in the names kept; der(`but`) stays as it is."""
+        jets = self.jets.jets(expression)
+        return expression.xreplace({s: self._value(name, order, but) for s, (name, order) in jets.items()})
+
+    def remove(self, residuals: Sequence[Residual]) -> list[Residual]:
+        """Take the alias equations out, pass by pass until none is left; return the others, rewritten."""
+        rows = dict(enumerate(residuals))
+        changed = True
+        while changed:
+            changed = False
+            for row, residual in list(rows.items()):
+                own = next((x for x, (_, _, said) in self.velocity.items() if said == row), "")
+                expression = self.substitute(residual.expression, own)
+                rows[row] = Residual(expression, residual.equation)
+                match self._pair(expression):
+                    case ((one, 0), (two, 0), sign):
+                        self._join(one, two, sign)
+                        del rows[row]
+                        changed = True
+                    case ((x, 1), (v, 0), sign) | ((v, 0), (x, 1), sign) if (
+                        not own and x not in self.velocity
+                    ):
+                        self.velocity[x] = (v, sign, row)
+                        changed = True
+        return list(rows.values())
+
+    def _pair(self, expression: sympy.Expr) -> tuple[Jet, Jet, int] | None:
+        """Return a, b and the sign of a = ±b; for a = 0, a twice and the sign 0; else None."""
+        jets = self.jets.jets(expression)
+        terms = [term.as_coeff_Mul() for term in sympy.Add.make_args(expression)]
+        if not 1 <= len(terms) <= 2 or any(s not in jets for _, s in terms):
             return None
-        found.append(rest)
-    return tuple(found)
+        (factor, one), (other_factor, two) = terms[0], terms[-1]
+        if len(terms) == 1:
+            return jets[one], jets[one], 0
+        if abs(factor) != abs(other_factor):
+            return None
+        return jets[one], jets[two], -1 if factor == other_factor else 1
 
-
-def _with_derivatives(replaced: dict[sympy.Symbol, sympy.Expr]) -> dict[sympy.Symbol, sympy.Expr]:
-    """Return the replacements with those of the derivatives: der(a) = ±der(b) where a = ±b."""
-    table = dict(replaced)
-    for name, expression in replaced.items():
-        derivatives = {s: derivative_symbol(s.name) for s in expression.free_symbols}
-        table[derivative_symbol(name.name)] = expression.xreplace(derivatives)
-    return table
-
-
-# ---- matching, blocks, solution ----
-
-
-def _solve(
-    residuals: Sequence[_Residual],
-    unknowns: Sequence[sympy.Symbol],
-    clock: str,
-    partition: Partition,
-    mistakes: Mistakes,
-) -> Assignments:
-    columns = {unknown: j for j, unknown in enumerate(unknowns)}
-    incidence = [
-        [columns[s] for s in sorted(r.expression.free_symbols & columns.keys(), key=str)] for r in residuals
-    ]
-    match = match_columns(incidence, len(unknowns))
-    matched_rows = {row for row in match if row is not None}
-    left_rows = [i for i in range(len(residuals)) if i not in matched_rows]
-    left_columns = [j for j, row in enumerate(match) if row is None]
-    if left_rows or left_columns:
-        _report_singular(residuals, unknowns, left_rows, left_columns, clock, mistakes)
-        return ()
-    row_to_column = {row: column for column, row in enumerate(match)}
-    assert all(row is not None for row in match)
-    # Row i computes column row_to_column[i]; it needs the rows that compute its other unknowns.
-    needs = [
-        [row for j in columns_of if (row := match[j]) is not None and row != i]
-        for i, columns_of in enumerate(incidence)
-    ]
-    found: list[tuple[str, sympy.Expr]] = []
-    for block in strong_components(needs):
-        rows = sorted(block)
-        own = [unknowns[row_to_column[row]] for row in rows]
-        found += _solve_block([residuals[row] for row in rows], own, clock, mistakes)
-    return tuple(found)
-
-
-def _report_singular(
-    residuals: Sequence[_Residual],
-    unknowns: Sequence[sympy.Symbol],
-    rows: Sequence[int],
-    columns: Sequence[int],
-    clock: str,
-    mistakes: Mistakes,
-) -> None:
-    where = "the continuous equations" if clock == CONTINUOUS else f"the equations of clock {clock}"
-    parts = []
-    if columns:
-        parts.append(f"no equation is left for {', '.join(unknowns[j].name for j in columns)}")
-    if rows:
-        texts = "; ".join(f"`{residuals[i].equation.text}` ({residuals[i].equation.origin})" for i in rows)
-        parts.append(f"these have no unknown of their own: {texts}")
-    place = residuals[rows[0]].equation.place if rows else _place_of(residuals)
-    mistakes.add("E502", place, f"{where} can't be solved: {', and '.join(parts)}")
-
-
-def _place_of(residuals: Sequence[_Residual]) -> Place:
-    return residuals[0].equation.place if residuals else Place("topology")
-
-
-def _solve_block(
-    block: Sequence[_Residual], unknowns: Sequence[sympy.Symbol], clock: str, mistakes: Mistakes
-) -> list[tuple[str, sympy.Expr]]:
-    """Solve a linear block symbolically: one equation by division, several by LU."""
-    nonlinear = [u for u in unknowns for r in block if _is_nonlinear(r.expression, u, unknowns)]
-    if nonlinear:
-        chain = " → ".join([u.name for u in unknowns] + [unknowns[0].name])
-        texts = "; ".join(f"`{r.equation.text}`" for r in block)
-        what = f"a nonlinear algebraic loop, which can't be solved here: {chain}, by {texts}"
-        mistakes.add("E503", block[0].equation.place, what)
-        return []
-    if len(block) == 1:
-        expression, unknown = block[0].expression, unknowns[0]
-        coefficient = sympy.diff(expression, unknown)
-        rest = expression.xreplace({unknown: sympy.Integer(0)})
-        return [(unknown.name, -rest / coefficient)]
-    matrix = sympy.Matrix([[sympy.diff(r.expression, u) for u in unknowns] for r in block])
-    zero = {u: sympy.Integer(0) for u in unknowns}
-    rest = sympy.Matrix([-r.expression.xreplace(zero) for r in block])
-    solution = matrix.LUsolve(rest)
-    return [(u.name, sympy.together(value)) for u, value in zip(unknowns, solution, strict=True)]
-
-
-def _is_nonlinear(expression: sympy.Expr, unknown: sympy.Symbol, unknowns: Sequence[sympy.Symbol]) -> bool:
-    if is_opaque_in(expression, unknown):
-        return True
-    return bool(sympy.diff(expression, unknown).free_symbols & set(unknowns))
-
-
-def match_columns(incidence: Sequence[Sequence[int]], columns: int) -> list[int | None]:
-    """Return for each column the row matched to it, or None; as many as can be matched.
-
-    Parameters
-    ----------
-    incidence
-        For each row, the columns it may be matched to.
-    columns
-        The number of columns.
-    """
-    match: list[int | None] = [None] * columns
-    for start in range(len(incidence)):
-        _augment(start, incidence, match)
-    return match
-
-
-def _augment(start: int, incidence: Sequence[Sequence[int]], match: list[int | None]) -> None:
-    """Try to match one more row, moving matched rows aside: breadth first, so that depth is no limit."""
-    came_from: dict[int, int] = {}
-    queue = [start]
-    for row in queue:
-        for column in incidence[row]:
-            if column in came_from:
-                continue
-            came_from[column] = row
-            owner = match[column]
-            if owner is None:
-                _flip(column, start, came_from, match)
-                return
-            queue.append(owner)
-
-
-def _flip(column: int, start: int, came_from: dict[int, int], match: list[int | None]) -> None:
-    held = {row: j for j, row in enumerate(match) if row is not None}
-    while True:
-        row = came_from[column]
-        match[column] = row
-        if row == start:
+    def _join(self, one: str, two: str, sign: int) -> None:
+        goes, stays = (one, two) if self.rank[one] >= self.rank[two] else (two, one)
+        self.parent[goes] = (stays, sign)
+        if goes not in self.velocity:
             return
-        column = held[row]
+        # With der(goes) = ±v and goes = ±stays, v is der(stays) up to a sign, unless that has one already:
+        # then its row is an equation like any other, between two velocities.
+        v, v_sign, row = self.velocity.pop(goes)
+        if sign and stays not in self.velocity:
+            self.velocity[stays] = (v, v_sign * sign, row)
 
-
-def strong_components(needs: Sequence[Iterable[int]]) -> list[list[int]]:
-    """Return the strongly connected components of a graph, each after all that it needs (Tarjan, iterative)."""
-    order: dict[int, int] = {}
-    low: dict[int, int] = {}
-    on_stack: set[int] = set()
-    stack: list[int] = []
-    found: list[list[int]] = []
-    for root in range(len(needs)):
-        if root in order:
-            continue
-        work = [(root, iter(needs[root]))]
-        while work:
-            node, rest = work[-1]
-            if node not in order:
-                order[node] = low[node] = len(order)
-                stack.append(node)
-                on_stack.add(node)
-            for following in rest:
-                if following not in order:
-                    work.append((following, iter(needs[following])))
-                    break
-                if following in on_stack:
-                    low[node] = min(low[node], order[following])
+    def _value(self, name: str, order: int, but: str) -> sympy.Expr:
+        sign = 1
+        while True:
+            if name in self.parent:
+                name, its_sign = self.parent[name]
+            elif order and name in self.velocity and name != but:
+                name, its_sign, _ = self.velocity[name]
+                order -= 1
             else:
-                work.pop()
-                if work:
-                    parent = work[-1][0]
-                    low[parent] = min(low[parent], low[node])
-                if low[node] == order[node]:
-                    cut = stack.index(node)
-                    found.append(stack[cut:])
-                    on_stack.difference_update(stack[cut:])
-                    del stack[cut:]
-    return found
+                return sign * self.jets.symbol(name, order)
+            sign *= its_sign
+            if not sign:
+                return sympy.S.Zero

@@ -2,12 +2,14 @@
 
 Takes: `Expr`. Gives: `sympy.Expr`, by building nodes; no text is ever parsed by SymPy.
 Guarantees: functions whose SymPy versions would search for simplifications (min, max, if, …) stay opaque.
-Does not: know clocks or crossings.
+Does not: know clocks or crossings, or which symbols move (see `index`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import random
+from collections.abc import Callable, Set
+from math import prod
 
 import sympy
 from apc.compiler.expression import (
@@ -103,6 +105,141 @@ def _binary(operator: str, left: sympy.Expr, right: sympy.Expr) -> sympy.Expr:
     return left**right
 
 
-def is_opaque_in(expression: sympy.Expr, unknown: sympy.Symbol) -> bool:
-    """Return whether the unknown stands inside an opaque function of the expression."""
-    return any(unknown in call.free_symbols for call in expression.atoms(sympy.core.function.AppliedUndef))
+def differential(expression: sympy.Expr, rate: Callable[[sympy.Symbol], sympy.Expr]) -> sympy.Expr:
+    """Return Σ ∂expression/∂s · rate(s) over the symbols s, by the chain rule.
+
+    Where min, max, abs and if have a corner, the derivative is that of the branch taken; sign, floor and
+    conditions are constant between their jumps.
+    """
+
+    def go(node: sympy.Expr) -> sympy.Expr:
+        if node.is_Symbol:
+            return rate(node)
+        if not node.args or not node.free_symbols:
+            return sympy.S.Zero
+        if node.is_Add:
+            return sympy.Add(*(go(term) for term in node.args))
+        if node.is_Mul:
+            return sympy.Add(
+                *(
+                    sympy.Mul(slope, *node.args[:place], *node.args[place + 1 :])
+                    for place, factor in enumerate(node.args)
+                    if (slope := go(factor)) != 0
+                )
+            )
+        if node.is_Pow and node.exp.is_Number:
+            return node.exp * node.base ** (node.exp - 1) * go(node.base)
+        return _of_function(node.func.__name__, node)
+
+    def _of_function(name: str, node: sympy.Expr) -> sympy.Expr:
+        if name == "if":
+            condition, then, otherwise = node.args
+            return _choice(condition, go(then), go(otherwise))
+        if name in ("min", "max"):
+            best, slope = node.args[0], go(node.args[0])
+            for argument in node.args[1:]:
+                order = (best, argument) if name == "min" else (argument, best)
+                slope = _choice(head("less_or_equal")(*order), slope, go(argument))
+                best = head(name)(best, argument)
+            return slope
+        if name.lower() == "abs":
+            slope = go(node.args[0])
+            return slope and head("sign")(node.args[0]) * slope
+        if name in SMOOTH:
+            slope = go(node.args[0])
+            return slope and node.fdiff(1) * slope
+        return sympy.S.Zero
+
+    return go(expression)
+
+
+def _choice(condition: sympy.Expr, then: sympy.Expr, otherwise: sympy.Expr) -> sympy.Expr:
+    return then if then == otherwise else head("if")(condition, then, otherwise)
+
+
+LinearForm = tuple[dict[sympy.Symbol, sympy.Expr], sympy.Expr]
+
+
+def linear_form(expression: sympy.Expr, unknowns: Set[sympy.Symbol]) -> LinearForm | None:
+    """Return the coefficients and the rest of Σ coefficient·unknown + rest, or None if it isn't linear.
+
+    Reads the terms as they stand: no differentiation, no expansion, so its cost is the expression's size.
+    """
+    if unknowns.isdisjoint(expression.free_symbols):
+        return {}, expression
+    if expression.is_Symbol:
+        return {expression: sympy.S.One}, sympy.S.Zero
+    if expression.is_Add:
+        forms = [linear_form(term, unknowns) for term in expression.args]
+        if any(form is None for form in forms):
+            return None
+        known = [form for form in forms if form is not None]
+        parts: dict[sympy.Symbol, list[sympy.Expr]] = {}
+        for coefficients, _ in known:
+            for unknown, coefficient in coefficients.items():
+                parts.setdefault(unknown, []).append(coefficient)
+        return {u: sympy.Add(*terms) for u, terms in parts.items()}, sympy.Add(*(rest for _, rest in known))
+    if expression.is_Mul:
+        moving = [factor for factor in expression.args if not unknowns.isdisjoint(factor.free_symbols)]
+        form = linear_form(moving[0], unknowns) if len(moving) == 1 else None
+        if form is None:
+            return None
+        scale = sympy.Mul(*(factor for factor in expression.args if factor is not moving[0]))
+        return {u: scale * coefficient for u, coefficient in form[0].items()}, scale * form[1]
+    if expression.func.__name__ == "if" and unknowns.isdisjoint(expression.args[0].free_symbols):
+        condition, *branches = expression.args
+        then, otherwise = (linear_form(branch, unknowns) for branch in branches)
+        if then is None or otherwise is None:
+            return None
+        zero = sympy.S.Zero
+        names = dict.fromkeys((*then[0], *otherwise[0]))
+        return {
+            u: _choice(condition, then[0].get(u, zero), otherwise[0].get(u, zero)) for u in names
+        }, _choice(condition, then[1], otherwise[1])
+    return None
+
+
+class ZeroTest:
+    """Says whether a rational expression is zero for all values of its symbols.
+
+    Each symbol, and each function value, gets a random residue modulo the prime 2⁶¹ − 1; an expression that
+    isn't zero vanishes there with probability below its degree/2⁶¹ (Schwartz 1980, Zippel 1979). Expansion
+    would decide the same at a cost that grows with the number of terms. The generator is seeded.
+    """
+
+    _PRIME = 2**61 - 1
+
+    def __init__(self) -> None:
+        self._values: dict[sympy.Expr, int] = {}
+        self._random = random.Random(0)
+
+    def define(self, name: sympy.Symbol, expression: sympy.Expr) -> None:
+        """Let a symbol stand for an expression."""
+        self._values[name] = self._value(expression)
+
+    def __call__(self, expression: sympy.Expr) -> bool:
+        """Return whether the expression is zero."""
+        return expression.is_zero is True or (not expression.is_Number and self._value(expression) == 0)
+
+    def _value(self, node: sympy.Expr) -> int:
+        known = self._values.get(node)
+        if known is None:
+            known = self._values[node] = self._compute(node)
+        return known
+
+    def _compute(self, node: sympy.Expr) -> int:
+        prime = self._PRIME
+        if node.is_Rational:
+            return int(node.p) * pow(int(node.q), -1, prime) % prime
+        if node.is_Add:
+            return sum(self._value(term) for term in node.args) % prime
+        if node.is_Mul:
+            return prod(self._value(factor) for factor in node.args) % prime
+        if node.is_Pow and node.exp.is_Integer and (base := self._value(node.base)):
+            return pow(base, int(node.exp), prime)
+        return self._random.randrange(1, prime)
+
+
+def no_derivative(expression: sympy.Expr) -> sympy.Expr:
+    """Stand in for `differentiate` where `der` can't occur."""
+    raise AssertionError(f"der of {expression} stands in a clocked equation")

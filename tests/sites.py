@@ -8,10 +8,12 @@ from fractions import Fraction
 from typing import Any
 
 import casadi
+import numpy as np
 from apc.compiler.compiled import (
     Clock,
     ClockPartition,
     CompiledSystem,
+    Graph,
     Group,
     Hold,
     Kind,
@@ -47,6 +49,7 @@ STATES = (
     State("cube.v", "m/s", "zero"),
 )
 MS = Fraction(1, 1000)
+COMPLETE = Graph("complete", np.zeros((0, 2), np.int64), np.zeros(0))
 
 
 def user(operator: str = "mean", *, own_delay: bool = False) -> Kind:
@@ -137,7 +140,7 @@ def paper(
             Clock("haptic", "haptic.period", "haptic.phase"),
             Clock("network", "network.period", "network.phase"),
         ),
-        links=(Link("lan", "network", "lan.delay", "complete"),),
+        links=(Link("lan", "network", "lan.delay", COMPLETE, ()),),
         timings=(
             Timing("haptic.period", haptic),
             Timing("haptic.phase", haptic_phase),

@@ -1,0 +1,635 @@
+"""Component and connector definitions: YAML text to typed data, checked once per component.
+
+Takes: the YAML source of a definition, and the library it stands in. Gives: `Component`, `Connector`.
+Guarantees: every name in an equation is declared, every equation's units agree, and a component has as
+many equations as it must have; a component that breaks this is never handed out.
+Does not: know any topology, or which component is used where.
+
+A component is locally balanced in Modelica's sense (Modelica Language Specification 3.6, section 4.8): it
+gives one equation for each of its variables and one for each flow of its connectors; the connections of a
+scene give the rest.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+from fractions import Fraction
+from typing import Protocol, TypeVar
+
+from apc.compiler.component import (
+    OTHERS,
+    ROLES,
+    Component,
+    Connector,
+    Inner,
+    Number,
+    Option,
+    Parameter,
+    Reference,
+    Send,
+    Variable,
+    option_test,
+)
+from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
+from apc.compiler.errors import ApcError, Mistakes, Place, nearest
+from apc.compiler.expression import (
+    Compare,
+    Equation,
+    Expr,
+    Name,
+    parse_equation,
+    parse_expression,
+    transform,
+    walk,
+)
+from apc.compiler.expression import Number as Literal
+from apc.compiler.parts import Scope, read_entry
+from apc.compiler.reading import (
+    add_unknown,
+    brief,
+    check_keys,
+    entries,
+    form,
+    read_mapping,
+    read_name,
+    read_text,
+)
+from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source, place_in
+from apc.compiler.units import DIMENSIONLESS, Dimension, Unit, parse_quantity, parse_unit, quantity
+from apc.compiler.values import PEERS, text_place
+
+COMPONENT_KEYS = (
+    "component",
+    "about",
+    "source",
+    "extends",
+    "connectors",
+    "parameters",
+    "variables",
+    "parts",
+    "connect",
+    "sends",
+    "equations",
+)
+RESERVED = frozenset({"peers", "others", "time", "ground", "type", "at", "shared", "count", "set"})
+Sends = tuple[tuple[str, Expr, str, Place], ...]
+_TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
+
+
+def read_connector(source: Source) -> Connector:
+    """Read a connector definition. Raises ApcError with all its mistakes."""
+    mistakes = Mistakes()
+    root = read_mapping(source.root, "a connector definition", mistakes)
+    mistakes.raise_if_any()
+    assert root is not None
+    root = check_keys(root, ("connector", "about", "source", "potentials", "flows"), "a connector", mistakes)
+    potentials = _variables(root.get("potentials"), mistakes)
+    flows = _variables(root.get("flows"), mistakes)
+    name = read_text(root.get("connector"), "connector", mistakes) or ""
+    about = read_text(root.get("about"), "about", mistakes) or ""
+    mistakes.raise_if_any()
+    return Connector(name, about, potentials, flows)
+
+
+class Definitions(Protocol):
+    """Where a definition finds the others it names."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Everything that can be asked for."""
+
+    def component(self, name: str) -> Component | None:
+        """Return a component, or None if there is no such name."""
+
+    def connector(self, name: str) -> Connector | None:
+        """Return a connector type, or None if there is no such name."""
+
+
+def read_component(source: Source, library: Definitions) -> Component:
+    """Read and check a component definition. Raises ApcError with all its mistakes."""
+    mistakes = Mistakes()
+    root = read_mapping(source.root, "a component definition", mistakes)
+    mistakes.raise_if_any()
+    assert root is not None
+    root = check_keys(root, COMPONENT_KEYS, "a component", mistakes)
+    draft = _read_declarations(root, library, mistakes)
+    mistakes.raise_if_any()
+    names = _Names(draft)
+    sends = _sends(root.get("sends"), mistakes)
+    locals_, found = names.infer_locals(sends), names.infer_sends(sends, mistakes)
+    component = replace(draft, locals=(*draft.locals, *locals_), sends=(*draft.sends, *found))
+    mistakes.raise_if_any()
+    names.check(component, mistakes)
+    mistakes.raise_if_any()
+    _check_balance(component, mistakes)
+    mistakes.raise_if_any()
+    return component
+
+
+def _read_declarations(root: Mapping, library: Definitions, mistakes: Mistakes) -> Component:
+    """Read everything but what has to be inferred; what the component extends comes first."""
+    title = root.get("component")
+    name = (read_name(title, "a component", mistakes) if isinstance(title, Scalar) else None) or "?"
+    base = _base(root.get("extends"), library, mistakes)
+    connectors = _connectors(root.get("connectors"), library, mistakes)
+    parameters = _parameters(root.get("parameters"), mistakes)
+    variables = _variables(root.get("variables"), mistakes)
+    equations = _equations(root.get("equations"), mistakes)
+    about = read_text(root.get("about"), "about", mistakes) or ""
+    cited = read_text(root.get("source"), "source", mistakes) or ""
+    place = title.place if title is not None else root.place
+    _check_distinct(connectors, parameters, variables, mistakes)
+    if base is None:
+        draft = Component(
+            name, about, cited, connectors, parameters, variables, (), (), equations, (), (), place
+        )
+    else:
+        draft = replace(
+            base,
+            name=name,
+            about=about,
+            source=cited,
+            connectors=(*base.connectors, *connectors),
+            parameters=_overridden(base.parameters, parameters),
+            variables=_overridden(base.variables, variables),
+            equations=(*base.equations, *equations),
+            place=place,
+        )
+    if root.get("parts") is None and root.get("connect") is None:
+        return draft
+    inner, passed = _read_inner(root, draft, library, mistakes)
+    return replace(draft, inner=(*draft.inner, *inner), passed=(*draft.passed, *passed))
+
+
+def _base(node: Node | None, library: Definitions, mistakes: Mistakes) -> Component | None:
+    text = read_text(node, "extends", mistakes, hint="extends: Mass")
+    return None if node is None or text is None else _found(text, node.place, library, mistakes)
+
+
+def _found(name: str, place: Place, library: Definitions, mistakes: Mistakes) -> Component | None:
+    try:
+        component = library.component(name)
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+    if component is None:
+        close = nearest(name, library.names)
+        what = f"there is no component {brief(name)}"
+        add_unknown("E206", place, what, name, (close,) if close else library.names, mistakes)
+    return component
+
+
+Declared = TypeVar("Declared", Parameter, Variable)
+
+
+def _overridden(base: tuple[Declared, ...], own: tuple[Declared, ...]) -> tuple[Declared, ...]:
+    """Return the inherited declarations, those declared again replaced in their place, then the new ones."""
+    again = {item.name: item for item in own}
+    known = {item.name for item in base}
+    return (*(again.get(item.name, item) for item in base), *(item for item in own if item.name not in known))
+
+
+def _read_inner(
+    root: Mapping, outer: Component, library: Definitions, mistakes: Mistakes
+) -> tuple[tuple[Inner, ...], tuple[tuple[str, str, str], ...]]:
+    """Read the parts inside a component and the connectors it passes on to them."""
+    bodies: dict[str, tuple[Mapping, Component, Place]] = {}
+    faulty: set[str] = set()
+    hint = "parts: {tip: {type: Mass}}"
+    for key, value in entries(read_mapping(root.get("parts"), "parts", mistakes, hint=hint)):
+        name = read_name(key, "a part", mistakes)
+        body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{type: Mass}}")
+        faulty.add(key.text)
+        component = None if name is None or body is None else read_type(key, body, None, library, mistakes)
+        if name is not None and body is not None and component is not None:
+            bodies[name] = (body, component, key.place)
+            faulty.discard(name)
+    dimensions = {(p.name,): p.unit.dimension for p in outer.numbers} | {PEERS: DIMENSIONLESS}
+
+    def references(role: str, word: str, place: Place) -> Collection[str]:
+        return [p.name for p in outer.parameters if isinstance(p, Reference) and p.role == role]
+
+    scope = Scope(
+        dimension=dimensions.get,
+        names=[".".join(parts) for parts in dimensions],
+        references=references,
+        parts={name: component for name, (_, component, _) in bodies.items()},
+        counts={},
+        faulty=faulty,
+        outer=outer,
+    )
+    inner = []
+    for name, (body, component, place) in bodies.items():
+        entry = read_entry(name, body, component, place, scope, mistakes, free_connectors=True)
+        inner.append(Inner(name, component, entry, place))
+    passed = [
+        (theirs, part.name, own)
+        for part in inner
+        for own, other, theirs in part.entry.connections
+        if not other
+    ]
+    passed += _read_connect(root.get("connect"), outer, bodies, mistakes)
+    return tuple(inner), tuple(passed)
+
+
+def _read_connect(
+    node: Node | None,
+    outer: Component,
+    bodies: dict[str, tuple[Mapping, Component, Place]],
+    mistakes: Mistakes,
+) -> list[tuple[str, str, str]]:
+    """Read `connect: {flange: tip.flange}`: connectors of the component that are those of an inner part."""
+    found = []
+    own = dict(outer.connectors)
+    known = [f"{p}.{c}" for p, (_, component, _) in bodies.items() for c, _ in component.connectors]
+    hint = "connect: {flange: tip.flange}"
+    for key, value in entries(read_mapping(node, "connect", mistakes, hint=hint)):
+        text = read_text(value, key.text, mistakes, hint=f"{key.text}: tip.flange")
+        if text is None:
+            continue
+        if key.text not in own:
+            what = f"connect names {brief(key.text)}, which is no connector of this component"
+            add_unknown("E206", key.place, what, key.text, list(own), mistakes)
+        elif text not in known:
+            what = f"connect names {brief(text)}, which is no connector of an inner part"
+            add_unknown("E206", value.place, what, text, known, mistakes)
+        else:
+            part, _, connector = text.partition(".")
+            found.append((key.text, part, connector))
+    return found
+
+
+def read_type(
+    key: Scalar, body: Mapping, default: str | None, library: Definitions, mistakes: Mistakes
+) -> Component | None:
+    """Return the component that a part's entry is of; `default` serves when the entry has no type."""
+    node = body.get("type")
+    name = default if node is None else read_text(node, "type", mistakes, hint="type: Mass")
+    if node is None and name is None:
+        mistakes.add("E201", key.place, f"{key.text} has no type", hint="type: SampledSpringDamper")
+    if name is None:
+        return None
+    return _found(name, node.place if node is not None else key.place, library, mistakes)
+
+
+class _Names:
+    """Resolves a component's names to dimensions, and finds the locals on the way."""
+
+    def __init__(self, component: Component) -> None:
+        self.component = component
+        self.dimensions: dict[tuple[str, ...], Dimension | None] = {PEERS: DIMENSIONLESS, ("time",): SECOND}
+        self.dimensions.update(dict(visible_names(component)))
+        for parameter in component.numbers:
+            self.dimensions[(parameter.name,)] = parameter.unit.dimension
+            for word, _ in parameter.words:
+                self.dimensions.setdefault((word,), parameter.unit.dimension)
+        passed = {connector for connector, _, _ in component.passed}
+        for name, connector in component.connectors:
+            if name not in passed:
+                for flow in connector.flows:
+                    self.dimensions[(name, flow.name)] = flow.unit.dimension
+        self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
+        for send in component.sends:
+            self.dimensions[(OTHERS, send.name)] = send.dimension
+        for parameter in component.parameters:
+            if isinstance(parameter, Reference) and parameter.role == "table":
+                self.dimensions[(parameter.name,)] = parameter.unit.dimension if parameter.unit else None
+
+    def infer_sends(self, sends: Sends, mistakes: Mistakes) -> tuple[Send, ...]:
+        """Return the sends with the dimension of what they send."""
+        return tuple(
+            Send(name, expression, text, place, _known(self._dimension(expression, text, place, mistakes)))
+            for name, expression, text, place in sends
+        )
+
+    def infer_locals(self, sends: Sends) -> tuple[tuple[str, Dimension], ...]:
+        """Return the undeclared names that stand alone on the left of an equation."""
+        for name, expression, text, place in sends:
+            self.dimensions[(OTHERS, name)] = self._dimension(expression, text, place, Mistakes())
+        found: list[tuple[str, Dimension]] = []
+        for equation in self.component.equations:
+            left = equation.left
+            if isinstance(left, Name) and len(left.parts) == 1 and left.parts not in self.dimensions:
+                # An unknown name on the right is reported once, by `check`; a local may still be undecided.
+                dimension = self._dimension(equation.right, equation.text, equation.place, Mistakes())
+                self.dimensions[left.parts] = dimension
+                found.append((left.parts[0], _known(dimension)))
+        return tuple(found)
+
+    def check(self, component: Component, mistakes: Mistakes) -> None:
+        """Check the names, then the units, of every equation."""
+        for equation in component.equations:
+            unknown = False
+            left, right = self._decided(equation.left), self._decided(equation.right)
+            for side in (left, right):
+                unknown |= self._check_names(side, equation.text, equation.place, mistakes)
+            if not unknown:
+                try:
+                    check_equation(
+                        Equation(left, right, equation.text, equation.place),
+                        lambda name: self.dimensions.get(name.parts),
+                    )
+                except ApcError as error:
+                    mistakes.take(error)
+
+    def _decided(self, expression: Expr) -> Expr:
+        """Return the expression with each test of an option replaced by a true statement.
+
+        Both branches of such a test are checked; the words of an option have no dimension.
+        """
+        options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
+        return transform(expression, lambda node: _TRUE if option_test(node, options) else None)
+
+    def _dimension(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> Dimension | None:
+        expression = self._decided(expression)
+        if self._check_names(expression, text, place, mistakes):
+            return None
+        try:
+            return dimension_of(expression, lambda name: self.dimensions.get(name.parts), text, place)
+        except ApcError as error:
+            mistakes.take(error)
+            return None
+
+    def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
+        wrong = False
+        for node in walk(expression):
+            if isinstance(node, Name) and node.parts not in self.dimensions:
+                wrong = True
+                shown = ".".join(node.parts)
+                known = sorted(".".join(parts) for parts in self.dimensions)
+                what = f"{self.component.name} has no {brief(shown)}"
+                add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)
+        return wrong
+
+
+def visible_names(component: Component) -> Iterator[tuple[tuple[str, ...], Dimension]]:
+    """Yield what may be named of a component from outside: its variables and its connectors' potentials."""
+    for variable in component.variables:
+        yield (variable.name,), variable.unit.dimension
+    for name, dimension in component.locals:
+        yield (name,), dimension
+    for name, connector in component.connectors:
+        for potential in connector.potentials:
+            yield (name, potential.name), potential.unit.dimension
+    for inner in component.inner:
+        for path, dimension in visible_names(inner.component):
+            yield (inner.name, *path), dimension
+
+
+def _known(dimension: Dimension | None) -> Dimension:
+    """Return a dimension that was inferred; what fits every dimension, such as 0, has none."""
+    return DIMENSIONLESS if dimension in (None, ANY) else dimension
+
+
+def _check_balance(component: Component, mistakes: Mistakes) -> None:
+    passed = {connector for connector, _, _ in component.passed}
+    flows = [
+        f"{name}.{flow.name}"
+        for name, connector in component.connectors
+        if name not in passed
+        for flow in connector.flows
+    ]
+    unknowns = [variable.name for variable in component.variables]
+    unknowns += [name for name, _ in component.locals] + flows
+    if len(component.equations) == len(unknowns):
+        return
+    mistakes.add(
+        "E501",
+        component.place,
+        f"{component.name} is unbalanced: {_counted(len(component.equations), 'equation')} for "
+        f"{_counted(len(unknowns), 'unknown')} ({', '.join(unknowns) or 'none'})",
+        hint="one equation for each variable and one for each flow of a connector",
+    )
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def _check_distinct(
+    connectors: tuple[tuple[str, Connector], ...],
+    parameters: tuple[Parameter, ...],
+    variables: tuple[Variable, ...],
+    mistakes: Mistakes,
+) -> None:
+    seen = {name for name, _ in connectors}
+    for item in (*parameters, *variables):
+        if item.name in seen:
+            mistakes.add("E205", item.place, f"the name {item.name} is used twice in this component")
+        if item.name in RESERVED:
+            mistakes.add("E205", item.place, f"{item.name} is a word of the language and can't be a name")
+        seen.add(item.name)
+
+
+def _connectors(
+    node: Node | None, library: Definitions, mistakes: Mistakes
+) -> tuple[tuple[str, Connector], ...]:
+    found = []
+    for key, value in entries(
+        read_mapping(node, "connectors", mistakes, hint="connectors: {flange: Flange}")
+    ):
+        name = read_name(key, "a connector", mistakes)
+        type_name = read_text(value, key.text, mistakes, hint=f"{key.text}: Flange")
+        if name is None or type_name is None:
+            continue
+        connector = library.connector(type_name)
+        if connector is None:
+            what = f"there is no connector type {brief(type_name)}"
+            known = [known for known in library.names if library.connector(known)]
+            add_unknown("E206", value.place, what, type_name, known, mistakes)
+        else:
+            found.append((name, connector))
+    return tuple(found)
+
+
+def _equations(node: Node | None, mistakes: Mistakes) -> tuple[Equation, ...]:
+    if node is None:
+        return ()
+    if not isinstance(node, Sequence):
+        mistakes.add(
+            "E203", node.place, "equations", expected="a list", got=form(node), hint="equations: [a + b = c]"
+        )
+        return ()
+    found = []
+    for item in node.items:
+        text = read_text(item, "an equation", mistakes, hint="- a + b = c")
+        if text is not None:
+            try:
+                found.append(parse_equation(text, text_place(item)))
+            except ApcError as error:
+                mistakes.take(error)
+    return tuple(found)
+
+
+def _sends(node: Node | None, mistakes: Mistakes) -> Sends:
+    found = []
+    for key, value in entries(read_mapping(node, "sends", mistakes, hint="sends: {x: sample(object.x)}")):
+        name = read_name(key, "what is sent", mistakes)
+        text = read_text(value, key.text, mistakes, hint=f"{key.text}: sample(object.x)")
+        if name is None or text is None:
+            continue
+        place = text_place(value)
+        try:
+            found.append((name, parse_expression(text, place), text, place))
+        except ApcError as error:
+            mistakes.take(error)
+    return tuple(found)
+
+
+def _variables(node: Node | None, mistakes: Mistakes) -> tuple[Variable, ...]:
+    found = []
+    for key, value in entries(read_mapping(node, "variables", mistakes, hint="variables: {x: {unit: m}}")):
+        name = read_name(key, "a variable", mistakes)
+        body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{unit: m}}")
+        if name is None or body is None:
+            continue
+        body = check_keys(body, ("unit", "start", "about"), f"variable {name}", mistakes)
+        unit = _unit(body, name, mistakes)
+        start = _declared(body.get("start"), name, unit, mistakes)
+        about = read_text(body.get("about"), "about", mistakes) or ""
+        if unit is not None:
+            found.append(Variable(name, unit, start, about, key.place))
+    return tuple(found)
+
+
+def _parameters(node: Node | None, mistakes: Mistakes) -> tuple[Parameter, ...]:
+    found: list[Parameter] = []
+    hint = "parameters: {stiffness: {unit: N/m, min: 0}}"
+    for key, value in entries(read_mapping(node, "parameters", mistakes, hint=hint)):
+        name = read_name(key, "a parameter", mistakes)
+        if name is None:
+            continue
+        parameter: Parameter | None
+        if isinstance(value, Scalar):
+            parameter = _reference(name, value, mistakes)
+        else:
+            body = read_mapping(value, f"parameter {name}", mistakes, hint=f"{name}: {{unit: N/m}}")
+            if body is None:
+                continue
+            if body.get("table") is not None:
+                parameter = _table(name, body, mistakes)
+            elif _has_words(body):
+                parameter = _option(name, body, mistakes)
+            else:
+                parameter = _number(name, body, mistakes)
+        if parameter is not None:
+            found.append(parameter)
+    return tuple(found)
+
+
+def _has_words(body: Mapping) -> bool:
+    return isinstance(body.get("options"), Sequence)
+
+
+def _reference(name: str, value: Scalar, mistakes: Mistakes) -> Reference | None:
+    if value.text in ROLES:
+        return Reference(name, value.text, "", value.place)
+    mistakes.add(
+        "E203",
+        value.place,
+        f"parameter {name}",
+        expected=f"{', '.join(ROLES)}, or a mapping with its unit",
+        got=brief(value.text) or "nothing",
+        hint=f"{name}: {{unit: N/m, min: 0}}",
+    )
+    return None
+
+
+def _option(name: str, body: Mapping, mistakes: Mistakes) -> Option | None:
+    body = check_keys(body, ("options", "default", "about"), f"parameter {name}", mistakes)
+    options = body.get("options")
+    assert isinstance(options, Sequence)
+    words = tuple(item.text for item in options.items if isinstance(item, Scalar))
+    default = read_text(body.get("default"), "default", mistakes)
+    node = body.get("default")
+    if default is not None and node is not None and default not in words:
+        what = f"{name} has no option {brief(default)}"
+        add_unknown("E206", node.place, what, default, words, mistakes)
+    about = read_text(body.get("about"), "about", mistakes) or ""
+    return Option(name, words, default, about, options.place)
+
+
+def _table(name: str, body: Mapping, mistakes: Mistakes) -> Reference | None:
+    """Read `{table: N}`: a file of numbers over time, in newtons."""
+    body = check_keys(body, ("table", "about"), f"parameter {name}", mistakes)
+    node = body.get("table")
+    text = read_text(node, "table", mistakes, hint="table: N")
+    about = read_text(body.get("about"), "about", mistakes) or ""
+    if node is None or text is None:
+        return None
+    try:
+        return Reference(name, "table", about, body.place, parse_unit(text, node.place))
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+
+
+def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
+    keys = ("unit", "min", "above", "max", "default", "about", "shared", "options")
+    body = check_keys(body, keys, f"parameter {name}", mistakes)
+    unit = _unit(body, name, mistakes)
+    shared = read_text(body.get("shared"), "shared", mistakes)
+    node = body.get("shared")
+    if shared not in (None, "divided", "whole") and node is not None:
+        mistakes.add("E203", node.place, "shared", expected="divided or whole", got=brief(shared or ""))
+    default = _declared(body.get("default"), name, unit, mistakes)
+    minimum = _declared(body.get("min"), name, unit, mistakes)
+    above = _declared(body.get("above"), name, unit, mistakes)
+    maximum = _declared(body.get("max"), name, unit, mistakes)
+    words = []
+    for key, value in entries(read_mapping(body.get("options"), "options", mistakes)):
+        number = _declared(value, key.text, unit, mistakes)
+        if number is not None:
+            words.append((key.text, number))
+    about = read_text(body.get("about"), "about", mistakes) or ""
+    if unit is None:
+        return None
+    return Number(
+        name,
+        unit,
+        default,
+        above if above is not None else minimum,
+        above is not None,
+        maximum,
+        shared == "divided",
+        tuple(words),
+        about,
+        body.place,
+    )
+
+
+def _unit(body: Mapping, name: str, mistakes: Mistakes) -> Unit | None:
+    node = body.get("unit")
+    if node is None:
+        mistakes.add(
+            "E201",
+            body.place,
+            f"{name} has no unit",
+            hint=f"{name}: {{unit: N/m}}  (unit: 1 when it has none)",
+        )
+        return None
+    text = read_text(node, "unit", mistakes, hint="unit: N/m")
+    if text is None:
+        return None
+    try:
+        return parse_unit(text, node.place)
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+
+
+def _declared(node: Node | None, name: str, unit: Unit | None, mistakes: Mistakes) -> Fraction | None:
+    """Read a number of a declaration: bare, it is in the unit declared beside it."""
+    text = read_text(node, name, mistakes)
+    if node is None or text is None or unit is None:
+        return None
+    try:
+        if _NUMBER.match(text):
+            return parse_quantity(text, node.place).value * unit.scale
+        return quantity(text, node.place, what=name, unit=unit.text).value
+    except ApcError as error:
+        mistakes.take(error)
+        return None

@@ -1,0 +1,294 @@
+"""Numbers in the text: quantities, words that stand for numbers, and expressions over named numbers.
+
+Takes: scalars of YAML. Gives: `Binding` (what was written) and `Value` (what it comes to).
+Guarantees: dimensions agree and bounds hold, or a mistake says so at its place.
+Does not: know sections, parts or peers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from fractions import Fraction
+
+from apc.compiler.dimensions import ANY, dimension_of
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.expression import (
+    Expr,
+    Name,
+    evaluate,
+    format_expression,
+    names,
+    parse_expression,
+    transform,
+)
+from apc.compiler.reading import add_unknown, brief, read_text
+from apc.compiler.source import Node, Scalar, place_in
+from apc.compiler.units import DIMENSIONLESS, Dimension, format_dimension, format_si, parse_quantity, quantity
+
+PEERS = ("peers",)
+
+# A quantity starts with a number; what follows is nothing, a unit, or a ratio such as 1/90 s. An operator
+# behind the number makes it an expression.
+_QUANTITY = re.compile(
+    r"[+-]?\s*(\d|\.\d)[\d.]*([eE][+-]?\d+)?(\s*/\s*\d[\d.]*)?\s*([^\W\d_].*|[°%µΩ].*)?\Z", re.DOTALL
+)
+_WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """A number as written: `number` in SI, or an `expression` over names."""
+
+    number: Fraction | None
+    expression: Expr | None
+    dimension: Dimension
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A number, in SI; `expression` is its text when it depends on other parameters."""
+
+    number: Fraction
+    dimension: Dimension
+    expression: str | None
+    place: Place
+
+    def __str__(self) -> str:
+        """Return the number with its SI unit."""
+        return format_si(float(self.number), self.dimension)
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Where a number must lie, in SI; `unit` is the one its messages use."""
+
+    unit: str
+    scale: Fraction
+    minimum: Fraction | None = None
+    open_minimum: bool = False
+    maximum: Fraction | None = None
+
+    def fault(self, number: Fraction) -> str:
+        """Return what the bounds ask for if the number breaks them, else an empty text."""
+        least = self.minimum
+        if least is not None and (number < least or (self.open_minimum and number == least)):
+            shown = f"{self._shown(least)} {self.unit}"
+            return f"more than {shown}" if self.open_minimum else f"{shown} or more"
+        if self.maximum is not None and number > self.maximum:
+            return f"{self._shown(self.maximum)} {self.unit} or less"
+        return ""
+
+    def check(self, value: Value, what: str, mistakes: Mistakes) -> None:
+        """Record a number that breaks the bounds."""
+        expected = self.fault(value.number)
+        if expected:
+            got = f"{self._shown(value.number)} {self.unit}"
+            mistakes.add("E207", value.place, what, expected=expected, got=got)
+
+    def _shown(self, number: Fraction) -> str:
+        return f"{float(number / self.scale):.12g}"
+
+
+def is_quantity(text: str) -> bool:
+    """Return whether a text is meant as a number with or without a unit, not as an expression."""
+    return bool(_QUANTITY.match(text) or _WORD_NUMBER.match(text))
+
+
+def text_place(node: Node) -> Place:
+    """Return where a scalar's text starts: behind the opening quote, if it has one."""
+    quoted = isinstance(node, Scalar) and not node.plain
+    return node.place.shifted(1) if quoted else node.place
+
+
+def read_binding(
+    node: Node | None,
+    what: str,
+    dimension: Dimension,
+    unit: str,
+    known: Callable[[tuple[str, ...]], Dimension | None],
+    names_known: Collection[str],
+    mistakes: Mistakes,
+    *,
+    words: Collection[tuple[str, Fraction]] = (),
+) -> Binding | None:
+    """Read a number: a quantity, a word that stands for one, or an expression.
+
+    Parameters
+    ----------
+    node
+        Where it stands; None if it isn't there.
+    what
+        What it is, for messages.
+    dimension, unit
+        What it must be in.
+    known
+        The dimension of a name an expression may use, or None.
+    names_known
+        All these names, for messages.
+    mistakes
+        Where faults go.
+    words
+        Words that stand for numbers.
+    """
+    text = read_text(node, what, mistakes, hint=f"{what}: 1 {unit}")
+    if node is None or text is None:
+        return None
+    named = dict(words)
+    if text in named:
+        return Binding(named[text], None, dimension, node.place)
+    try:
+        if is_quantity(text):
+            number = quantity(text, node.place, what=what, unit=unit).value
+            return Binding(number, None, dimension, node.place)
+        return Binding(
+            None,
+            _expression(text, text_place(node), what, dimension, unit, known, names_known),
+            dimension,
+            node.place,
+        )
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+
+
+def _expression(
+    text: str,
+    place: Place,
+    what: str,
+    dimension: Dimension,
+    unit: str,
+    known: Callable[[tuple[str, ...]], Dimension | None],
+    names_known: Collection[str],
+) -> Expr:
+    tree = parse_expression(text, place)
+    check_names(tree, text, place, what, known, names_known)
+    found = dimension_of(tree, lambda name: known(name.parts), text, place)
+    if found not in (None, ANY, dimension):
+        got = f"{brief(text)}, which is in {format_dimension(found or dimension)}"
+        raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: 1 {unit}"))
+    return tree
+
+
+def check_names(
+    tree: Expr,
+    text: str,
+    place: Place,
+    what: str,
+    known: Callable[[tuple[str, ...]], Dimension | None],
+    names_known: Collection[str],
+) -> None:
+    """Raise ApcError for every name of an expression that isn't known."""
+    mistakes = Mistakes()
+    for node in names(tree):
+        if known(node.parts) is None:
+            shown = ".".join(node.parts)
+            told = f"{what} names {brief(shown)}, which is no parameter here"
+            add_unknown("E206", place_in(place, text, node.start), told, shown, names_known, mistakes)
+    mistakes.raise_if_any()
+
+
+def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -> Value:
+    """Return what a binding comes to, given what its names come to. Raises ApcError if it has no value."""
+    if binding.expression is None:
+        assert binding.number is not None
+        return Value(binding.number, binding.dimension, None, binding.place)
+    number = Fraction(evaluate(binding.expression, number_of, place=binding.place))
+    return Value(number, binding.dimension, format_expression(binding.expression), binding.place)
+
+
+def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | None:
+    """Read a number of any unit: a quantity, or an expression whose names are checked later."""
+    text = read_text(node, what, mistakes, hint=f"{what}: 2000 N/m")
+    if node is None or text is None:
+        return None
+    try:
+        if is_quantity(text):
+            found = parse_quantity(text, node.place)
+            return Binding(found.value, None, found.unit.dimension, node.place)
+        return Binding(None, parse_expression(text, text_place(node)), DIMENSIONLESS, node.place)
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+
+
+def resolve_in_order(
+    waiting: dict[str, Binding], known: dict[str, Value], peers: int, mistakes: Mistakes
+) -> dict[str, Value]:
+    """Settle named numbers that depend on each other, in the order in which they can be known."""
+    settled = dict(known)
+    left = dict(waiting)
+
+    def dimension(parts: tuple[str, ...]) -> Dimension | None:
+        if parts == PEERS:
+            return DIMENSIONLESS
+        name = ".".join(parts)
+        return settled[name].dimension if name in settled else None
+
+    def number(parts: tuple[str, ...]) -> Fraction:
+        return Fraction(peers) if parts == PEERS else settled[".".join(parts)].number
+
+    faulty: set[str] = set()
+    while left:
+        needs = {
+            name: [n for n in _needed(binding) if n in left or n in faulty] for name, binding in left.items()
+        }
+        ready = [name for name, missing in needs.items() if not missing]
+        if not ready:
+            circular = {name: [n for n in missing if n in left] for name, missing in needs.items()}
+            circular = {name: missing for name, missing in circular.items() if missing}
+            chain = _cycle(circular)
+            if chain:
+                text = " → ".join(chain)
+                mistakes.add("E209", left[chain[0]].place, f"parameters depend in a circle: {text}")
+            return settled
+        for name in ready:
+            binding = left.pop(name)
+            try:
+                settled[name] = _settled(name, binding, dimension, number, ("peers", *settled))
+            except ApcError as error:
+                faulty.add(name)
+                mistakes.take(error)
+    return settled
+
+
+def _settled(
+    name: str,
+    binding: Binding,
+    dimension: Callable[[tuple[str, ...]], Dimension | None],
+    number: Callable[[tuple[str, ...]], Fraction],
+    known: Collection[str],
+) -> Value:
+    if binding.expression is None:
+        return settle(binding, number)
+    text = format_expression(binding.expression)
+    place = binding.place
+    check_names(binding.expression, text, place, name, dimension, known)
+    found = dimension_of(binding.expression, lambda n: dimension(n.parts), text, place)
+    known_dimension = DIMENSIONLESS if found is None or found == ANY else found
+    return settle(Binding(None, binding.expression, known_dimension, place), number)
+
+
+def _needed(binding: Binding) -> list[str]:
+    return [] if binding.expression is None else [".".join(n.parts) for n in names(binding.expression)]
+
+
+def _cycle(needs: dict[str, list[str]]) -> list[str]:
+    """Return a circle in a graph, its first node repeated at the end; empty if a path leads out of it."""
+    if not needs:
+        return []
+    path: list[str] = []
+    name = next(iter(needs))
+    while name not in path:
+        if name not in needs:
+            return []
+        path.append(name)
+        name = needs[name][0]
+    return [*path[path.index(name) :], name]
+
+
+def renamed(tree: Expr, whole: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Expr:
+    """Return an expression with every name made whole."""
+    return transform(tree, lambda node: Name(whole(node.parts)) if isinstance(node, Name) else None)
