@@ -91,11 +91,11 @@ def solve_blocks(
         As many equations as unknowns; a mistake if not.
     where
         What to call the equations in a message: "the continuous equations".
+    mistakes
+        Takes E502 equations or unknowns left over, E503 a loop without an unknown to solve for, E511 linear
+        equations that depend on each other.
     nonzero
-        Parameters that are positive whatever their numbers; preferred as divisors.
-
-    Mistakes: E502 equations or unknowns left over, E503 a loop without an unknown to solve for, E507 linear
-    equations that depend on each other.
+        Parameters that no number can make zero; divisors stay when all others are zero, where possible.
     """
     columns = {unknown: j for j, unknown in enumerate(unknowns)}
     incidence = [sorted(columns[s] for s in r.expression.free_symbols & columns.keys()) for r in residuals]
@@ -127,8 +127,8 @@ class _Solver:
     def __init__(self, where: str, mistakes: Mistakes, nonzero: Set[sympy.Symbol]) -> None:
         self.where = where
         self.mistakes = mistakes
-        self.nonzero = nonzero
         self.is_zero = ZeroTest()
+        self.can_vanish = ZeroTest(nonzero)
 
     def solve(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
         known = frozenset(unknowns)
@@ -151,7 +151,7 @@ class _Solver:
             f"{self.where} depend on each other and don't determine {_some([u.name for u in unknowns])}: "
             f"{_some([residual.shown for residual in block])}"
         )
-        self.mistakes.add("E507", block[0].equation.place, what)
+        self.mistakes.add("E511", block[0].equation.place, what)
 
     # ---- linear ----
 
@@ -160,8 +160,8 @@ class _Solver:
     ) -> list[Step]:
         """Solve by Gaussian elimination with sparse rows; later pivots are assigned first.
 
-        The next pivot is a number if there is one, else plainly not zero, and among these the one that
-        fills in least (Markowitz 1957).
+        The next pivot is one that stays when every parameter that may be zero is, if there is one; of these
+        the one that fills in least (Markowitz 1957), and of several a number. Sizes are not known here.
         """
         place = {unknown: j for j, unknown in enumerate(unknowns)}
         rows = [
@@ -179,11 +179,13 @@ class _Solver:
                 return entry
             short = symbol(f"{unknowns[0].name} by elimination {len(named) + 1}")
             self.is_zero.define(short, entry)
+            self.can_vanish.define(short, entry)
             named.append((short.name, entry))
             return short
 
-        def cost(i: int, j: int) -> tuple[int, int, int, int]:
-            return self._rank(rows[i][j]), (len(rows[i]) - 1) * (len(holders[j]) - 1), i, j
+        def cost(i: int, j: int) -> tuple[bool, int, bool, int, int]:
+            entry, fill = rows[i][j], (len(rows[i]) - 1) * (len(holders[j]) - 1)
+            return self.can_vanish(entry), fill, not entry.is_Number, i, j
 
         heap = [cost(i, j) for i, row in enumerate(rows) for j in row]
         heapq.heapify(heap)
@@ -191,7 +193,7 @@ class _Solver:
         used: set[int] = set()
         while heap:
             entry = heapq.heappop(heap)
-            i, j = entry[2:]
+            i, j = entry[-2:]
             if i in used or i not in holders[j]:
                 continue
             if (current := cost(i, j)) > entry:
@@ -228,35 +230,14 @@ class _Solver:
             solved.append((unknowns[j].name, (right[i] - others) / rows[i][j]))
         return named + solved
 
-    def _rank(self, entry: sympy.Expr) -> int:
-        """Return 0 for a number, 1 for what is plainly not zero, 2 for the rest, as a choice of divisor."""
-        if entry.is_Number:
-            return 0
-        return 1 if self._sign(entry) else 2
-
-    def _sign(self, entry: sympy.Expr) -> int:
-        """Return the sign of an entry, where parameters that are positive settle it, or else 0."""
-        if entry.is_Number:
-            return 1 if entry > 0 else -1 if entry < 0 else 0
-        if entry.is_Symbol:
-            return 1 if entry in self.nonzero else 0
-        if entry.is_Pow and entry.exp.is_Number:
-            base = self._sign(entry.base)
-            return base if base >= 0 or not entry.exp.is_Integer or entry.exp % 2 else 1
-        if entry.is_Mul or entry.is_Add:
-            signs = [self._sign(argument) for argument in entry.args]
-            if entry.is_Mul:
-                return int(sympy.prod(signs))
-            return signs[0] if len(set(signs)) == 1 else 0
-        return 0
-
     # ---- nonlinear ----
 
     def _tear(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
         """Guess as few unknowns as simply found, so that the others follow one by one.
 
         An equation whose only open unknown stands in it linearly, with a factor free of the loop's unknowns,
-        computes it. When there is none, the open unknown that stands in most of the open equations is torn.
+        computes it. When there is none, the open unknown in most of the open equations is torn, of
+        several the one that fewest of them could compute.
         """
         members = frozenset(unknowns)
         held = [set(residual.expression.free_symbols & members) for residual in block]
@@ -269,6 +250,20 @@ class _Solver:
         free = dict.fromkeys(unknowns)
         inner: list[Assignment] = []
         torn: list[sympy.Symbol] = []
+
+        def solvable(coefficient: sympy.Expr) -> bool:
+            return members.isdisjoint(coefficient.free_symbols) and not self.is_zero(coefficient)
+
+        computable: dict[sympy.Symbol, set[int]] = {u: set() for u in unknowns}
+        for i, residual in enumerate(block):
+            for u in held[i]:
+                form = linear_form(residual.expression, frozenset((u,)))
+                if form is not None and solvable(form[0][u]):
+                    computable[u].add(i)
+
+        def gain(unknown: sympy.Symbol) -> tuple[int, int]:
+            rows = [i for i in standing[unknown] if i in left]
+            return len(rows), -sum(i in computable[unknown] for i in rows)
 
         def close(unknown: sympy.Symbol) -> None:
             del free[unknown]
@@ -283,17 +278,15 @@ class _Solver:
                 if i not in left or len(held[i]) != 1:
                     continue
                 [unknown] = held[i]
+                if i not in computable[unknown]:
+                    continue
                 form = linear_form(block[i].expression, frozenset((unknown,)))
-                if form is None:
-                    continue
-                coefficient = form[0][unknown]
-                if coefficient.free_symbols & members or self.is_zero(coefficient):
-                    continue
-                inner.append((unknown.name, -form[1] / coefficient))
+                assert form is not None
+                inner.append((unknown.name, -form[1] / form[0][unknown]))
                 del left[i]
                 close(unknown)
             if free:
-                tear = max(free, key=lambda u: sum(i in left for i in standing[u]))
+                tear = max(free, key=gain)
                 torn.append(tear)
                 close(tear)
         assert len(left) == len(torn), "a matched block has as many equations as unknowns"
@@ -423,7 +416,7 @@ def report_singular(
     parts = []
     place = residuals[0].equation.place if residuals else Place("topology")
     if found.over_rows:
-        place = residuals[found.over_rows[0]].equation.place
+        place = next(r for i, r in enumerate(residuals) if i not in match).equation.place
         count = _count(len(found.over_columns), "unknown")
         named = [unknowns[j] for j in found.over_columns]
         held = f"hold only {count} ({_some(named)})" if named else "hold no unknown"

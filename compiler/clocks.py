@@ -22,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
+from apc.compiler.component import OTHERS
 from apc.compiler.errors import Mistakes
 from apc.compiler.expression import (
     Binary,
@@ -35,7 +36,7 @@ from apc.compiler.expression import (
     names,
     transform,
 )
-from apc.compiler.flatten import OTHERS, FlatEquation, FlatKind, FlatSend, FlatSystem
+from apc.compiler.flatten import FlatEquation, FlatKind, FlatSend, FlatSystem
 from apc.compiler.scene import Scene
 
 CONTINUOUS = "continuous"
@@ -222,18 +223,23 @@ class _Partitioner:
 
     # ---- one pass that finds the clocks ----
 
-    def _visit(self, expression: Expr, domain: str, equation: FlatEquation) -> None:
+    def _visit(self, expression: Expr, domain: str, equation: FlatEquation, *, heard: bool = False) -> None:
+        """Join what ticks together; `heard` is inside a reduction, where alone `others` can be named."""
         if isinstance(expression, Name):
             name = ".".join(expression.parts)
             if name in self.variables:
                 self._join(domain, name, equation)
+            elif expression.parts[0] == OTHERS and not heard:
+                shown = f"others.{expression.parts[-1]}"
+                what = f"{shown} of {equation.origin} is a value of each other peer, and one is due here"
+                self.mistakes.add("E506", equation.place, what, hint=f"mean({shown}), or sum, max, min")
         elif isinstance(expression, Call):
-            self._visit_call(expression, domain, equation)
+            self._visit_call(expression, domain, equation, heard)
         else:
             for child in children(expression):
-                self._visit(child, domain, equation)
+                self._visit(child, domain, equation, heard=heard)
 
-    def _visit_call(self, call: Call, domain: str, equation: FlatEquation) -> None:
+    def _visit_call(self, call: Call, domain: str, equation: FlatEquation, heard: bool) -> None:
         text = format_expression(call)
         if call.function == "sample":
             assert isinstance(call.arguments[1], Name)
@@ -248,7 +254,7 @@ class _Partitioner:
             self._visit(call.arguments[0], domain, equation)
         elif _hears(call):
             for argument in call.arguments:
-                self._visit(argument, domain, equation)
+                self._visit(argument, domain, equation, heard=True)
             if equation.clock is None:
                 what = f"{equation.origin} hears the other peers but has no parameter that names one clock"
                 self.mistakes.add("E504", equation.place, what, hint="parameters: {clock: clock}")
@@ -258,7 +264,7 @@ class _Partitioner:
             if call.function == "previous" and equation.clock is not None:
                 self._pin(domain, equation.clock, text, equation)
             for argument in call.arguments:
-                self._visit(argument, domain, equation)
+                self._visit(argument, domain, equation, heard=heard)
 
     # ---- crossings ----
 
@@ -345,7 +351,7 @@ class _Partitioner:
     # ---- what is heard of the others ----
 
     def _receive(self, call: Call, symbol: str, clock: str, where: FlatEquation | FlatSend) -> Expr:
-        """Take a linear reduction apart, so that N peers cost N; leave another one whole, a pair at a time."""
+        """Take a linear reduction apart, so that N peers cost N; leave another one whole, pair by pair."""
         argument = call.arguments[0]
         if call.function == "count":
             part = next(name.parts[1:] for name in names(call) if name.parts[0] == OTHERS)
@@ -417,7 +423,12 @@ def count_of(link: str) -> str:
 
 
 def _hears(call: Call) -> bool:
-    return call.function in REDUCTIONS and any(name.parts[0] == OTHERS for name in names(call))
+    """Return whether a call reduces the other peers to one value; max(a, b) is of two values, and doesn't."""
+    return (
+        call.function in REDUCTIONS
+        and len(call.arguments) == 1
+        and any(name.parts[0] == OTHERS for name in names(call))
+    )
 
 
 def _without_holds(expression: Expr) -> Expr:

@@ -60,9 +60,10 @@ class PairDelay:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Carries every sender's channels to those who hear it; `delay` is the name of a timing, `clock` of a clock.
+    """Carries every sender's channels to those who hear it.
 
-    `delays` are those pairs of groups for which another delay holds.
+    `clock` is the name of a clock, `delay` of a timing; `delays` are the pairs of groups with a delay of
+    their own.
     """
 
     name: str
@@ -125,9 +126,9 @@ class Receive:
     """Row of r: the `operator` over the others that the peer hears over a link; the newest delivered values.
 
     "mean" and "sum" are weighted by the link's graph. Without an `edge` they are of row `channel` of the
-    link's `SendPartition`, so that a complete graph of N peers costs N. With an `edge`, and always for "max",
-    "min" and "count", the operator runs over `edge(x, u, m, s, p, t)`, one evaluation a pair of peers: x, u, m,
-    p, t are the hearing peer's, s (n_c,) the sending peer's channels of the link.
+    link's `SendPartition`, so that a complete graph of N peers costs N. With an `edge` the operator runs over
+    `edge(x, u, m, s, p, t)`, one evaluation a pair of peers: x, u, m, p, t are the hearing peer's, s (n_c,)
+    the sending peer's channels of the link. "max" and "min" don't look at weights.
     """
 
     name: str

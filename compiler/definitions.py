@@ -35,6 +35,8 @@ from apc.compiler.component import (
 from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
 from apc.compiler.errors import ApcError, Mistakes, Place, nearest
 from apc.compiler.expression import (
+    FUNCTIONS,
+    KEYWORDS,
     Compare,
     Equation,
     Expr,
@@ -73,7 +75,9 @@ COMPONENT_KEYS = (
     "sends",
     "equations",
 )
-RESERVED = frozenset({"peers", "others", "time", "ground", "type", "at", "shared", "count", "set"})
+RESERVED = frozenset(
+    {"peers", "others", "time", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
+)
 Sends = tuple[tuple[str, Expr, str, Place], ...]
 _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
@@ -182,14 +186,19 @@ def _found(name: str, place: Place, library: Definitions, mistakes: Mistakes) ->
     return component
 
 
-Declared = TypeVar("Declared", Parameter, Variable)
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+Declared = TypeVar("Declared", bound=_Named)
 
 
 def _overridden(base: tuple[Declared, ...], own: tuple[Declared, ...]) -> tuple[Declared, ...]:
     """Return the inherited declarations, those declared again replaced in their place, then the new ones."""
-    again = {item.name: item for item in own}
-    known = {item.name for item in base}
-    return (*(again.get(item.name, item) for item in base), *(item for item in own if item.name not in known))
+    merged = {item.name: item for item in base}
+    merged.update({item.name: item for item in own})
+    return tuple(merged.values())
 
 
 def _read_inner(
@@ -207,13 +216,14 @@ def _read_inner(
         if name is not None and body is not None and component is not None:
             bodies[name] = (body, component, key.place)
             faulty.discard(name)
-    dimensions = {(p.name,): p.unit.dimension for p in outer.numbers} | {PEERS: DIMENSIONLESS}
+    dimensions: dict[tuple[str, ...], Dimension] = {(p.name,): p.unit.dimension for p in outer.numbers}
+    dimensions[PEERS] = DIMENSIONLESS
 
     def references(role: str, word: str, place: Place) -> Collection[str]:
         return [p.name for p in outer.parameters if isinstance(p, Reference) and p.role == role]
 
     scope = Scope(
-        dimension=dimensions.get,
+        dimension=lambda parts: dimensions.get(parts),
         names=[".".join(parts) for parts in dimensions],
         references=references,
         parts={name: component for name, (_, component, _) in bodies.items()},
@@ -223,7 +233,8 @@ def _read_inner(
     )
     inner = []
     for name, (body, component, place) in bodies.items():
-        entry = read_entry(name, body, component, place, scope, mistakes, free_connectors=True)
+        free = [connector for connector, _ in component.connectors]
+        entry = read_entry(name, body, component, place, scope, mistakes, free_connectors=free)
         inner.append(Inner(name, component, entry, place))
     passed = [
         (theirs, part.name, own)
@@ -294,9 +305,9 @@ class _Names:
         self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
         for send in component.sends:
             self.dimensions[(OTHERS, send.name)] = send.dimension
-        for parameter in component.parameters:
-            if isinstance(parameter, Reference) and parameter.role == "table":
-                self.dimensions[(parameter.name,)] = parameter.unit.dimension if parameter.unit else None
+        for table in component.parameters:
+            if isinstance(table, Reference) and table.role == "table" and table.unit is not None:
+                self.dimensions[(table.name,)] = table.unit.dimension
 
     def infer_sends(self, sends: Sends, mistakes: Mistakes) -> tuple[Send, ...]:
         """Return the sends with the dimension of what they send."""
@@ -575,7 +586,6 @@ def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
     node = body.get("shared")
     if shared not in (None, "divided", "whole") and node is not None:
         mistakes.add("E203", node.place, "shared", expected="divided or whole", got=brief(shared or ""))
-    default = _declared(body.get("default"), name, unit, mistakes)
     minimum = _declared(body.get("min"), name, unit, mistakes)
     above = _declared(body.get("above"), name, unit, mistakes)
     maximum = _declared(body.get("max"), name, unit, mistakes)
@@ -584,6 +594,9 @@ def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
         number = _declared(value, key.text, unit, mistakes)
         if number is not None:
             words.append((key.text, number))
+    node = body.get("default")
+    named = dict(words).get(node.text) if isinstance(node, Scalar) else None
+    default = named if named is not None else _declared(node, name, unit, mistakes)
     about = read_text(body.get("about"), "about", mistakes) or ""
     if unit is None:
         return None

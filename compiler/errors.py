@@ -11,6 +11,8 @@ import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+SHOWN = 75  # characters of a source line, so that it fits a terminal of 80 with its indent
+
 
 @dataclass(frozen=True, slots=True, order=True)
 class Place:
@@ -52,8 +54,9 @@ class Mistake:
         if not (self.place.line and line.strip()):
             return text
         # A long line is shown around its fault only; a tab or control character would move the caret.
-        start = max(0, self.place.column - 1 - 60)
-        shown = "".join(c if c.isprintable() else " " for c in line[start : start + 100])
+        start = max(0, self.place.column - 1 - SHOWN // 2) if len(line) > SHOWN else 0
+        start = min(start, max(0, len(line) - SHOWN))
+        shown = "".join(c if c.isprintable() else " " for c in line[start : start + SHOWN])
         return f"{text}\n    {shown}\n    {' ' * (self.place.column - 1 - start)}^"
 
     @property

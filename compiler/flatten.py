@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.component import Component, Option, Reference, option_test
+from apc.compiler.component import OTHERS, Component, Option, Reference, option_test
 from apc.compiler.component import Number as NumberParameter
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.expression import (
@@ -32,7 +32,6 @@ from apc.compiler.units import Dimension
 from apc.compiler.values import Value
 
 PEERS = Name(("peers",))
-OTHERS = "others"
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,11 +296,10 @@ def _connections(parts: list[Part], mistakes: Mistakes) -> Iterator[FlatEquation
     In a set with the ground the potentials are zero and the flows are whatever they must be.
     """
     here = {part.name: part for part in parts}
-    passed = {
-        (part.name, connector): (f"{part.name}.{inner}", its)
-        for part in parts
-        for connector, inner, its in part.component.passed
-    }
+    passed: dict[Node, list[Node]] = {}
+    for part in parts:
+        for connector, inner, its in part.component.passed:
+            passed.setdefault((part.name, connector), []).append((f"{part.name}.{inner}", its))
     for members in _meeting(parts, here, passed, mistakes):
         grounded = (GROUND, "") in members
         joined = [node for node in members if node[0] != GROUND and node not in passed]
@@ -330,7 +328,7 @@ def _whole_name(node: Node, variable: str) -> Name:
 
 
 def _meeting(
-    parts: list[Part], here: dict[str, Part], passed: dict[Node, Node], mistakes: Mistakes
+    parts: list[Part], here: dict[str, Part], passed: dict[Node, list[Node]], mistakes: Mistakes
 ) -> Iterator[list[Node]]:
     """Yield the sets of connectors that meet, each read from what is joined to outwards."""
     sets: dict[Node, list[Node]] = {}
@@ -346,8 +344,9 @@ def _meeting(
             for member in mine:
                 sets[member] = other
 
-    for outer, inner in passed.items():
-        join(outer, inner)
+    for outer, inside in passed.items():
+        for inner in inside:
+            join(outer, inner)
     for part in parts:
         for connector, other, its_connector in part.connections:
             own = (part.name, connector)

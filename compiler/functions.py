@@ -2,19 +2,21 @@
 
 Takes: `SortedSystem`. Gives: `CompiledSystem`.
 Guarantees: a kind's functions hold only what its states, its samples and what it sends depend on; what the
-scene named but nothing reads is listed in `dropped`.
+scene named but nothing reads is listed in `dropped`. They are SX functions, unless the kind has a nonlinear
+loop: then they are MX functions, with a Newton solver for each loop inside.
 Does not: write files, or put numbers in the place of parameters.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import casadi
 import sympy
-from apc.compiler.clocks import OTHERS, HoldCrossing, ReceiveCrossing
+from apc.compiler.blocks import ImplicitBlock
+from apc.compiler.clocks import HoldCrossing, ReceiveCrossing
 from apc.compiler.compiled import (
     ClockPartition,
     CompiledSystem,
@@ -25,16 +27,22 @@ from apc.compiler.compiled import (
     SendPartition,
     State,
 )
+from apc.compiler.component import OTHERS
 from apc.compiler.exchange import Timings, all_parameters, compiled_groups, used_clocks, used_links
 from apc.compiler.scene import Scene, TimeTable
 from apc.compiler.structure import SortedKind, SortedSystem
 from apc.compiler.symbolic import derivative_symbol, no_derivative, symbol, to_sympy
 from apc.compiler.units import format_dimension
 
+Definition: TypeAlias = sympy.Expr | ImplicitBlock
+# CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
+# afterwards and squares the error: the rest is rounding. A bound on the residual would depend on its scale.
+NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100}
 _CASADI: dict[str, Callable[..., Any]] = {
     "min": casadi.fmin,
     "max": casadi.fmax,
     "abs": casadi.fabs,
+    "Abs": casadi.fabs,  # what SymPy makes of sqrt(x^2)
     "sign": casadi.sign,
     "floor": casadi.floor,
     "exp": casadi.exp,
@@ -46,12 +54,12 @@ _CASADI: dict[str, Callable[..., Any]] = {
     "and": casadi.logic_and,
     "or": casadi.logic_or,
     "not": casadi.logic_not,
-    "less": casadi.SX.__lt__,
-    "less_or_equal": casadi.SX.__le__,
-    "more": casadi.SX.__gt__,
-    "more_or_equal": casadi.SX.__ge__,
-    "equal": casadi.SX.__eq__,
-    "unequal": casadi.SX.__ne__,
+    "less": operator.lt,
+    "less_or_equal": operator.le,
+    "more": operator.gt,
+    "more_or_equal": operator.ge,
+    "equal": operator.eq,
+    "unequal": operator.ne,
 }
 
 
@@ -123,9 +131,9 @@ class _KindBuilder:
         }
         self.timings = timings
         self.dropped: list[tuple[str, str]] = []
-        self.continuous = {symbol(name): expression for name, expression in kind.partitions[0].assignments}
-        self.clocked = {
-            symbol(name): expression for part in kind.partitions[1:] for name, expression in part.assignments
+        self.continuous: dict[sympy.Symbol, Definition] = kind.partitions[0].definitions
+        self.clocked: dict[sympy.Symbol, Definition] = {
+            s: definition for part in kind.partitions[1:] for s, definition in part.definitions.items()
         }
         self.samples = {symbol(name): expression for name, _, expression in kind.samples}
         self.known_holds = {symbol(hold.symbol): hold for hold in kind.holds}
@@ -164,21 +172,24 @@ class _KindBuilder:
         channels = self._channels(rows)
         states = self.kind.states
         self.dropped += [(name, "nobody hears it") for name in self.sends if name not in rows]
-        x = {symbol(name): casadi.SX.sym(name) for name in states}
-        u = {symbol(hold.symbol): casadi.SX.sym(hold.symbol) for hold in holds}
+        type_: Any = casadi.MX if self._loops() else casadi.SX
+        x = {symbol(name): type_.sym(name) for name in states}
+        u = {symbol(hold.symbol): type_.sym(hold.symbol) for hold in holds}
         names = self._parameter_names(reached, {*x, *u})
-        p = {name: casadi.SX.sym(name) for name in names}
-        time = casadi.SX.sym("time")
-        known = {symbol(name): value for name, value in p.items()} | {
-            symbol(f"initial({name})"): value for name, value in p.items()
-        }
+        p = {name: type_.sym(name) for name in names}
+        time = type_.sym("time")
+        # A start value has the name of its variable; the name itself is what is computed.
+        computed = {*self.continuous, *self.clocked}
+        known = {symbol(name): value for name, value in p.items() if symbol(name) not in computed}
+        known |= {symbol(f"initial({name})"): value for name, value in p.items()}
         known |= {**x, **u, symbol("time"): time}
-        writer = _Writer(known, {**self.continuous, **self.samples}, self.tables)
-        inputs = {"x": _column(x), "u": _column(u), "p": _stack(p.values()), "t": time}
+        writer = _Writer(type_, known, {**self.continuous, **self.samples}, self.tables, p)
+        inputs = {"x": _stack(type_, x.values()), "u": _stack(type_, u.values())}
+        inputs |= {"p": _stack(type_, p.values()), "t": time}
         derivative = casadi.Function(
             "derivative",
             [inputs["x"], inputs["u"], inputs["p"], time],
-            [_stack(writer.write(derivative_symbol(name)) for name in states)],
+            [_stack(type_, (writer.write(derivative_symbol(name)) for name in states))],
             ["x", "u", "p", "t"],
             ["dx"],
         )
@@ -276,7 +287,15 @@ class _KindBuilder:
         starts = set(self.kind.states)
         starts |= {previous.variable for s, previous in self.known_previous.items() if s in reached}
         starts |= {name[8:-1] for name in free if name.startswith("initial(")}
+        guessed = {name for loop in self._loops() for name in loop.tearing}
+        starts |= {v.name for v in self.kind.clocked.flat.variables if v.start and v.name in guessed}
         return sorted({name for name in free if not name.startswith("initial(")} | starts)
+
+    def _loops(self) -> list[ImplicitBlock]:
+        """Return the nonlinear loops that the kind's functions have to solve."""
+        tables = (self.continuous, self.clocked)
+        found = (table[s] for s in self.reached for table in tables if s in table)
+        return [definition for definition in found if isinstance(definition, ImplicitBlock)]
 
     def _clock(
         self,
@@ -285,7 +304,7 @@ class _KindBuilder:
         receives: dict[sympy.Symbol, Any],
         channels: dict[str, tuple[str, int]],
         writer: _Writer,
-        inputs: dict[str, casadi.SX],
+        inputs: dict[str, Any],
     ) -> ClockPartition:
         heard = {s: receive for s, receive in receives.items() if receive.clock == clock}
         remembered = {
@@ -293,14 +312,22 @@ class _KindBuilder:
             for s, previous in self.known_previous.items()
             if previous.clock == clock and previous.variable in outputs
         }
-        r = {s: casadi.SX.sym(s.name) for s in heard}
-        m = {s: casadi.SX.sym(s.name) for s in remembered}
+        type_ = writer.type_
+        r = {s: type_.sym(s.name) for s in heard}
+        m = {s: type_.sym(s.name) for s in remembered}
         own = writer.extended({**r, **m}, self.clocked)
         alone = writer.extended(m, self.clocked)  # what one pair of peers knows: nothing that is heard
         tick = casadi.Function(
             f"tick_{clock}",
-            [inputs["x"], inputs["u"], _column(m), _column(r), inputs["p"], inputs["t"]],
-            [_stack(own.write(symbol(name)) for name in outputs)],
+            [
+                inputs["x"],
+                inputs["u"],
+                own.column(m.values()),
+                own.column(r.values()),
+                inputs["p"],
+                inputs["t"],
+            ],
+            [own.column(own.write(symbol(name)) for name in outputs)],
             ["x", "u", "m", "r", "p", "t"],
             ["y"],
         )
@@ -328,12 +355,12 @@ class _KindBuilder:
         receive: ReceiveCrossing,
         channels: dict[str, tuple[str, int]],
         writer: _Writer,
-        remembered: dict[sympy.Symbol, casadi.SX],
-        inputs: dict[str, casadi.SX],
+        remembered: dict[sympy.Symbol, Any],
+        inputs: dict[str, Any],
     ) -> Any:
         """Write what a reduction runs over, for one peer that hears and one that is heard."""
         size = 1 + max(row for link, row in channels.values() if link == receive.link)
-        sent = casadi.SX.sym("s", size)
+        sent = writer.type_.sym("s", size)
         theirs = {
             symbol(f"{OTHERS}.{name}"): sent[row]
             for name, (link, row) in channels.items()
@@ -342,14 +369,14 @@ class _KindBuilder:
         own = writer.extended(theirs, {})
         return casadi.Function(
             "edge",
-            [inputs["x"], inputs["u"], _column(remembered), sent, inputs["p"], inputs["t"]],
+            [inputs["x"], inputs["u"], own.column(remembered.values()), sent, inputs["p"], inputs["t"]],
             [own.translate(self.edges[s])],
             ["x", "u", "m", "s", "p", "t"],
             ["value"],
         )
 
     def _send(
-        self, link: str, channels: dict[str, tuple[str, int]], writer: _Writer, inputs: dict[str, casadi.SX]
+        self, link: str, channels: dict[str, tuple[str, int]], writer: _Writer, inputs: dict[str, Any]
     ) -> SendPartition:
         first: dict[int, str] = {}
         for name, (its_link, row) in channels.items():
@@ -359,7 +386,7 @@ class _KindBuilder:
         send = casadi.Function(
             f"send_{link}",
             [inputs["x"], inputs["u"], inputs["p"], inputs["t"]],
-            [_stack(writer.translate(self.sends[name].expression) for name in names)],
+            [writer.column(writer.translate(self.sends[name].expression) for name in names)],
             ["x", "u", "p", "t"],
             ["s"],
         )
@@ -374,36 +401,46 @@ def _others(expression: sympy.Expr | None) -> list[str]:
     return sorted(s.name.removeprefix(prefix) for s in expression.free_symbols if s.name.startswith(prefix))
 
 
-def _column(symbols: dict[sympy.Symbol, casadi.SX]) -> casadi.SX:
-    return _stack(symbols.values())
-
-
-def _stack(values: Iterable[casadi.SX]) -> casadi.SX:
+def _stack(type_: Any, values: Iterable[Any]) -> Any:
     """Return a dense column of scalars, (0, 1) when there are none."""
     listed = list(values)
-    return casadi.densify(casadi.vertcat(*listed)) if listed else casadi.SX.zeros(0, 1)
+    return casadi.densify(casadi.vertcat(*listed)) if listed else type_(0, 1)
 
 
 class _Writer:
-    """Translates SymPy expressions to CasADi, each definition once."""
+    """Translates SymPy expressions to CasADi, each definition once.
+
+    `type_` is casadi.SX, or casadi.MX where a definition is a loop; `starts` gives the start values of the
+    unknowns that have one, where a loop's iteration begins.
+    """
 
     def __init__(
         self,
-        known: dict[sympy.Symbol, casadi.SX],
-        definitions: dict[sympy.Symbol, sympy.Expr],
-        tables: dict[str, TimeTable],
+        type_: Any,
+        known: Mapping[sympy.Symbol, Any],
+        definitions: Mapping[sympy.Symbol, Definition],
+        tables: Mapping[str, TimeTable],
+        starts: Mapping[str, Any],
     ) -> None:
+        self.type_ = type_
         self.known = dict(known)
         self.definitions = definitions
         self.tables = tables
+        self.starts = starts
+
+    def column(self, values: Iterable[Any]) -> Any:
+        """Return a dense column of scalars."""
+        return _stack(self.type_, values)
 
     def extended(
-        self, known: dict[sympy.Symbol, casadi.SX], definitions: dict[sympy.Symbol, sympy.Expr]
+        self, known: Mapping[sympy.Symbol, Any], definitions: Mapping[sympy.Symbol, Definition]
     ) -> _Writer:
         """Return a writer that knows more."""
-        return _Writer({**self.known, **known}, {**self.definitions, **definitions}, self.tables)
+        return _Writer(
+            self.type_, {**self.known, **known}, {**self.definitions, **definitions}, self.tables, self.starts
+        )
 
-    def write(self, wanted: sympy.Symbol) -> casadi.SX:
+    def write(self, wanted: sympy.Symbol) -> Any:
         """Return the value of a symbol, writing what it depends on first.
 
         A stack instead of recursion, so that the length of a chain of definitions is no limit.
@@ -418,25 +455,46 @@ class _Writer:
             if missing:
                 work += missing
             else:
-                self.known[s] = self._build(self.definitions[s])
-        value: casadi.SX = self.known[wanted]
-        return value
+                definition = self.definitions[s]
+                if isinstance(definition, ImplicitBlock):
+                    self.known |= self._solve(definition)
+                else:
+                    self.known[s] = self._build(definition)
+        return self.known[wanted]
 
-    def translate(self, expression: sympy.Expr) -> casadi.SX:
+    def _solve(self, loop: ImplicitBlock) -> dict[sympy.Symbol, Any]:
+        """Return the unknowns of a loop: those torn by Newton's iteration, the others from them."""
+        outer = self._needed(loop)
+        own = {symbol(name): casadi.SX.sym(name) for name in loop.tearing}
+        given = {s: casadi.SX.sym(s.name) for s in outer}
+        others = {symbol(name): expression for name, expression in loop.inner}
+        inside = _Writer(casadi.SX, {**own, **given}, others, self.tables, {})
+        z, q = inside.column(own.values()), inside.column(given.values())
+        residual = inside.column(inside.translate(expression) for expression in loop.residuals)
+        solver = casadi.rootfinder("loop", "newton", {"x": z, "p": q, "g": residual}, NEWTON)
+        last_step = casadi.solve(casadi.jacobian(residual, z), residual)
+        polish = casadi.Function("polish", [z, q], [z - last_step])
+        rest = casadi.Function("rest", [z, q], [inside.column(inside.write(s) for s in others)])
+        guess = self.column(self.starts.get(name, self.type_(0)) for name in loop.tearing)
+        values = self.column(self.known[s] for s in outer)
+        torn = polish(solver(x0=guess, p=values)["x"], values)
+        found = rest(torn, values)
+        return {s: torn[i] for i, s in enumerate(own)} | {s: found[i] for i, s in enumerate(others)}
+
+    def translate(self, expression: sympy.Expr) -> Any:
         """Return the value of an expression."""
         for s in self._needed(expression):
             self.write(s)
         return self._build(expression)
 
-    def _needed(self, expression: sympy.Expr) -> list[sympy.Symbol]:
+    def _needed(self, expression: Definition) -> list[sympy.Symbol]:
         return sorted((s for s in expression.free_symbols if s.name not in self.tables), key=str)
 
-    def _build(self, expression: sympy.Expr) -> casadi.SX:
+    def _build(self, expression: sympy.Expr) -> Any:
         if expression.is_Symbol:
-            known: casadi.SX = self.known[expression]
-            return known
-        if expression.is_Number:
-            return casadi.SX(float(expression))
+            return self.known[expression]
+        if expression.is_number and not expression.args:
+            return self.type_(float(expression))
         if expression.is_Mul:
             return self._product(expression)
         if expression.func.__name__ == "interpolate":
@@ -446,26 +504,24 @@ class _Writer:
             return _fold(arguments, operator.add)
         if expression.is_Pow:
             return _power(arguments[0], expression.exp, arguments[1])
-        value: casadi.SX = _CASADI[expression.func.__name__](*arguments)
-        return value
+        return _CASADI[expression.func.__name__](*arguments)
 
-    def _interpolated(self, table: sympy.Symbol, time: sympy.Expr) -> casadi.SX:
+    def _interpolated(self, table: sympy.Symbol, time: sympy.Expr) -> Any:
         """Return a table's value, linear between its rows and constant beyond its ends."""
         found = self.tables[table.name]
         start, end = found.times[0], found.times[-1]
         inside = casadi.fmin(casadi.fmax(self._build(time), start), end)
-        value: casadi.SX = casadi.pw_lin(inside, found.times.tolist(), found.numbers.tolist())
-        return value
+        return casadi.pw_lin(inside, found.times.tolist(), found.numbers.tolist())
 
-    def _product(self, expression: sympy.Expr) -> casadi.SX:
+    def _product(self, expression: sympy.Expr) -> Any:
         """Return a product, dividing by its factors of negative power: a/b rounds once, a*b**-1 twice."""
         above = [self._build(node) for node in expression.args if not _is_reciprocal(node)]
         below = [self._build(1 / node) for node in expression.args if _is_reciprocal(node)]
-        product = _fold(above, operator.mul) if above else casadi.SX(1)
+        product = _fold(above, operator.mul) if above else self.type_(1)
         return product / _fold(below, operator.mul) if below else product
 
 
-def _fold(values: Sequence[casadi.SX], join: Callable[[casadi.SX, casadi.SX], casadi.SX]) -> casadi.SX:
+def _fold(values: Sequence[Any], join: Callable[[Any, Any], Any]) -> Any:
     total = values[0]
     for value in values[1:]:
         total = join(total, value)
@@ -476,7 +532,7 @@ def _is_reciprocal(node: sympy.Expr) -> bool:
     return bool(node.is_Pow and node.exp.is_Number and node.exp.is_negative)
 
 
-def _power(base: casadi.SX, exponent: sympy.Expr, written: casadi.SX) -> casadi.SX:
+def _power(base: Any, exponent: sympy.Expr, written: Any) -> Any:
     if exponent == -1:
         return 1 / base
     if exponent == sympy.Rational(1, 2):

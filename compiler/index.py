@@ -17,13 +17,14 @@ start value of a chosen state counts; the variables that depend on it follow, wh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import sympy
 from apc.compiler.blocks import Residual, match_columns, report_singular
 from apc.compiler.errors import Mistakes
 from apc.compiler.symbolic import (
+    NoDerivativeError,
     ZeroTest,
     derivative_symbol,
     differential,
@@ -38,17 +39,49 @@ TIME = symbol("time")
 Jet = tuple[str, int]  # a variable and how often it is differentiated
 
 
-class JumpError(Exception):
-    """The derivative of a value that jumps was asked for."""
-
-
 class Jets:
-    """The symbols of variables and of their derivatives, `x`, `der(x)`, `der(der(x))`, both ways."""
+    """The symbols of variables and of their derivatives, `x`, `der(x)`, `der(der(x))`, both ways.
 
-    def __init__(self, names: Iterable[str], jumping: Iterable[str] = ()) -> None:
-        self._jets: dict[sympy.Symbol, Jet] = {symbol(name): (name, 0) for name in names}
+    `velocities` gives derivatives their own names: with {x: v} they are `x`, `v`, `der(v)`, and v is no
+    variable of its own. `jumping` are the symbols of held forces.
+    """
+
+    def __init__(
+        self, names: Iterable[str], jumping: Iterable[str], velocities: Mapping[str, str] | None = None
+    ) -> None:
+        velocities = velocities or {}
+        derived = set(velocities.values())
+        self.names = [name for name in names if name not in derived]
+        self._jets: dict[sympy.Symbol, Jet] = {}
+        self._named: dict[str, int] = {}
+        for name in self.names:
+            self._jets[symbol(name)] = (name, 0)
+            own, order = name, 0
+            while own in velocities:
+                own, order = velocities[own], order + 1
+                self._jets[symbol(own)] = (name, order)
+                self._named[name] = order
         self._symbols = {jet: s for s, jet in self._jets.items()}
         self._jumping = {symbol(name) for name in jumping}
+
+    def renamed(self, names: Iterable[str], velocities: Mapping[str, str]) -> Jets:
+        """Return the jets of some of the variables, where `velocities` name derivatives."""
+        kept = Jets(names, (), velocities)
+        kept._jumping = self._jumping
+        for name, order in self._symbols:
+            if symbol(name) in kept._jets:
+                root, first = kept._jets[symbol(name)]
+                kept.symbol(root, first + order)
+        return kept
+
+    def named_order(self, name: str) -> int:
+        """Return how many derivatives of a variable have names of their own."""
+        return self._named.get(name, 0)
+
+    def add(self, name: str) -> sympy.Symbol:
+        """Add a variable and return its symbol."""
+        self.names.append(name)
+        return self.symbol(name, 0)
 
     def symbol(self, name: str, order: int) -> sympy.Symbol:
         """Return the symbol of a derivative of a variable."""
@@ -65,14 +98,12 @@ class Jets:
         return {s: self._jets[s] for s in sorted(found, key=str)}
 
     def differentiate(self, expression: sympy.Expr) -> sympy.Expr:
-        """Return the time derivative; raise JumpError for one that a held force would have to give."""
-        if any(call.func.__name__ in ("hold", "sample") for call in expression.atoms(sympy.Function)):
-            raise JumpError(str(expression))
+        """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""
         return differential(expression, self._rate)
 
     def _rate(self, s: sympy.Symbol) -> sympy.Expr:
         if s in self._jumping:
-            raise JumpError(s.name)
+            raise NoDerivativeError(s.name, "a force that jumps at its ticks")
         if s in self._jets:
             name, order = self._jets[s]
             return self.symbol(name, order + 1)
@@ -105,12 +136,12 @@ def reduce_index(
     started
         The variables with a declared start value.
     jets
-        Knows the symbols of `names`.
+        Knows the symbols of `names` and of their derivatives.
     where
         What to call the equations in a message.
-
-    Mistakes: E502 equations or unknowns left over or constraints that say the same, E508 the derivative of a
-    value that jumps, E509 states that can't be chosen once and for all.
+    mistakes
+        Takes E502 equations or unknowns left over or constraints that say the same, E508 the derivative of a
+        value that jumps, E509 states that can't be chosen once and for all.
     """
     column = {name: j for j, name in enumerate(names)}
     incidence = [sorted({column[n] for n, _ in jets.jets(r.expression).values()}) for r in residuals]
@@ -146,7 +177,8 @@ class _System:
         self.held: list[dict[str, int]] = []  # for each equation, its variables and their highest orders
         self.derivative: dict[int, int] = {}  # equation -> its derivative
         self.integral: dict[int, int] = {}  # and back
-        self.order = dict.fromkeys(names, 0)
+        # A derivative with a name of its own is asked for, even if no equation holds it.
+        self.order = {name: jets.named_order(name) for name in names}
         for residual in residuals:
             self._hold(residual)
         for orders in self.held:
@@ -211,8 +243,8 @@ class _System:
         residual = self.residuals[row]
         try:
             expression = self.jets.differentiate(residual.expression)
-        except JumpError as jump:
-            report_jump(residual, jump, mistakes)
+        except NoDerivativeError as missing:
+            report_no_derivative(residual, missing, mistakes)
             return False
         self.derivative[row], self.integral[len(self.residuals)] = len(self.residuals), row
         made = Residual(expression, residual.equation)
@@ -237,7 +269,7 @@ class _System:
 
         def wanted_last(jet: Jet) -> tuple[bool, int, int]:
             name, order = jet
-            return order == 1 and name in started, -order, -rank[name]
+            return self.jets.symbol(name, order - 1).name in started, -order, -rank[name]
 
         chosen: set[Jet] = set()
         rows = [row for row in self.integral if row not in self.derivative]
@@ -305,7 +337,7 @@ class _System:
             residual = self.residuals[row]
             if entries:
                 factors = ", ".join(
-                    f"{name} (by the factor {sympy.sstr(c)})" for (name, _), c in entries.items()
+                    f"{name} (by the factor {sympy.sstr(c)})" for (name, _), c in sorted(entries.items())
                 )
                 what = (
                     f"{where}: no variable follows from the constraint {residual.shown} in every position, "
@@ -318,10 +350,8 @@ class _System:
                 mistakes.add("E502", residual.equation.place, what)
 
 
-def report_jump(residual: Residual, jump: JumpError, mistakes: Mistakes) -> None:
-    """Add the mistake E508: an equation's derivative needs that of a value that jumps."""
-    what = (
-        f"{residual.shown} needs the derivative of {jump}, a value that jumps at its ticks; "
-        "a position can follow a force only through a mass"
-    )
-    mistakes.add("E508", residual.equation.place, what)
+def report_no_derivative(residual: Residual, missing: NoDerivativeError, mistakes: Mistakes) -> None:
+    """Add the mistake E508: an equation's derivative is needed, and what it holds has none."""
+    what = f"{residual.shown} needs the derivative of {missing}"
+    why = "a position follows such a force only through a mass"
+    mistakes.add("E508", residual.equation.place, f"{what}; {why}")

@@ -7,9 +7,9 @@ Does not: read what is in a definition (see `definitions`).
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 
+from apc.compiler.cache import builtin_files
 from apc.compiler.component import Component, Connector
 from apc.compiler.definitions import read_component, read_connector
 from apc.compiler.errors import ApcError, Mistake
@@ -28,10 +28,8 @@ class Library:
         self._texts: dict[str, str] = {}
         self._components: dict[str, Component] = {}
         self._connectors: dict[str, Connector] = {}
-        self._files: dict[str, Path] = {}
+        self._files: dict[str, Path] = dict(builtin_files())
         self._open: list[str] = []  # the components being read, each asked for by the one before
-        for path in _builtin_files():
-            self._files["".join(word.capitalize() for word in path.stem.split("-"))] = path
         for folder in folders:
             for path in sorted(folder.rglob("*.yaml")):
                 source = read_source(path)
@@ -91,16 +89,6 @@ class Library:
             self._sources[name] = parse_source(path.read_bytes(), file=path.name, path=path)
         self._texts[name] = self._sources[name].digest
         return self._sources[name]
-
-
-@functools.cache
-def _builtin_files() -> tuple[Path, ...]:
-    root = Path(__file__).resolve().parent
-    # Beside the compiler in a checkout and in an installed package alike.
-    models = root.parent / "models"
-    return tuple(
-        path for path in sorted(models.rglob("*.yaml")) if "scenes" not in path.relative_to(models).parts
-    )
 
 
 def _title(source: Source) -> str | None:

@@ -13,15 +13,16 @@ from typing import Any
 
 import casadi
 import sympy
-from apc.compiler.clocks import ClockedSystem
+from apc.compiler.blocks import Assignment, ImplicitBlock
+from apc.compiler.clocks import ClockedSystem, ReceiveCrossing
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.expression import format_expression
 from apc.compiler.flatten import FlatKind, FlatSystem
 from apc.compiler.scene import Scene
-from apc.compiler.values import Value
 from apc.compiler.source import Mapping, Node, Scalar, Source
 from apc.compiler.structure import SortedSystem
 from apc.compiler.units import format_dimension
+from apc.compiler.values import Value
 
 
 @singledispatch
@@ -106,9 +107,14 @@ def _(clocked: ClockedSystem) -> str:
             f"  hold of {h.clock}: {h.variable}, after {format_expression(h.delay)} s" for h in kind.holds
         ]
         lines += [f"  previous on {p.clock}: {p.variable}" for p in kind.previous]
-        lines += [f"  receive on {r.clock} over {r.link}: {r.operator} of {r.send}" for r in kind.receives]
+        lines += [f"  receive on {r.clock} over {r.link}: {_heard(r)}" for r in kind.receives]
         lines += [f"  send over {s.link}: {s.name} = {format_expression(s.expression)}" for s in kind.sends]
     return "\n".join(lines)
+
+
+def _heard(receive: ReceiveCrossing) -> str:
+    what = receive.send if receive.edge is None else format_expression(receive.edge)
+    return f"{receive.operator} of {what}"
 
 
 @describe.register
@@ -116,16 +122,28 @@ def _(system: SortedSystem) -> str:
     lines = []
     for kind in system.kinds:
         lines.append(f"kind {kind.clocked.flat.name}: states {', '.join(kind.states)}")
-        lines += [f"  alias {name} = {_plain(expression)}" for name, expression in kind.aliases]
+        lines += [f"  alias {name} = {plain(expression)}" for name, expression in kind.aliases]
         for partition in kind.partitions:
             lines.append(f"  {partition.clock}:")
-            lines += [f"    {name} := {_plain(expression)}" for name, expression in partition.assignments]
-        lines += [f"  {name} := {_plain(expression)}" for name, _, expression in kind.samples]
-        lines += [f"  send over {s.link}: {s.name} := {_plain(s.expression)}" for s in kind.sends]
+            lines += [line for step in partition.assignments for line in step_lines(step)]
+        lines += [f"  {name} := {plain(expression)}" for name, _, expression in kind.samples]
+        lines += [f"  send over {s.link}: {s.name} := {plain(s.expression)}" for s in kind.sends]
     return "\n".join(lines)
 
 
-def _plain(expression: sympy.Expr) -> str:
+def step_lines(step: Assignment | ImplicitBlock) -> Iterator[str]:
+    """Yield an assignment, or a nonlinear loop: its chain, then what is computed on the way round."""
+    if not isinstance(step, ImplicitBlock):
+        yield f"    {step[0]} := {plain(step[1])}"
+        return
+    yield f"    loop {step.chain}"
+    yield from (f"      guess {name}" for name in step.tearing)
+    yield from (f"      {name} := {plain(expression)}" for name, expression in step.inner)
+    yield from (f"      until 0 = {plain(expression)}" for expression in step.residuals)
+
+
+def plain(expression: sympy.Expr) -> str:
+    """Return an expression as text, terms and factors in a fixed order."""
     return str(sympy.sstr(expression, order="lex"))
 
 
@@ -147,5 +165,7 @@ def _(system: CompiledSystem) -> str:
 
 def _function_lines(function: Any, names: Iterable[str]) -> Iterator[str]:
     yield f"  {function}"
+    if not function.is_a("SXFunction"):
+        return  # it solves a loop: a graph of matrices, whose entries have no text of their own
     values = function(*function.sx_in())
     yield from (f"    {name} = {casadi.SX(values[row])}" for row, name in enumerate(names))

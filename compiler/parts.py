@@ -57,7 +57,7 @@ def read_entry(
     more_keys: Collection[str] = (),
     index: int = 1,
     count: int | None = None,
-    free_connectors: bool = False,
+    free_connectors: Collection[str] = (),
 ) -> Entry:
     """Read the entry of a part.
 
@@ -76,7 +76,7 @@ def read_entry(
     index, count
         Which element of an array of how many this is; `count` None for a part that is no array.
     free_connectors
-        Whether its connectors may be left unjoined, as those of a mass.
+        Those of its connectors that may be left unjoined here, as those of a mass.
     """
     connectors = dict(component.connectors)
     parameters = [p.name for p in component.parameters]
@@ -98,7 +98,7 @@ def read_entry(
             word = reader.option(parameter)
             if word is not None:
                 options.append((parameter.name, word))
-        elif parameter.role in ("clock", "link"):
+        elif parameter.role in ("clock", "link") or (parameter.role == "table" and scope.outer is not None):
             target = reader.reference(parameter)
             if target is not None:
                 references.append((parameter.name, target))
@@ -113,8 +113,11 @@ def read_entry(
     connections = [
         joined
         for connector, type_ in component.connectors
-        if (joined := reader.connection(connector, type_.name, free_connectors)) is not None
+        if (joined := reader.connection(connector, type_.name, connector in free_connectors)) is not None
     ]
+    targets = [(part, its) for _, part, its in connections if part != GROUND]
+    if len(targets) > 1 and len(set(targets)) == 1:
+        mistakes.add("E210", place, f"{name} joins {targets[0][0]} to itself", hint="two different parts")
     return Entry(
         tuple(values), tuple(options), tuple(references), tuple(described), tuple(starts), tuple(connections)
     )
@@ -194,6 +197,13 @@ class _EntryReader:
         word = read_text(node, parameter.name, self.mistakes)
         if word is None:
             return None
+        outer = self.scope.outer.parameter(word) if self.scope.outer is not None else None
+        if isinstance(outer, Reference) and parameter.unit is not None and outer.unit is not None:
+            # A table handed on to a part inside: only here do the two units meet.
+            if outer.unit.dimension != parameter.unit.dimension:
+                expected, got = parameter.unit.text, outer.unit.text
+                self.mistakes.add("E204", node.place, parameter.name, expected=expected, got=got)
+            return word
         known_names = self.scope.references(parameter.role, word, node.place)
         if known_names is None or word in known_names:
             return word

@@ -1,22 +1,24 @@
 """The stages one after another: a topology file to a compiled model, or to any stage before it.
 
-Takes: a path. Gives: the value of the last stage asked for.
+Takes: a path. Gives: the value of the last stage asked for, or every one on the way.
 Guarantees: each stage sees only the value of the one before.
 Does not: save anything.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
+from apc.compiler.cache import origin_texts
 from apc.compiler.clocks import ClockedSystem, partition
 from apc.compiler.compiled import CompiledSystem, Origin
 from apc.compiler.flatten import FlatSystem, flatten
 from apc.compiler.functions import build_functions
 from apc.compiler.library import Library
 from apc.compiler.scene import Scene, build_scene, library_folders
-from apc.compiler.source import Source, read_source
+from apc.compiler.source import Mapping, Scalar, Sequence, Source, read_source
 from apc.compiler.structure import SortedSystem, sort
 
 Stage = Literal["source", "scene", "flat", "clocked", "sorted", "compiled"]
@@ -32,23 +34,32 @@ def compile_topology(path: Path) -> CompiledSystem:
 
 
 def run_stages(path: Path, *, until: Stage) -> StageValue:
-    """Run the stages up to and including `until`. Raises ApcError with the mistakes of the first that fails."""
+    """Run the stages up to and including `until`. Raises ApcError with the mistakes of one that fails."""
+    return next(value for stage, value in each_stage(path) if stage == until)
+
+
+def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
+    """Run the stages one by one, yielding each one's name and value as soon as it is done."""
     source = read_source(path)
-    if until == "source":
-        return source
+    yield "source", source
     library = Library(library_folders(source))
     scene = build_scene(source, library)
-    if until == "scene":
-        return scene
+    yield "scene", scene
     flat = flatten(scene)
-    if until == "flat":
-        return flat
+    yield "flat", flat
     clocked = partition(flat)
-    if until == "clocked":
-        return clocked
+    yield "clocked", clocked
     sorted_system = sort(clocked)
-    if until == "sorted":
-        return sorted_system
-    return build_functions(
-        sorted_system, Origin(path.name, ((path.name, source.digest), *scene.texts, *library.texts))
+    yield "sorted", sorted_system
+    texts = origin_texts(
+        (path.name, source.digest), scene.texts, _folders_named(source), library.texts, path.parent
     )
+    yield "compiled", build_functions(sorted_system, Origin(path.name, texts))
+
+
+def _folders_named(source: Source) -> Iterator[str]:
+    """Yield the folders of components as the topology names them."""
+    node = source.root.get("library") if isinstance(source.root, Mapping) else None
+    for item in node.items if isinstance(node, Sequence) else (node,):
+        if isinstance(item, Scalar):
+            yield item.text

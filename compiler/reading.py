@@ -22,7 +22,9 @@ def form(node: Node) -> str:
         return "a mapping"
     if isinstance(node, Sequence):
         return "a list"
-    return f"{brief(node.text)}" if node.text.strip() else "nothing"
+    if node.value is None or not node.text.strip():
+        return "nothing"
+    return brief(node.text) if node.plain else f'"{brief(node.text)}"'
 
 
 def brief(text: str) -> str:
@@ -43,14 +45,14 @@ def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "
     """Return the text of a scalar that isn't empty."""
     if node is None:
         return None
-    if isinstance(node, Scalar) and node.text.strip():
+    if isinstance(node, Scalar) and node.text.strip() and node.value is not None:
         return node.text
     mistakes.add("E203", node.place, what, expected="a single value", got=form(node), hint=hint)
     return None
 
 
 def read_name(node: Scalar, what: str, mistakes: Mistakes) -> str | None:
-    """Return the text of a scalar when it can serve as a name: a letter, then letters, digits, underscores."""
+    """Return the text of a scalar that can serve as a name: a letter, then letters, digits, underscores."""
     if IDENTIFIER.match(node.text):
         return node.text
     mistakes.add(

@@ -10,16 +10,17 @@ Does not: look into a component's equations.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+from apc.compiler.compiled import Graph
 from apc.compiler.component import Component, Number, Option, Reference, Variable
-from apc.compiler.definitions import read_type
+from apc.compiler.definitions import RESERVED, read_type
 from apc.compiler.dimensions import SECOND
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.graphs import COMPLETE, Graph, PairDelay, read_graph, read_pairs
+from apc.compiler.graphs import COMPLETE, PairDelay, read_graph, read_pairs
 from apc.compiler.groups import Columns, GroupBody, read_counts, read_settings
 from apc.compiler.library import Library
 from apc.compiler.parts import LARGEST_ARRAY, Scope, read_entry
@@ -38,6 +39,7 @@ from apc.compiler.tables import read_table
 from apc.compiler.units import DIMENSIONLESS, Dimension
 from apc.compiler.values import (
     PEERS,
+    AlreadyReportedError,
     Binding,
     Value,
     read_binding,
@@ -238,6 +240,7 @@ class _Reader:
         self.bodies: dict[str, _Body] = {}
         self.groups: dict[str, GroupBody] = {}
         self.faulty: set[str] = set()  # parts that are there but can't be read: reported once, there
+        self.faulty_names: set[str] = set()  # parameters without a value, likewise
         self.texts: dict[str, str] = {}
 
     @property
@@ -292,7 +295,10 @@ class _Reader:
     def _dimension(self, parts: tuple[str, ...]) -> Dimension | None:
         if parts == PEERS:
             return DIMENSIONLESS
-        value = self.parameters.get(".".join(parts))
+        name = ".".join(parts)
+        if name in self.faulty_names:
+            raise AlreadyReportedError
+        value = self.parameters.get(name)
         return None if value is None else value.dimension
 
     def _number(self, parts: tuple[str, ...]) -> Fraction:
@@ -332,16 +338,22 @@ class _Reader:
         for key, value in entries(section):
             name = read_name(key, "a parameter", self.mistakes)
             binding = read_free(value, key.text, self.mistakes)
-            if name in ("peers", "time", "others", "ground"):
+            if name in RESERVED:
                 self.mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
             elif name is not None and binding is not None:
                 waiting[name] = binding
-        self.parameters = resolve_in_order(waiting, {}, sum(self.counts.values()), self.mistakes)
+                continue
+            self.faulty_names.add(key.text)
+        self.parameters, faulty = resolve_in_order(waiting, sum(self.counts.values()), self.mistakes)
+        self.faulty_names |= faulty
 
     def _read_clocks(self, node: Node | None) -> None:
         for key, value in entries(read_mapping(node, "clocks", self.mistakes, hint="clocks: {haptic: 1 ms}")):
             name = read_name(key, "a clock", self.mistakes)
             if name is None:
+                continue
+            if name in RESERVED or name in self.parameters or name in self.groups:
+                self.mistakes.add("E205", key.place, f"the name {name} is used twice in this topology")
                 continue
             phase: Value | None = Value(Fraction(0), SECOND, None, value.place)
             if isinstance(value, Mapping):
@@ -384,7 +396,7 @@ class _Reader:
             if name in self.bodies or name in self.clocks or name in self.parameters or name in self.groups:
                 self.mistakes.add("E205", key.place, f"the name {name} is used twice in this topology")
                 continue
-            if name in ("peers", "time", "others", "ground"):
+            if name in RESERVED:
                 self.mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
                 continue
             component = read_type(key, body, DEFAULT_TYPES.get(section), self.library, self.mistakes)
@@ -460,7 +472,7 @@ class _Reader:
                 more_keys=PART_KEYS,
                 index=index,
                 count=entry.count,
-                free_connectors=entry.section == "masses",
+                free_connectors=self._free_connectors(name, entry),
             )
             part = Part(
                 name if entry.count is None else f"{name}[{index}]",
@@ -478,6 +490,19 @@ class _Reader:
             )
             found += self._with_inner(part)
         return found
+
+    def _free_connectors(self, name: str, entry: _Body) -> Collection[str]:
+        """Return the connectors an entry need not mention: a mass's, and those another entry is joined to."""
+        connectors = [connector for connector, _ in entry.component.connectors]
+        if entry.section == "masses":
+            return connectors
+        named = {
+            value.text
+            for other in self.bodies.values()
+            for _, value in other.body.entries
+            if isinstance(value, Scalar)
+        }
+        return [connector for connector in connectors if f"{name}.{connector}" in named]
 
     def _settled_all(
         self, bindings: Collection[tuple[str, Binding]], component: Component | None
@@ -498,6 +523,7 @@ class _Reader:
         found = [part]
         values = dict(part.values)
         references = dict(part.references)
+        tables = {table.name: table for table in part.tables}
 
         def number(parts: tuple[str, ...]) -> Fraction:
             own = parts[-1]
@@ -526,8 +552,12 @@ class _Reader:
                 inner.component,
                 settled(entry.values),
                 entry.options,
-                tuple((own, references.get(outer, "?")) for own, outer in entry.references),
-                (),
+                tuple(
+                    (own, references.get(outer, "?"))
+                    for own, outer in entry.references
+                    if outer not in tables
+                ),
+                tuple(replace(tables[outer], name=own) for own, outer in entry.references if outer in tables),
                 settled(entry.starts),
                 tuple(
                     (own, other if other == "ground" else f"{part.name}.{other}", its)
@@ -630,7 +660,7 @@ class _Reader:
         if "graph" in roles:
             node = body.get(roles["graph"])
             graph = read_graph(node, self.counts, self.folder, self.mistakes, self.texts)
-        pairs = read_pairs(body.get(roles["delays"]), self.groups, self.mistakes) if "delays" in roles else []
+        pairs = read_pairs(body.get(roles["delays"]), self.counts, self.mistakes) if "delays" in roles else []
         delays = []
         for sender, receiver, node in pairs:
             value = self._value(node, f"the delay from {sender} to {receiver}", SECOND, "s")
@@ -652,8 +682,8 @@ class _Reader:
         """Read a number for a parameter, or a start value for a variable."""
         words = item.words if isinstance(item, Number) else ()
         names = ("peers", *self.parameters)
+        assert not isinstance(item, Option) and item.unit is not None
         unit = item.unit
-        assert unit is not None
         binding = read_binding(
             node, what, unit.dimension, unit.text, self._dimension, names, self.mistakes, words=words
         )

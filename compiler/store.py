@@ -15,14 +15,11 @@ import dataclasses
 import hashlib
 import io
 import json
-import lzma
 import os
-import struct
 import tempfile
 import types
 import typing
 import zipfile
-import zlib
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -30,19 +27,12 @@ from typing import Any
 
 import casadi
 import numpy as np
+from apc.compiler.cache import DAMAGE, FORMAT, LARGEST, MEMBER
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 
-FORMAT = 2
-MEMBER = "model.json"
 # CasADi's reader can crash on text that isn't its own, so every member is checked against its digest first.
-LARGEST = 256 * 2**20
 FOREIGN = "it is not what apc compile writes"
-# What zipfile, its decompressors, json and our own reading of the document raise at what isn't theirs.
-DAMAGE = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError),
-    *(AttributeError, KeyError, IndexError, ValueError, TypeError, RuntimeError),
-)
 
 
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:

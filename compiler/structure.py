@@ -26,11 +26,11 @@ from apc.compiler.clocks import (
     ReceiveCrossing,
 )
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.expression import Name
+from apc.compiler.expression import Expr, Name
 from apc.compiler.flatten import FlatEquation
-from apc.compiler.index import Jet, Jets, JumpError, reduce_index, report_jump
+from apc.compiler.index import Jet, Jets, reduce_index, report_no_derivative
 from apc.compiler.scene import Scene
-from apc.compiler.symbolic import symbol, to_sympy
+from apc.compiler.symbolic import NoDerivativeError, no_derivative, symbol, to_sympy
 from apc.compiler.units import format_dimension
 
 __all__ = [
@@ -117,117 +117,149 @@ def _positive_parameters(scene: Scene) -> list[str]:
 
 
 def sort_kind(kind: ClockedKind, mistakes: Mistakes, *, nonzero: Collection[str] = ()) -> SortedKind:
-    """Sort and solve one kind.
+    """Sort and solve one kind; when there are mistakes, the value returned is not whole.
 
-    Mistakes: E502, E503, E507 to E509 as in `solve_blocks` and `reduce_index`; E510 a state has no start
-    value. When there are any, the value returned is not whole.
+    Parameters
+    ----------
+    kind
+        A kind of peer, partitioned by clock.
+    mistakes
+        Takes E502, E503, E508, E509 and E511 as in `solve_blocks` and `reduce_index`, and E510 a state has no
+        start value.
+    nonzero
+        Parameters that no number can make zero.
     """
-    continuous = kind.partitions[0]
-    assert continuous.clock == CONTINUOUS
-    jets = Jets(continuous.variables, (hold.symbol for hold in kind.holds))
-    started = {variable.name for variable in kind.flat.variables if variable.start}
     divisors = [symbol(name) for name in nonzero]
-    where = "the continuous equations"
-
-    residuals = _residuals(continuous.equations, jets.differentiate, mistakes)
-    origin = continuous.equations[0].place if continuous.equations else Place("topology")
-    read = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, origin) for s in kind.samples] + [
-        FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.sends
-    ]
-    values = [_right_side(equation, jets, mistakes) for equation in read]
-
-    aliases = _Aliases(jets, continuous.variables, started)
-    residuals = aliases.remove(residuals)
-    values = [aliases.substitute(value) for value in values]
-    # A derivative that is only sampled or sent has to be computed too: it gets an equation of its own.
-    probes = _probes(read, values, jets)
-    names = [*aliases.kept(), *probes]
-    reduced = reduce_index([*residuals, *probes.values()], names, started, jets, where, mistakes)
-    steps: tuple[Step, ...] = ()
-    states: tuple[str, ...] = ()
-    if reduced is not None:
-        found = solve_blocks(reduced.residuals, reduced.unknowns, where, mistakes, nonzero=divisors)
-        steps = tuple(step for step in found if probes.keys().isdisjoint(assigned(step)))
-        states = tuple(s.name for s in reduced.states)
-        _check_starts(states, started, reduced.residuals, mistakes)
-
-    partitions = [SortedPartition(CONTINUOUS, steps)]
+    continuous = _sort_continuous(kind, divisors, mistakes)
+    partitions = [SortedPartition(CONTINUOUS, continuous.steps)]
     for clock in kind.partitions[1:]:
-        own = _residuals(clock.equations, _no_derivative, mistakes)
+        own = _residuals(clock.equations, no_derivative, mistakes)
         unknowns = [symbol(name) for name in clock.variables]
         where = f"the equations of clock {clock.clock}"
         found = solve_blocks(own, unknowns, where, mistakes, nonzero=divisors)
         partitions.append(SortedPartition(clock.clock, found))
-    sampled, sent = values[: len(kind.samples)], values[len(kind.samples) :]
     return SortedKind(
         kind,
-        states,
-        aliases.assignments(),
+        continuous.states,
+        continuous.aliases,
         tuple(partitions),
-        tuple((s.symbol, s.clock, value) for s, value in zip(kind.samples, sampled, strict=True)),
+        tuple((s.symbol, s.clock, e) for s, e in zip(kind.samples, continuous.sampled, strict=False)),
         kind.holds,
         kind.previous,
         kind.receives,
         tuple(
-            SortedSend(send.name, send.link, format_dimension(send.dimension), value)
-            for send, value in zip(kind.sends, sent, strict=True)
+            SortedSend(send.name, send.link, format_dimension(send.dimension), expression)
+            for send, expression in zip(kind.sends, continuous.sent, strict=False)
         ),
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Continuous:
+    """The continuous partition, and what is sampled and sent of it."""
+
+    states: tuple[str, ...] = ()
+    aliases: tuple[Assignment, ...] = ()
+    steps: tuple[Step, ...] = ()
+    sampled: tuple[sympy.Expr, ...] = ()
+    sent: tuple[sympy.Expr, ...] = ()
+
+
+def _sort_continuous(kind: ClockedKind, divisors: Sequence[sympy.Symbol], mistakes: Mistakes) -> _Continuous:
+    partition = kind.partitions[0]
+    assert partition.clock == CONTINUOUS
+    where = "the continuous equations"
+    held = [hold.symbol for hold in kind.holds]
+    started = {variable.name for variable in kind.flat.variables if variable.start}
+    place = partition.equations[0].place if partition.equations else Place("topology")
+    # What is read, each as an equation of its own, `sample(x) = x`, for messages.
+    reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, place) for s in kind.samples]
+    reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.sends]
+    jets = Jets(partition.variables, held)
+    residuals = _residuals(partition.equations, jets.differentiate, mistakes)
+    values = [_value(read, read.right, jets.differentiate, mistakes) for read in reads]
+    if len(residuals) < len(partition.equations) or None in values:
+        return _Continuous()
+
+    aliases = _Aliases(jets, partition.variables, started)
+    residuals = aliases.remove(residuals)
+    read_values = [aliases.substitute(value) for value in values if value is not None]
+    jets = jets.renamed(aliases.kept, aliases.velocities)
+    probes = _probes(reads, read_values, jets)
+    reduced = reduce_index([*residuals, *probes.values()], jets.names, started, jets, where, mistakes)
+    if reduced is None:
+        return _Continuous()
+    states = tuple(s.name for s in reduced.states)
+    _check_starts(states, started, partition.equations, mistakes)
+    named = tuple((f"der({x})", symbol(v)) for x, v in aliases.velocities.items() if x in states)
+    solved = solve_blocks(reduced.residuals, reduced.unknowns, where, mistakes, nonzero=divisors)
+    return _Continuous(
+        states,
+        aliases.assignments,
+        (
+            *(step for step in named if step[1].name in states),
+            *(step for step in solved if probes.keys().isdisjoint(assigned(step))),
+            *(step for step in named if step[1].name not in states),
+        ),
+        tuple(read_values[: len(kind.samples)]),
+        tuple(read_values[len(kind.samples) :]),
+    )
+
+
 def _residuals(
-    equations: Iterable[FlatEquation],
+    equations: Sequence[FlatEquation],
     differentiate: Callable[[sympy.Expr], sympy.Expr],
     mistakes: Mistakes,
 ) -> list[Residual]:
+    """Return the equations as residuals, without those whose derivatives don't exist."""
     found = []
     for equation in equations:
-        try:
-            difference = to_sympy(equation.left, differentiate) - to_sympy(equation.right, differentiate)
-        except JumpError as jump:
-            report_jump(Residual(sympy.S.Zero, equation), jump, mistakes)
-            difference = sympy.S.Zero
-        found.append(Residual(difference, equation))
+        left = _value(equation, equation.left, differentiate, mistakes)
+        right = _value(equation, equation.right, differentiate, mistakes)
+        if left is not None and right is not None:
+            found.append(Residual(left - right, equation))
     return found
 
 
-def _right_side(equation: FlatEquation, jets: Jets, mistakes: Mistakes) -> sympy.Expr:
+def _value(
+    equation: FlatEquation,
+    expression: Expr,
+    differentiate: Callable[[sympy.Expr], sympy.Expr],
+    mistakes: Mistakes,
+) -> sympy.Expr | None:
     try:
-        return to_sympy(equation.right, jets.differentiate)
-    except JumpError as jump:
-        report_jump(Residual(sympy.S.Zero, equation), jump, mistakes)
-        return sympy.S.Zero
+        return to_sympy(expression, differentiate)
+    except NoDerivativeError as missing:
+        report_no_derivative(Residual(sympy.S.Zero, equation), missing, mistakes)
+        return None
 
 
-def _no_derivative(expression: sympy.Expr) -> sympy.Expr:
-    raise AssertionError("der stands in continuous equations only")
+def _probes(reads: Sequence[FlatEquation], values: Sequence[sympy.Expr], jets: Jets) -> dict[str, Residual]:
+    """Return, for each derivative that is sampled or sent, the equation `sampled der(x) = der(x)`.
 
-
-def _probes(read: Sequence[FlatEquation], values: Sequence[sympy.Expr], jets: Jets) -> dict[str, Residual]:
-    """Return, for each derivative that is read, the equation `sampled der(x) = der(x)`, by its unknown."""
+    It makes sure that the derivative is computed, even if no other equation holds it.
+    """
     probes: dict[str, Residual] = {}
-    for equation, value in zip(read, values, strict=True):
+    for read, value in zip(reads, values, strict=True):
         for derivative, (_, order) in jets.jets(value).items():
             name = f"sampled {derivative}"
             if order and name not in probes:
-                probes[name] = Residual(jets.symbol(name, 0) - derivative, equation)
+                probes[name] = Residual(jets.add(name) - derivative, read)
     return probes
 
 
 def _check_starts(
-    states: Iterable[str], started: Set[str], residuals: Sequence[Residual], mistakes: Mistakes
+    states: Iterable[str], started: Set[str], equations: Sequence[FlatEquation], mistakes: Mistakes
 ) -> None:
     for state in states:
         if state in started:
             continue
-        holder = next(r for r in residuals if symbol(f"der({state})") in r.expression.free_symbols)
+        holder = next((e for e in equations if f"der({state})" in e.text), equations[0])
+        what = f"{state} is a state, by `{holder.text}` ({holder.origin}), and has no start value"
+        hint = f"{state.rpartition('.')[2]}: {{…, start: …}}"
         if state.startswith("der("):
-            what = f"{state} is a state of its own in {holder.shown} and has no start value"
-            hint = f"a variable with a start value for it: {state} = v"
-        else:
-            what = f"{state} is a state, by {holder.shown}, and has no start value"
-            hint = f"{state.rpartition('.')[2]}: {{…, start: …}}"
-        mistakes.add("E510", holder.equation.place, what, hint=hint)
+            hint = f"{state} = v, with a start value for v"
+        mistakes.add("E510", holder.place, what, hint=hint)
 
 
 # ---- aliases ----
@@ -237,8 +269,8 @@ class _Aliases:
     """The equations a = b, a = -b and a = 0 between unknowns taken out, and what stands for what.
 
     Of two, the one with a start value stays; then the one a component declares, not the connector's:
-    `device.x`, not `device.flange.x`; then the one named first. Where der(x) = v, v also stands for der(x)
-    in all other equations, so that masses with one position are seen to have one velocity.
+    `device.x`, not `device.flange.x`; then the one named first. The equations der(x) = v are taken out too:
+    v is then the name of the derivative, so that masses with one position are seen to have one velocity.
     """
 
     def __init__(self, jets: Jets, names: Sequence[str], started: Set[str]) -> None:
@@ -246,20 +278,24 @@ class _Aliases:
         self.names = names
         self.rank = {name: (name not in started, name.count("."), j) for j, name in enumerate(names)}
         self.parent: dict[str, tuple[str, int]] = {}  # name -> ± another; sign 0: zero
-        self.velocity: dict[str, tuple[str, int, int]] = {}  # x -> v, ±1, the row that says der(x) = ±v
+        self.velocities: dict[str, str] = {}  # x -> v
+        self._position: dict[str, str] = {}  # v -> x
+        self._row: dict[str, int] = {}  # x -> the row that says der(x) = v
 
+    @property
     def kept(self) -> list[str]:
-        """Return the names that stand for themselves."""
+        """The names that stand for themselves."""
         return [name for name in self.names if name not in self.parent]
 
+    @property
     def assignments(self) -> tuple[Assignment, ...]:
-        """Return what each of the other names stands for."""
-        return tuple((name, self._value(name, 0, "")) for name in self.names if name in self.parent)
+        """What each of the other names stands for."""
+        return tuple((name, self._stands_for(name, 0)) for name in self.names if name in self.parent)
 
-    def substitute(self, expression: sympy.Expr, but: str = "") -> sympy.Expr:
-        """Return the expression in the names kept; der(`but`) stays as it is."""
+    def substitute(self, expression: sympy.Expr) -> sympy.Expr:
+        """Return the expression in the names kept."""
         jets = self.jets.jets(expression)
-        return expression.xreplace({s: self._value(name, order, but) for s, (name, order) in jets.items()})
+        return expression.xreplace({s: self._stands_for(*jet) for s, jet in jets.items()})
 
     def remove(self, residuals: Sequence[Residual]) -> list[Residual]:
         """Take the alias equations out, pass by pass until none is left; return the others, rewritten."""
@@ -267,27 +303,29 @@ class _Aliases:
         changed = True
         while changed:
             changed = False
+            said = set(self._row.values())
             for row, residual in list(rows.items()):
-                own = next((x for x, (_, _, said) in self.velocity.items() if said == row), "")
-                expression = self.substitute(residual.expression, own)
+                if row in said:
+                    continue
+                expression = self.substitute(residual.expression)
                 rows[row] = Residual(expression, residual.equation)
                 match self._pair(expression):
                     case ((one, 0), (two, 0), sign):
-                        self._join(one, two, sign)
+                        said -= self._join(one, two, sign)
                         del rows[row]
                         changed = True
-                    case ((x, 1), (v, 0), sign) | ((v, 0), (x, 1), sign) if (
-                        not own and x not in self.velocity
-                    ):
-                        self.velocity[x] = (v, sign, row)
+                    case ((x, 1), (v, 0), 1) | ((v, 0), (x, 1), 1) if self._can_name(x, v):
+                        self.velocities[x], self._position[v], self._row[x] = v, x, row
+                        said.add(row)
                         changed = True
-        return list(rows.values())
+        said = set(self._row.values())
+        return [residual for row, residual in rows.items() if row not in said]
 
     def _pair(self, expression: sympy.Expr) -> tuple[Jet, Jet, int] | None:
         """Return a, b and the sign of a = ±b; for a = 0, a twice and the sign 0; else None."""
         jets = self.jets.jets(expression)
         terms = [term.as_coeff_Mul() for term in sympy.Add.make_args(expression)]
-        if not 1 <= len(terms) <= 2 or any(s not in jets for _, s in terms):
+        if len(terms) > 2 or any(s not in jets for _, s in terms):
             return None
         (factor, one), (other_factor, two) = terms[0], terms[-1]
         if len(terms) == 1:
@@ -296,27 +334,34 @@ class _Aliases:
             return None
         return jets[one], jets[two], -1 if factor == other_factor else 1
 
-    def _join(self, one: str, two: str, sign: int) -> None:
+    def _join(self, one: str, two: str, sign: int) -> set[int]:
+        """Let one name stand for the other; return the rows der(x) = v to be read again in the new names."""
         goes, stays = (one, two) if self.rank[one] >= self.rank[two] else (two, one)
         self.parent[goes] = (stays, sign)
-        if goes not in self.velocity:
-            return
-        # With der(goes) = ±v and goes = ±stays, v is der(stays) up to a sign, unless that has one already:
-        # then its row is an equation like any other, between two velocities.
-        v, v_sign, row = self.velocity.pop(goes)
-        if sign and stays not in self.velocity:
-            self.velocity[stays] = (v, v_sign * sign, row)
+        reopened = set()
+        for x in [name for name in (goes, self._position.get(goes)) if name in self._row]:
+            assert x is not None
+            del self._position[self.velocities.pop(x)]
+            reopened.add(self._row.pop(x))
+        return reopened
 
-    def _value(self, name: str, order: int, but: str) -> sympy.Expr:
+    def _can_name(self, x: str, v: str) -> bool:
+        """Return whether v may be the name of der(x): each once, and not in a circle."""
+        if x in self.velocities or v in self._position:
+            return False
+        follows = v
+        while follows in self.velocities:
+            follows = self.velocities[follows]
+        return follows != x
+
+    def _stands_for(self, name: str, order: int) -> sympy.Expr:
         sign = 1
-        while True:
+        while sign:
             if name in self.parent:
                 name, its_sign = self.parent[name]
-            elif order and name in self.velocity and name != but:
-                name, its_sign, _ = self.velocity[name]
-                order -= 1
+                sign *= its_sign
+            elif order and name in self.velocities:
+                name, order = self.velocities[name], order - 1
             else:
                 return sign * self.jets.symbol(name, order)
-            sign *= its_sign
-            if not sign:
-                return sympy.S.Zero
+        return sympy.S.Zero

@@ -105,17 +105,24 @@ def _binary(operator: str, left: sympy.Expr, right: sympy.Expr) -> sympy.Expr:
     return left**right
 
 
+class NoDerivativeError(Exception):
+    """A value was to be differentiated that has no derivative, because it jumps or bends: which, and why."""
+
+    def __init__(self, what: str, why: str) -> None:
+        super().__init__(f"{what}, {why}")
+
+
 def differential(expression: sympy.Expr, rate: Callable[[sympy.Symbol], sympy.Expr]) -> sympy.Expr:
     """Return Σ ∂expression/∂s · rate(s) over the symbols s, by the chain rule.
 
     Where min, max, abs and if have a corner, the derivative is that of the branch taken; sign, floor and
-    conditions are constant between their jumps.
+    conditions are constant between their jumps. Raises NoDerivativeError for other opaque functions.
     """
 
     def go(node: sympy.Expr) -> sympy.Expr:
         if node.is_Symbol:
             return rate(node)
-        if not node.args or not node.free_symbols:
+        if not node.args:
             return sympy.S.Zero
         if node.is_Add:
             return sympy.Add(*(go(term) for term in node.args))
@@ -129,9 +136,9 @@ def differential(expression: sympy.Expr, rate: Callable[[sympy.Symbol], sympy.Ex
             )
         if node.is_Pow and node.exp.is_Number:
             return node.exp * node.base ** (node.exp - 1) * go(node.base)
-        return _of_function(node.func.__name__, node)
+        return of_function(node.func.__name__, node)
 
-    def _of_function(name: str, node: sympy.Expr) -> sympy.Expr:
+    def of_function(name: str, node: sympy.Expr) -> sympy.Expr:
         if name == "if":
             condition, then, otherwise = node.args
             return _choice(condition, go(then), go(otherwise))
@@ -148,7 +155,10 @@ def differential(expression: sympy.Expr, rate: Callable[[sympy.Symbol], sympy.Ex
         if name in SMOOTH:
             slope = go(node.args[0])
             return slope and node.fdiff(1) * slope
-        return sympy.S.Zero
+        if name in ("sign", "floor"):
+            return sympy.S.Zero
+        why = "a value that jumps at its ticks" if name in ("hold", "sample") else "which has none"
+        raise NoDerivativeError(str(node), why)
 
     return go(expression)
 
@@ -205,11 +215,14 @@ class ZeroTest:
     Each symbol, and each function value, gets a random residue modulo the prime 2⁶¹ − 1; an expression that
     isn't zero vanishes there with probability below its degree/2⁶¹ (Schwartz 1980, Zippel 1979). Expansion
     would decide the same at a cost that grows with the number of terms. The generator is seeded.
+
+    With `nonzero`, all other symbols are taken as zero: whether an expression is zero then.
     """
 
     _PRIME = 2**61 - 1
 
-    def __init__(self) -> None:
+    def __init__(self, nonzero: Set[sympy.Symbol] | None = None) -> None:
+        self._nonzero = nonzero
         self._values: dict[sympy.Expr, int] = {}
         self._random = random.Random(0)
 
@@ -229,6 +242,8 @@ class ZeroTest:
 
     def _compute(self, node: sympy.Expr) -> int:
         prime = self._PRIME
+        if node.is_Symbol and self._nonzero is not None and node not in self._nonzero:
+            return 0
         if node.is_Rational:
             return int(node.p) * pow(int(node.q), -1, prime) % prime
         if node.is_Add:

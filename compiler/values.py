@@ -8,9 +8,10 @@ Does not: know sections, parts or peers.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from graphlib import CycleError, TopologicalSorter
 
 from apc.compiler.dimensions import ANY, dimension_of
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
@@ -59,6 +60,10 @@ class Value:
     def __str__(self) -> str:
         """Return the number with its SI unit."""
         return format_si(float(self.number), self.dimension)
+
+
+class AlreadyReportedError(Exception):
+    """Raised by a look-up for a name whose own fault was reported: what depends on it needs no message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +157,8 @@ def read_binding(
     except ApcError as error:
         mistakes.take(error)
         return None
+    except AlreadyReportedError:
+        return None
 
 
 def _expression(
@@ -215,11 +222,19 @@ def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | Non
 
 
 def resolve_in_order(
-    waiting: dict[str, Binding], known: dict[str, Value], peers: int, mistakes: Mistakes
-) -> dict[str, Value]:
-    """Settle named numbers that depend on each other, in the order in which they can be known."""
-    settled = dict(known)
-    left = dict(waiting)
+    waiting: Mapping[str, Binding], peers: int, mistakes: Mistakes
+) -> tuple[dict[str, Value], set[str]]:
+    """Settle named numbers that depend on each other, in the order in which they can be known.
+
+    Returns
+    -------
+    settled
+        The values, in the order of `waiting`.
+    faulty
+        The names without one; each fault was reported once, where it is.
+    """
+    settled: dict[str, Value] = {}
+    faulty: set[str] = set()
 
     def dimension(parts: tuple[str, ...]) -> Dimension | None:
         if parts == PEERS:
@@ -230,28 +245,26 @@ def resolve_in_order(
     def number(parts: tuple[str, ...]) -> Fraction:
         return Fraction(peers) if parts == PEERS else settled[".".join(parts)].number
 
-    faulty: set[str] = set()
-    while left:
-        needs = {
-            name: [n for n in _needed(binding) if n in left or n in faulty] for name, binding in left.items()
-        }
-        ready = [name for name, missing in needs.items() if not missing]
-        if not ready:
-            circular = {name: [n for n in missing if n in left] for name, missing in needs.items()}
-            circular = {name: missing for name, missing in circular.items() if missing}
-            chain = _cycle(circular)
-            if chain:
-                text = " → ".join(chain)
-                mistakes.add("E209", left[chain[0]].place, f"parameters depend in a circle: {text}")
-            return settled
-        for name in ready:
-            binding = left.pop(name)
-            try:
-                settled[name] = _settled(name, binding, dimension, number, ("peers", *settled))
-            except ApcError as error:
-                faulty.add(name)
-                mistakes.take(error)
-    return settled
+    needs = {name: {n for n in _needed(binding) if n in waiting} for name, binding in waiting.items()}
+    sorter = TopologicalSorter(needs)
+    try:
+        order = list(sorter.static_order())
+    except CycleError as error:
+        chain = list(reversed(error.args[1]))
+        first = min(range(len(chain) - 1), key=lambda i: list(waiting).index(chain[i]))
+        chain = [*chain[first:-1], *chain[:first], chain[first]]
+        mistakes.add("E209", waiting[chain[0]].place, f"parameters depend in a circle: {' → '.join(chain)}")
+        return {}, set(waiting)
+    for name in order:
+        if needs[name] & faulty:
+            faulty.add(name)
+            continue
+        try:
+            settled[name] = _settled(name, waiting[name], dimension, number, ("peers", *settled))
+        except ApcError as error:
+            faulty.add(name)
+            mistakes.take(error)
+    return {name: settled[name] for name in waiting if name in settled}, faulty
 
 
 def _settled(
@@ -273,20 +286,6 @@ def _settled(
 
 def _needed(binding: Binding) -> list[str]:
     return [] if binding.expression is None else [".".join(n.parts) for n in names(binding.expression)]
-
-
-def _cycle(needs: dict[str, list[str]]) -> list[str]:
-    """Return a circle in a graph, its first node repeated at the end; empty if a path leads out of it."""
-    if not needs:
-        return []
-    path: list[str] = []
-    name = next(iter(needs))
-    while name not in path:
-        if name not in needs:
-            return []
-        path.append(name)
-        name = needs[name][0]
-    return [*path[path.index(name) :], name]
 
 
 def renamed(tree: Expr, whole: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Expr:

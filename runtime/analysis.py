@@ -15,9 +15,11 @@ from fractions import Fraction
 from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
+from apc.runtime.exchange import Exchange, build_exchange
 from apc.runtime.linearize import SiteJacobians, jacobians
-from apc.runtime.modes import ClosedSystem, PeerGroup, dense, modes, peer_groups
+from apc.runtime.modes import Split, dense, split
 from apc.runtime.parameters import resolve
+from apc.runtime.peers import PeerGroup, peer_groups, states_of
 from apc.runtime.schedule import ORDER, Schedule, build_schedules
 from apc.runtime.spectrum import Mode, solve_spectrum
 from apc.runtime.threads import single_threaded
@@ -27,7 +29,8 @@ from apc.runtime.threads import single_threaded
 class Prepared:
     """What analyses of one system with different numbers have in common.
 
-    The Jacobians hold for any numbers; the schedules for these timings and this order of coincident events.
+    The Jacobians (one a kind) hold for any numbers; the schedules (one a group) for these timings and this
+    order of coincident events.
     """
 
     jacobians: tuple[SiteJacobians, ...]
@@ -41,7 +44,8 @@ class Analysis:
     """The answer of an analysis; `spectral_radius` is per frame, rigid modes removed.
 
     `states_per_peer` is that of the largest kind of peer in the scene. `method` is "modes" or "dense".
-    `linearized` says that some site is not affine: the answer then holds near its start values only.
+    `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
+    say why it was analysed as it was.
     """
 
     topology: str
@@ -56,6 +60,7 @@ class Analysis:
     rigid_modes: int
     modes: tuple[Mode, ...]
     linearized: bool
+    notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the analysis as plain data, ready for JSON."""
@@ -84,6 +89,7 @@ class Analysis:
                 for mode in self.modes
             ],
             "linearized": self.linearized,
+            "notes": list(self.notes),
         }
 
 
@@ -102,7 +108,7 @@ def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared
 
 
 def analyze_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -> Analysis:
-    """Analyse a system as its common and difference modes.
+    """Analyse a system as few small ones where its graphs and groups allow, or else as a whole.
 
     Parameters
     ----------
@@ -111,21 +117,25 @@ def analyze_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
     prepared
         From `prepare`, of this system with any numbers; saves building the Jacobians again.
     """
-    return _analyze(system, prepared, "modes", modes)
+    return _analyze(system, prepared, split)
 
 
 def analyze_dense(system: CompiledSystem, *, prepared: Prepared | None = None) -> Analysis:
     """Analyse a system as one matrix over all peers: the check on `analyze_modes`, at the cost of N³."""
-    return _analyze(system, prepared, "dense", lambda groups: (dense(groups),))
+    return _analyze(system, prepared, lambda groups, exchange: Split("dense", (dense(groups, exchange),), ()))
 
 
-def lifted_groups(system: CompiledSystem, *, prepared: Prepared | None = None) -> tuple[PeerGroup, ...]:
-    """Return the groups of a system, lifted; groups of equal dynamics as one."""
+def lifted_groups(
+    system: CompiledSystem, *, prepared: Prepared | None = None
+) -> tuple[tuple[PeerGroup, ...], Exchange]:
+    """Return the peers of a system in groups of equal dynamics, lifted, and the exchange between them."""
     numbers = resolve(system)
     prepared = prepared or prepare(system)
     if numbers.timings != prepared.timings:
         prepared = _scheduled(system, prepared.jacobians, numbers.timings, prepared.order)
-    return peer_groups(system, prepared.jacobians, prepared.schedules, numbers.parameters)
+    exchange = build_exchange(system, numbers.timings)
+    groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
+    return groups, exchange
 
 
 def _scheduled(
@@ -142,20 +152,19 @@ def _scheduled(
 def _analyze(
     system: CompiledSystem,
     prepared: Prepared | None,
-    method: str,
-    split: Callable[[Sequence[PeerGroup]], Sequence[ClosedSystem]],
+    method: Callable[[Sequence[PeerGroup], Exchange], Split],
 ) -> Analysis:
-    """Analyse a system, split into closed systems by `split`."""
+    """Analyse a system, split into closed systems by a method."""
     with single_threaded():
-        groups = lifted_groups(system, prepared=prepared)
-        closed = split(groups)
-        spectrum = solve_spectrum(closed)
+        groups, exchange = lifted_groups(system, prepared=prepared)
+        found = method(groups, exchange)
+        spectrum = solve_spectrum(found.systems)
     return Analysis(
         topology=system.name,
         peers=system.peers,
-        frame_s=closed[0].frame_s,
-        states_per_peer=max(len(group.lifted.z_names) + sum(group.schedule.depths) for group in groups),
-        method=method,
+        frame_s=found.systems[0].frame_s,
+        states_per_peer=max(states_of(group.schedule, group.jacobians) for group in groups),
+        method=found.method,
         verdict=spectrum.verdict,
         stable=spectrum.stable,
         spectral_radius=spectrum.spectral_radius,
@@ -163,4 +172,5 @@ def _analyze(
         rigid_modes=spectrum.rigid_modes,
         modes=spectrum.modes,
         linearized=not all(group.site.affine for group in groups),
+        notes=found.notes,
     )

@@ -90,6 +90,7 @@ def lift(site: LinearSite, schedule: Schedule) -> LiftedSite:
 
     size = len(block)
     width = size + max((tick.m.shape[1] + tick.r.shape[1] for tick in site.ticks), default=0)
+    width += len(schedule.heard)
     exponential = (EXPONENTIAL_ROUNDINGS + squarings + COEFFICIENT_ROUNDINGS) * size
     roundings = sum(
         size + exponential if isinstance(event, Propagate) else width + COEFFICIENT_ROUNDINGS
@@ -127,7 +128,7 @@ def _compose(
     unit = np.eye(n_z + n_r)
     nothing = np.zeros(n_z + n_r)
     value: dict[Value, Floats] = {one: unit[n_x + row] for row, one in enumerate(schedule.carried)}
-    heard = np.vstack([unit[n_z:], nothing])  # its last row stands for what is not read
+    heard = unit[n_z:]
 
     # The continuous states above what the holds put out: a step multiplies both at once.
     moving = np.zeros((n_x + n_u, n_z + n_r))
@@ -156,7 +157,8 @@ def _compose(
             case Tick(partition, index, rows_heard):
                 memories = kind.clocks[partition].memories
                 before = [value.get(Value(partition, o, index - 1), nothing) for o in memories]
-                inputs = np.vstack([moving, *before, heard[list(rows_heard)]])
+                received = [heard[list(rows)].sum(axis=0) for rows in rows_heard]
+                inputs = np.vstack([moving, *before, *received])
                 for output, row_of in enumerate(ticks[partition] @ inputs):
                     value[Value(partition, output, index)] = row_of
     inside[-1] = moving[:n_x]

@@ -1,9 +1,9 @@
 """Close the loop between peers, as few small systems instead of one large one.
 
-Takes: groups of equal peers, each with its linear site, schedule and lifted site.
-Gives: `PeerGroup`, `ClosedSystem`, `close`, `modes`, `dense`.
-Guarantees: the systems of `modes`, each as often as its multiplicity says, have together the spectrum of
-`dense`, whatever the number of peers; the cost grows with the number of different groups only.
+Takes: the groups of equal peers of a scene, and the exchange between them.
+Gives: `ClosedSystem`, `close`; `Split`, `split`, `modes`, `dense`.
+Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
+`dense`, whatever the number of peers.
 Does not: compute eigenvalues (see `spectrum`).
 
 On a complete graph a peer of group g hears r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and 1
@@ -12,6 +12,10 @@ for a sum. K groups of n_1 … n_K equal peers then split exactly:
     common        all peers of a group alike: r_g = c_g Σ_h (n_h − δ_gh) s_h        once
     difference g  peers of group g apart, their sum zero, all else at rest: r_g = −c_g s_g        n_g − 1
     times
+
+Equal peers on any other graph, r = W s: one system an eigenvalue λ of W, r = λ s, as often as W holds it. A
+complex pair λ = α ± iβ is one real system of two sites, r = [α −β; β α] s. Different peers on such a graph
+are one whole system.
 """
 
 from __future__ import annotations
@@ -21,33 +25,28 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
-from apc.compiler.compiled import CompiledSystem
-from apc.runtime.lift import UNIT, LiftedSite, lift
-from apc.runtime.linearize import LinearSite, SiteJacobians, linearize, linearize_exact, same_dynamics
-from apc.runtime.schedule import Schedule
+from apc.runtime.exchange import Exchange, GraphMode, check_mean, graph_modes
+from apc.runtime.lift import UNIT
+from apc.runtime.peers import MOST_STATES, PeerGroup, states_of, too_large, used_ways
+from apc.runtime.schedule import Way
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-# What site g hears of site h: the weight on h's packet, by operator and link.
-Coupling = Mapping[tuple[str, str], tuple[tuple[Fraction, ...], ...]]
+# What site g hears of site h on a way: the weight on h's packet.
+Coupling = Mapping[Way, tuple[tuple[Fraction, ...], ...]]
+
+# More systems than this are refused: each takes some milliseconds.
+MOST_SYSTEMS = 3000
 
 
 @dataclass(frozen=True, slots=True)
-class PeerGroup:
-    """`count` peers that move alike; `parameters` is their vector (n_p,)."""
+class Split:
+    """A whole system as independent ones; `method` is "modes" or "dense", `notes` say why."""
 
-    name: str
-    count: int
-    parameters: Floats
-    jacobians: SiteJacobians
-    site: LinearSite
-    schedule: Schedule
-    lifted: LiftedSite
-
-    def exact(self) -> LinearSite:
-        """The site's matrices in exact rationals."""
-        return linearize_exact(self.jacobians, self.parameters)
+    method: str
+    systems: tuple[ClosedSystem, ...]
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,59 +83,62 @@ class ClosedSystem:
     motion: tuple[int, ...]
 
 
-def peer_groups(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    parameters: Sequence[Floats],
-) -> tuple[PeerGroup, ...]:
-    """Lift every group of a system once; groups of equal dynamics become one, named `left+right`.
+def split(groups: Sequence[PeerGroup], exchange: Exchange) -> Split:
+    """Split the whole system into as few and small systems as its graphs and groups allow.
 
     Parameters
     ----------
-    system
-        The compiled scene.
-    jacobians, schedules
-        One a kind.
-    parameters
-        One vector (n_p,) a group.
+    groups
+        All peers, see `peers.peer_groups`.
+    exchange
+        The links.
+
+    Raises
+    ------
+    ApcError
+        E801, E802 a mean that can't be; E804 one system of too many states, E805 too many systems.
     """
-    groups: list[PeerGroup] = []
-    for group, vector in zip(system.groups, parameters, strict=True):
-        site = linearize(jacobians[group.kind], vector)
-        for place, known in enumerate(groups):
-            if same_dynamics(site, known.site):
-                groups[place] = replace(
-                    known, name=f"{known.name}+{group.name}", count=known.count + group.count
-                )
-                break
-        else:
-            schedule = schedules[group.kind]
-            groups.append(
-                PeerGroup(
-                    group.name,
-                    group.count,
-                    vector,
-                    jacobians[group.kind],
-                    site,
-                    schedule,
-                    lift(site, schedule),
-                )
-            )
-    return tuple(groups)
+    ways = used_ways(group.schedule for group in groups)
+    graphs = list(dict.fromkeys(way.link for way in ways if not exchange.is_complete(way.link)))
+    if not graphs:
+        return Split("modes", modes(groups, exchange), ())
+    named = " and ".join(f"{link} ({exchange.links[link].graph.shape})" for link in graphs)
+    reason = f"the peers on {named} differ" if len(groups) > 1 else _no_common_graph(ways, exchange)
+    if not reason:
+        found = _graph_modes(groups[0], ways, exchange)
+        if found is not None:
+            note = f"{len(found)} systems, one an eigenvalue of the graph of {named}"
+            return Split("modes", found, (note,))
+        reason = f"the graph of {named} has no full set of eigenvectors"
+    return Split("dense", (dense(groups, exchange),), (f"all peers as one system: {reason}",))
 
 
-def modes(groups: Sequence[PeerGroup]) -> tuple[ClosedSystem, ...]:
-    """Split the whole system into one common system and a difference system a group of two or more."""
+def modes(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[ClosedSystem, ...]:
+    """Split a system of complete graphs into a common system and a difference system a group of two or more.
+
+    Parameters
+    ----------
+    groups
+        All peers, see `peers.peer_groups`.
+    exchange
+        The links, all of them complete.
+    """
     peers = sum(group.count for group in groups)
     name = "single" if peers == 1 else "common"
+    degrees = _degrees(groups, exchange)
     systems = [
-        close(groups, _coupling(groups, lambda g, h: groups[h].count - (1 if g == h else 0)), name=name)
+        close(
+            groups,
+            _couple(
+                groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
+            ),
+            name=name,
+        )
     ]
     for place, group in enumerate(groups):
         if group.count < 2:
             continue
-        weights = _coupling(groups, lambda g, h: -1 if g == h else 0)
+        weights = _couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
         own = {key: ((rows[place][place],),) for key, rows in weights.items()}
         systems.append(
             close(
@@ -149,35 +151,187 @@ def modes(groups: Sequence[PeerGroup]) -> tuple[ClosedSystem, ...]:
     return tuple(systems)
 
 
-def dense(groups: Sequence[PeerGroup]) -> ClosedSystem:
-    """Assemble every peer of the whole system: the check on `modes`, at the cost of N³."""
+def dense(groups: Sequence[PeerGroup], exchange: Exchange) -> ClosedSystem:
+    """Assemble every peer of the whole system: the check on all else, at the cost of N³.
+
+    Parameters
+    ----------
+    groups
+        All peers, see `peers.peer_groups`.
+    exchange
+        The links.
+
+    Raises
+    ------
+    ApcError
+        E801, E802 a mean that can't be; E804 more than `MOST_STATES` states.
+    """
+    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
+    if states > MOST_STATES:
+        raise too_large(exchange, f"{exchange.peers:,} peers", states)
     everyone = [
-        replace(group, name=f"{group.name}[{number + 1}]", count=1)
-        for group in groups
-        for number in range(group.count)
+        replace(group, name=exchange.peer_name(peer), count=1, peers=np.array([peer]))
+        for peer, group in sorted(
+            ((int(peer), group) for group in groups for peer in group.peers), key=lambda pair: pair[0]
+        )
     ]
-    return close(everyone, _coupling(everyone, lambda g, h: 0 if g == h else 1), name="dense")
+    weights = {
+        link: {
+            (receiver, sender): Fraction(weight)
+            for (sender, receiver), weight in zip(*(one.tolist() for one in exchange.arcs(link)), strict=True)
+        }
+        for link in exchange.links
+    }
+    degrees: dict[tuple[str, int], Fraction] = {}
+    for link, entries in weights.items():
+        for (receiver, sender), weight in entries.items():
+            if everyone[sender].sends(link):
+                degrees[link, receiver] = degrees.get((link, receiver), Fraction(0)) + weight
+    return close(
+        everyone,
+        _couple(everyone, exchange, lambda way, g, h: weights[way.link].get((g, h), Fraction(0)), degrees),
+        name="dense",
+    )
 
 
-def _coupling(groups: Sequence[PeerGroup], others: Callable[[int, int], int]) -> Coupling:
-    """Weigh `others(g, h)` packets of site h at site g: 1 for a sum, 1/(number of others) for a mean."""
-    pairs = sorted({(one.operator, one.sent.link) for group in groups for one in group.schedule.heard})
+def _degrees(groups: Sequence[PeerGroup], exchange: Exchange) -> dict[tuple[str, int], Fraction]:
+    """Return how many others a peer of each group hears over each complete link."""
+    degrees = {}
+    for link in exchange.links:
+        total = sum(group.count for group in groups if group.sends(link))
+        for g, group in enumerate(groups):
+            number = total - (1 if group.sends(link) else 0)
+            if number:
+                degrees[link, g] = Fraction(number)
+    return degrees
+
+
+def _couple(
+    groups: Sequence[PeerGroup],
+    exchange: Exchange,
+    weigh: Callable[[Way, int, int], Fraction],
+    degrees: Mapping[tuple[str, int], Fraction],
+) -> Coupling:
+    """Weigh each site's packets at each other, way by way.
+
+    Parameters
+    ----------
+    groups
+        The sites.
+    exchange
+        The links.
+    weigh
+        The weight of a packet of site h at site g in a plain sum.
+    degrees
+        What a mean is divided by, by link and site; who hears nobody has no entry.
+    """
     coupling = {}
-    for operator, link in pairs:
-        sends = [any(sending.link == link for sending in group.jacobians.kind.sends) for group in groups]
-        total = sum(group.count for group, does in zip(groups, sends, strict=True) if does)
+    for way in used_ways(group.schedule for group in groups):
         rows = []
-        for g in range(len(groups)):
-            number = total - (1 if sends[g] else 0)
-            assert number > 0, f"a peer of {groups[g].name} hears {link}, but nobody else sends"
-            weight = Fraction(1, number) if operator == "mean" else Fraction(1)
-            rows.append(tuple(weight * others(g, h) if sends[h] else Fraction(0) for h in range(len(groups))))
-        coupling[operator, link] = tuple(rows)
+        for g, group in enumerate(groups):
+            hears = any(one.way == way for one in group.schedule.heard)
+            if hears and way.operator == "mean":
+                total = degrees.get((way.link, g))
+                check_mean(
+                    exchange, int(group.peers[0]), way.link, "mean", total is not None, total or Fraction(0)
+                )
+            row = []
+            for h, sender in enumerate(groups):
+                weight = weigh(way, g, h) if hears and sender.sends(way.link) else Fraction(0)
+                if weight and exchange.delay(way.link, sender.role, group.role) == way.delay:
+                    if way.operator == "mean":
+                        weight /= degrees[way.link, g]
+                    elif way.operator in ("max", "min"):  # the one it is taken from counts once
+                        weight = Fraction(1 if weight > 0 else -1)
+                    row.append(weight * group.gain(way, sender))
+                else:
+                    row.append(Fraction(0))
+            rows.append(tuple(row))
+        coupling[way] = tuple(rows)
     return coupling
 
 
+def _no_common_graph(ways: Sequence[Way], exchange: Exchange) -> str:
+    """Return why the links' W have not the same eigenvectors, or "" if they are one graph."""
+    links = list(dict.fromkeys(way.link for way in ways))
+    shapes = {exchange.links[link].graph.shape for link in links}
+    listed = [exchange.links[link].graph for link in links]
+    if len(shapes) > 1 or any(
+        not np.array_equal(graph.arcs, listed[0].arcs) or not np.array_equal(graph.weights, listed[0].weights)
+        for graph in listed
+    ):
+        return f"the graphs of {' and '.join(links)} are not the same"
+    if len({way.operator == "mean" for way in ways}) > 1 and _degree(links[0], exchange) is None:
+        return f"means and sums over {links[0]}, whose peers hear unequal weights"
+    if any(way.operator in ("max", "min") for way in ways):
+        return "who is the largest or smallest decides who is heard"
+    return ""
+
+
+def _degree(link: str, exchange: Exchange) -> Fraction | None:
+    """Return the sum of the weights that every peer hears over a link, None when it differs."""
+    pairs, weights = exchange.arcs(link)
+    if np.all(weights == 1):
+        counts = np.bincount(pairs[:, 1], minlength=exchange.peers)
+        return Fraction(int(counts[0])) if np.all(counts == counts[0]) else None
+    sums = [Fraction(0)] * exchange.peers
+    for receiver, weight in zip(pairs[:, 1].tolist(), weights.tolist(), strict=True):
+        sums[receiver] += Fraction(weight)
+    return sums[0] if len(set(sums)) == 1 else None
+
+
+def _graph_modes(
+    group: PeerGroup, ways: Sequence[Way], exchange: Exchange
+) -> tuple[ClosedSystem, ...] | None:
+    """Return one system an eigenvalue of the graph that equal peers share, None if it lacks eigenvectors."""
+    link = ways[0].link
+    means = any(way.operator == "mean" for way in ways)
+    pairs, weights = exchange.arcs(link)
+    if means:
+        sums = np.bincount(pairs[:, 1], weights, minlength=exchange.peers)
+        hears = np.bincount(pairs[:, 1], minlength=exchange.peers) > 0
+        for peer in np.flatnonzero((sums == 0) | ~hears).tolist():
+            total = sum(map(Fraction, weights[pairs[:, 1] == peer].tolist()), Fraction(0))
+            check_mean(exchange, peer, link, "mean", bool(hears[peer]), total)
+    degree = _degree(link, exchange)
+    by_mean = means and degree is None
+    found = graph_modes(exchange.links[link].graph, exchange.peers, mean=by_mean)
+    if found is None:
+        return None
+    if len(found) > MOST_SYSTEMS:
+        raise too_large(
+            exchange, f"{exchange.peers:,} peers on a graph", len(found) * len(group.lifted.z_names)
+        )
+    # What a way weighs a neighbour by, in units of W.
+    scale = {
+        way: group.gain(way, group) / (degree if degree and way.operator == "mean" else Fraction(1))
+        for way in ways
+    }
+    return tuple(_graph_mode(group, mode, scale) for mode in found)
+
+
+def _graph_mode(group: PeerGroup, mode: GraphMode, scale: Mapping[Way, Fraction]) -> ClosedSystem:
+    """Close one site by an eigenvalue, or two by a complex pair."""
+    a, b = mode.real, mode.imaginary
+    doubts = {way: float(abs(one)) * mode.doubt for way, one in scale.items()}
+    name = "common" if mode.common else f"graph {mode.value.real:+.6g}"
+    if not b:
+        coupling: Coupling = {way: ((one * a,),) for way, one in scale.items()}
+        return close([group], coupling, name=name, multiplicity=mode.multiplicity, doubts=doubts)
+    pair = {way: ((one * a, -one * b), (one * b, one * a)) for way, one in scale.items()}
+    sites = [replace(group, name=part) for part in ("real", "imaginary")]
+    return close(
+        sites, pair, name=f"{name} ± {mode.value.imag:.6g}i", multiplicity=mode.multiplicity, doubts=doubts
+    )
+
+
 def close(
-    sites: Sequence[PeerGroup], coupling: Coupling, *, name: str, multiplicity: int = 1
+    sites: Sequence[PeerGroup],
+    coupling: Coupling,
+    *,
+    name: str,
+    multiplicity: int = 1,
+    doubts: Mapping[Way, float] | None = None,
 ) -> ClosedSystem:
     """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it.
 
@@ -186,9 +340,11 @@ def close(
     sites
         The K sites.
     coupling
-        W (K, K) by operator and link, exact.
+        W (K, K) by way, exact.
     name, multiplicity
         What the system is called and how often the whole holds it.
+    doubts
+        By how much each entry of a way's W may be off, where it isn't exact.
 
     Notes
     -----
@@ -208,26 +364,27 @@ def close(
     n = len(names)
     s_start = np.cumsum([0] + [len(site.s) for site in lifted])
 
-    def links(weigh: Callable[[Fraction], float]) -> list[tuple[Floats, Floats]]:
+    def links(weigh: Callable[[Fraction, float], float]) -> list[tuple[Floats, Floats]]:
         """Return, for each site, r over the packets sent this frame and over the state."""
         found = []
         for g, group in enumerate(sites):
             now = np.zeros((len(group.schedule.heard), s_start[-1]))
             before = np.zeros((len(group.schedule.heard), n))
             for line, one in enumerate(group.schedule.heard):
-                for h, weight in enumerate(coupling[one.operator, one.sent.link][g]):
-                    if weight == 0:
+                doubt = (doubts or {}).get(one.way, 0.0)
+                for h, weight in enumerate(coupling[one.way][g]):
+                    if weight == 0 and doubt == 0:
                         continue
                     row = row_of[h][one.sent]
                     if one.lag == 0:
-                        now[line, s_start[h] + row] = weigh(weight)
+                        now[line, s_start[h] + row] = weigh(weight, doubt)
                     else:
-                        before[line, place_of[Packet(h, row, one.lag)]] = weigh(weight)
+                        before[line, place_of[Packet(h, row, one.lag)]] = weigh(weight, doubt)
             found.append((now, before))
         return found
 
     exact = [(site.p, site.q, site.s, site.d) for site in lifted]
-    matrix, heard = _closed(exact, links(float), offsets, packets, place_of, n)
+    matrix, heard = _closed(exact, links(lambda weight, _: float(weight)), offsets, packets, place_of, n)
     # The magnitudes, and the magnitudes with their errors: the difference bounds the error to all orders.
     large = [tuple(np.abs(block) for block in blocks) for blocks in exact]
     wide = [
@@ -239,10 +396,15 @@ def close(
         )
         for blocks, site in zip(large, lifted, strict=True)
     ]
-    weights = links(lambda weight: float(abs(weight)))
+    weights = links(lambda weight, _: float(abs(weight)))
+    doubtful = links(lambda weight, doubt: float(abs(weight)) + doubt) if doubts else weights
     bound, _ = _closed(large, weights, offsets, packets, place_of, n)
-    upper, _ = _closed(wide, weights, offsets, packets, place_of, n)
-    roundings = 4 * (n + s_start[-1]) * (1 + len(sites[0].schedule.sent)) * UNIT
+    upper, _ = _closed(wide, doubtful, offsets, packets, place_of, n)
+    # A sum rounds as often as it has terms that are not zero, whatever the size of the whole.
+    listened = max(len(group.schedule.heard) for group in sites)
+    senders = max((int(np.count_nonzero(now, axis=1).max(initial=0)) for now, _ in weights), default=0)
+    terms = max(len(site.z_names) for site in lifted) + listened * (1 + senders)
+    roundings = 4 * (terms + 2) * (1 + len(sites[0].schedule.sent)) * UNIT
     error = (upper - bound) + roundings * upper
 
     marks = min(len(site.inside) for site in lifted)

@@ -3,15 +3,19 @@
 Takes: a `CompiledSystem` and overrides such as `contact.stiffness=800 N/m`.
 Gives: `Override`, `parse_override`, `apply`, `Numbers`, `resolve`.
 Guarantees: what depends on a changed parameter by an expression changes with it, in exact rationals; bounds
-are kept; the rest keeps the very numbers it was compiled with.
+are kept; the rest keeps the very numbers it was compiled with. What depends on a parameter that differs from
+peer to peer is worked out peer by peer, in floats, in a time that grows with the number of peers.
 Does not: change what was compiled as structure (which parts there are, how many peers).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from apc.compiler.compiled import PEERS, CompiledSystem, Group, Parameter, Timing
@@ -23,6 +27,35 @@ SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
 
 _PLACE = Place("override")
 
+Floats = NDArray[np.float64]
+
+# The language's operators and functions of a parameter, over the values of all peers at once.
+_OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": np.true_divide,
+    "^": np.float_power,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+}
+_EXTREMES: dict[str, Callable[[Any, Any], Any]] = {"max": np.maximum, "min": np.minimum}
+_FUNCTIONS: dict[str, Callable[[Any], Any]] = {
+    "abs": np.abs,
+    "sign": np.sign,
+    "floor": np.floor,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tanh": np.tanh,
+}
+
 
 @dataclass(frozen=True, slots=True)
 class Override:
@@ -33,15 +66,17 @@ class Override:
     value: Fraction
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Numbers:
     """Everything a compiled system needs to become matrices.
 
-    `parameters` holds one vector (n_p,) a group, in the order of its kind's parameters; `timings` seconds by
-    name.
+    `parameters` holds one matrix (k, n_p) a group: its peers' different rows, in the order in which they come
+    first, columns in the order of its kind's parameters; `rows` (count,) says which of them each peer has.
+    `timings` are seconds by name.
     """
 
-    parameters: tuple[NDArray[np.float64], ...]
+    parameters: tuple[Floats, ...]
+    rows: tuple[NDArray[np.int64], ...]
     timings: Mapping[str, Fraction]
 
 
@@ -124,7 +159,16 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
             for name, parameter in parameters.items()
             if name not in values and own and scope.parameter(name) != common.parameter(name)
         }
-        groups.append(replace(group, values=tuple(scope.parameter(name) for name in values)))
+        groups.append(
+            replace(
+                group,
+                values=tuple(scope.parameter(name) for name in values),
+                # One value for the group, or for everybody, is one for each of its peers.
+                columns=tuple(
+                    column for column in group.columns if column.name not in everywhere.keys() | own.keys()
+                ),
+            )
+        )
     changed = replace(
         system,
         parameters=tuple(common.parameter(name) for name in parameters),
@@ -144,17 +188,102 @@ def resolve(system: CompiledSystem, overrides: Sequence[Override] = ()) -> Numbe
         As `apply`.
     """
     system = apply(system, overrides)
+    found = [_different_rows(system, group) for group in system.groups]
     return Numbers(
-        parameters=tuple(_vector(system, group) for group in system.groups),
+        parameters=tuple(parameters for parameters, _ in found),
+        rows=tuple(rows for _, rows in found),
         timings={timing.name: timing.value for timing in system.timings},
     )
 
 
-def _vector(system: CompiledSystem, group: Group) -> NDArray[np.float64]:
-    """Return a group's parameters in the order of its kind."""
-    value = {parameter.name: parameter.value for parameter in system.parameters}
-    value |= {parameter.name: parameter.value for parameter in group.values}
-    return np.array([value[name] for name in system.kinds[group.kind].parameters], dtype=np.float64)
+def _different_rows(system: CompiledSystem, group: Group) -> tuple[Floats, NDArray[np.int64]]:
+    """Return a group's different parameter rows (k, n_p) and which of them each peer has (count,)."""
+    names = system.kinds[group.kind].parameters
+    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    common = np.array([[holder[name].value for name in names]], dtype=np.float64).reshape(1, -1)
+    columns = _Columns(system, group, holder)
+    varying = {place: column for place, name in enumerate(names) if (column := columns.of(name)) is not None}
+    if not varying:
+        # A view of one zero: a million equal peers take no memory.
+        return common, np.broadcast_to(np.int64(0), (group.count,))
+    table = np.stack(list(varying.values()), axis=1) + 0.0  # −0 and 0 are one number
+    known: dict[bytes, int] = {}
+    rows = np.array([known.setdefault(row.tobytes(), len(known)) for row in table], dtype=np.int64)
+    first = np.zeros(len(known), dtype=np.int64)
+    first[rows[::-1]] = np.arange(len(rows))[::-1]
+    parameters = np.repeat(common, len(known), axis=0)
+    parameters[:, list(varying)] = table[first]
+    return parameters, rows
+
+
+class _Columns:
+    """The parameters of one group that differ from peer to peer, given or by an expression."""
+
+    def __init__(self, system: CompiledSystem, group: Group, holder: Mapping[str, Parameter]) -> None:
+        self._group = group.name
+        self._holder = holder
+        self._timings = {timing.name: float(timing.value) for timing in system.timings}
+        self._given = bool(group.columns)
+        self._found: dict[str, Floats | None] = {column.name: column.values for column in group.columns}
+
+    def of(self, name: str) -> Floats | None:
+        """Return a parameter's values (count,), or None when all peers share one."""
+        if name not in self._found:
+            expression = self._holder[name].expression if name in self._holder else None
+            self._found[name] = self._evaluated(name, expression) if expression and self._given else None
+        return self._found[name]
+
+    def _evaluated(self, name: str, text: str) -> Floats | None:
+        from apc.compiler.expression import names, parse_expression
+
+        tree = parse_expression(text, Place(name, 1, 1, text))
+        if all(self.of(".".join(node.parts)) is None for node in names(tree)):
+            return None
+        with np.errstate(all="ignore"):
+            values = np.asarray(_evaluate_rows(tree, self._look_up), dtype=np.float64)
+        wrong = np.flatnonzero(~np.isfinite(values))
+        if len(wrong):
+            peer = f"{self._group}[{int(wrong[0]) + 1}]"
+            raise ApcError(Mistake("E331", _PLACE, f"{name} = {text[:80]} has no finite value for {peer}"))
+        return values
+
+    def _look_up(self, parts: tuple[str, ...]) -> Any:
+        name = ".".join(parts)
+        column = self.of(name)
+        if column is not None:
+            return column
+        return self._holder[name].value if name in self._holder else self._timings[name]
+
+
+def _evaluate_rows(expr: Any, lookup: Callable[[tuple[str, ...]], Any]) -> Any:
+    """Return an expression's value for all peers at once, in floats (or truth values)."""
+    from apc.compiler.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not, Number
+
+    def value(node: Any) -> Any:
+        match node:
+            case Number():
+                return float(node.value)
+            case Name():
+                return lookup(node.parts)
+            case Negate():
+                return -value(node.operand)
+            case Binary() | Compare():
+                return _OPERATORS[node.operator](value(node.left), value(node.right))
+            case Logic():
+                join = np.logical_and if node.operator == "and" else np.logical_or
+                return join(value(node.left), value(node.right))
+            case Not():
+                return np.logical_not(value(node.operand))
+            case Conditional():
+                return np.where(value(node.condition), value(node.then), value(node.otherwise))
+            case Call():
+                arguments = [value(argument) for argument in node.arguments]
+                if node.function in _EXTREMES:
+                    return functools.reduce(_EXTREMES[node.function], arguments)
+                return _FUNCTIONS[node.function](*arguments)
+        raise AssertionError(f"no such expression: {node!r}")
+
+    return value(expr)
 
 
 class _Scope:
@@ -245,6 +374,7 @@ def _check(system: CompiledSystem) -> None:
     for group in system.groups:
         for parameter in group.values:
             _check_bounds(parameter, f"{group.name}.{parameter.name}", mistakes)
+        _check_columns(system, group, mistakes)
     periods = {clock.period for clock in system.clocks}
     for timing in system.timings:
         if timing.name in periods and timing.value <= 0:
@@ -272,3 +402,20 @@ def _check_bounds(parameter: Parameter, name: str, mistakes: Mistakes) -> None:
         out("at least", low)
     if high is not None and value > high:
         out("at most", high)
+
+
+def _check_columns(system: CompiledSystem, group: Group, mistakes: Mistakes) -> None:
+    """Record the first peer's value that is out of its bounds, of each parameter that differs."""
+    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    columns = _Columns(system, group, holder)
+    for name, parameter in holder.items() if group.columns else ():
+        values = columns.of(name)
+        if values is None:
+            continue
+        low = -np.inf if parameter.minimum is None else parameter.minimum
+        high = np.inf if parameter.maximum is None else parameter.maximum
+        below = values <= low if parameter.open_minimum else values < low
+        wrong = np.flatnonzero(below | (values > high))
+        if len(wrong):
+            peer, value = f"{group.name}[{int(wrong[0]) + 1}]", float(values[wrong[0]])
+            _check_bounds(replace(parameter, value=value), f"{peer}.{name}", mistakes)

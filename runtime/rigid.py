@@ -25,8 +25,10 @@ from typing import Any
 
 import flint
 import numpy as np
+from apc.runtime.exchange import QUICK_PRIME
 from apc.runtime.linearize import LinearSite
-from apc.runtime.modes import ClosedSystem, PeerGroup
+from apc.runtime.modes import ClosedSystem
+from apc.runtime.peers import PeerGroup
 from apc.runtime.schedule import Act, Propagate, Send, Tick, Value
 from numpy.typing import NDArray
 
@@ -34,9 +36,6 @@ Floats = NDArray[np.float64]
 
 # A linear form in the unknowns, sparse.
 Form = dict[int, Fraction]
-
-# A prime for the quick look: the null space modulo a prime is at least as large as the true one.
-QUICK_PRIME = 2**61 - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,16 +140,15 @@ def _standing(system: ClosedSystem, exact: Sequence[LinearSite], number: _Number
         for p, (tick, partition) in enumerate(zip(site.ticks, site.kind.clocks, strict=True)):
             y = [{number.outputs[g][p] + o: Fraction(1)} for o in range(len(partition.outputs))]
             m = [y[o] for o in partition.memories]
-            r = []
-            for receive in partition.receives:
-                weights = system.coupling.get((receive.operator, receive.link))
-                channel = _channel(site, receive.link, receive.channel)
-                r.append(
-                    _combine(
-                        (weight, sent[h].get((receive.link, channel), {}))
-                        for h, weight in enumerate(weights[g] if weights else ())
-                    )
+            schedule = system.sites[g].schedule
+            r = [
+                _combine(
+                    (weight, sent[h].get((way.link, channel), {}))
+                    for way, channel in schedule.ways(p, place)
+                    for h, weight in enumerate(system.coupling[way][g])
                 )
+                for place in range(len(partition.receives))
+            ]
             for o in range(len(partition.outputs)):
                 terms = [*zip(tick.x[o], x, strict=True), *zip(tick.u[o], u, strict=True)]
                 terms += [*zip(tick.m[o], m, strict=True), *zip(tick.r[o], r, strict=True)]
@@ -175,11 +173,6 @@ def _standing_sends(site: LinearSite, number: _Numbering, g: int) -> dict[tuple[
         for send, sending in zip(site.sends, site.kind.sends, strict=True)
         for c, channel in enumerate(sending.channels)
     }
-
-
-def _channel(site: LinearSite, link: str, channel: int) -> str:
-    """Return the name of a channel, by its row in the site's own send partition."""
-    return next(sending.channels[channel] for sending in site.kind.sends if sending.link == link)
 
 
 def _standing_state(
@@ -277,17 +270,17 @@ class _Ramp:
         growth = {row: self.slope(standing[one.link, one.channel]) for row, one in enumerate(schedule.sent)}
         return sent, growth
 
-    def heard(self, g: int, place: int, sent: Sequence[tuple[dict[int, Form], dict[int, Form]]]) -> Form:
-        """Return what site g hears at a row of r, each packet as it was when it was sent."""
-        if place < 0:
-            return {}
-        one = self.system.sites[g].schedule.heard[place]
+    def heard(
+        self, g: int, rows: Iterable[int], sent: Sequence[tuple[dict[int, Form], dict[int, Form]]]
+    ) -> Form:
+        """Return what site g hears at some rows of r together, each packet as it was when it was sent."""
         total: Form = {}
-        for h, weight in enumerate(self.system.coupling[one.operator, one.sent.link][g]):
-            if weight:
-                row = self.system.sites[h].schedule.sent.index(one.sent)
-                _add(total, weight, sent[h][0][row])
-                _add(total, -weight * one.lag * self.frame, sent[h][1][row])
+        for one in (self.system.sites[g].schedule.heard[row] for row in rows):
+            for h, weight in enumerate(self.system.coupling[one.way][g]):
+                if weight:
+                    row = self.system.sites[h].schedule.sent.index(one.sent)
+                    _add(total, weight, sent[h][0][row])
+                    _add(total, -weight * one.lag * self.frame, sent[h][1][row])
         return total
 
     def equations(self, sent: Sequence[tuple[dict[int, Form], dict[int, Form]]]) -> Iterator[Form]:
@@ -305,7 +298,7 @@ class _Ramp:
                     tick, partition = site.ticks[event.partition], site.kind.clocks[event.partition]
                     before = (Value(event.partition, o, event.index - 1) for o in partition.memories)
                     inputs = [*x, *u, *(self.value(g, one) for one in before)]
-                    inputs += [self.heard(g, place, sent) for place in event.heard]
+                    inputs += [self.heard(g, rows, sent) for rows in event.heard]
                     for o in range(len(partition.outputs)):
                         row = [*tick.x[o], *tick.u[o], *tick.m[o], *tick.r[o]]
                         own = self.value(g, Value(event.partition, o, event.index))

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
-from apc.runtime.linearize import LinearSite
+from apc.compiler.compiled import Clock, CompiledSystem, Link
+from apc.runtime.exchange import Exchange, build_exchange, check_mean
+from apc.runtime.linearize import LinearSite, edge_name
 
 # The order of coincident events. Continuous variables are continuous, so sampling needs no place in it.
 ORDER = ("send", "deliver", "tick", "act")
@@ -44,10 +45,26 @@ class Sent:
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Heard:
-    """What a site hears: `operator` over the other peers' `sent`, of `lag` frames ago (0: this frame)."""
+class Way:
+    """A way from peer to peer, one weight for each pair of peers: `operator` over a link, delayed `delay`.
+
+    Only those pairs of peers are on it whose delay is the timing `delay`. A receive that weighs every sender
+    apart, by the slope of its edge function, has a way of its own for each channel: `edge` and `channel` name
+    it, and are empty for a plain sum or mean.
+    """
 
     operator: str
+    link: str
+    delay: str
+    edge: str = ""
+    channel: str = ""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Heard:
+    """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame)."""
+
+    way: Way
     sent: Sent
     lag: int
 
@@ -69,11 +86,11 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Clock partition `partition` computes, tick `index`; `heard` are rows of r, -1 for one not read."""
+    """Clock partition `partition` computes, tick `index`; `heard` are each receive's rows of r, to add."""
 
     partition: int
     index: int
-    heard: tuple[int, ...]
+    heard: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +106,7 @@ Event = Propagate | Send | Tick | Act
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """One frame of one kind of site.
+    """One frame of the peers of one group.
 
     `acting` is what each hold puts out as the frame begins (None for a hold nobody reads); `carried` are the
     values of earlier frames that this one needs, the remembered part of z after the continuous states;
@@ -116,6 +133,12 @@ class Schedule:
     def frame_s(self) -> Fraction:
         """The length of the frame in seconds."""
         return self.frame * self.quantum
+
+    def ways(self, partition: int, receive: int) -> tuple[tuple[Way, str], ...]:
+        """Return the ways and channels a receive of a clock partition hears, whatever the tick."""
+        ticks = [one for one in self.events if isinstance(one, Tick) and one.partition == partition]
+        heard = [self.heard[row] for tick in ticks for row in tick.heard[receive]]
+        return tuple(dict.fromkeys((one.way, one.sent.channel) for one in heard))
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +174,7 @@ def build_schedules(
     *,
     order: Sequence[str] = ORDER,
 ) -> tuple[Schedule, ...]:
-    """Build the schedule of every kind, over the frame they share.
+    """Build the schedule of every group, over the frame they share; equal ones are one object.
 
     Parameters
     ----------
@@ -165,27 +188,85 @@ def build_schedules(
         The order of coincident events, a permutation of `ORDER`. With "act" before "tick", a value that acts
         at once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and
         "tick" before "deliver" for a packet that arrives exactly at a tick.
+
+    Raises
+    ------
+    ApcError
+        E801 a mean, maximum or minimum over nobody.
     """
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
     rank = {name: place for place, name in enumerate(order)}
+    exchange = build_exchange(system, timings)
     live = [_live_outputs(pattern) for pattern in patterns]
     read = [_live_receives(pattern, outputs) for pattern, outputs in zip(patterns, live, strict=True)]
-    times = _times(system, timings, patterns, live, read)
+    ears = [_ears(system, patterns, exchange, group, read) for group in range(len(system.groups))]
+    times = _times(system, timings, patterns, live, ears)
 
-    heard = [
-        _heard_at_ticks(pattern.kind, system, outputs, receives, times, rank)
-        for pattern, outputs, receives in zip(patterns, live, read, strict=True)
-    ]
+    known: dict[tuple[int, _Ears], dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]] = {}
     depth: dict[Sent, int] = {}
-    for by_tick in heard:
-        for row in by_tick.values():
-            for one in row:
-                if one is not None:
-                    depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
-    return tuple(
-        _build(pattern, system, outputs, by_tick, depth, times, rank)
-        for pattern, outputs, by_tick in zip(patterns, live, heard, strict=True)
-    )
+    for group, own in zip(system.groups, ears, strict=True):
+        if (group.kind, own) not in known:
+            heard = _heard_at_ticks(patterns[group.kind], exchange, live[group.kind], own, times, rank)
+            known[group.kind, own] = heard
+            for one in (one for row in heard.values() for receive in row for one in receive):
+                depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
+    built = {
+        (kind, own): _build(patterns[kind], system, live[kind], heard, depth, times, rank)
+        for (kind, own), heard in known.items()
+    }
+    return tuple(built[group.kind, own] for group, own in zip(system.groups, ears, strict=True))
+
+
+# For each clock partition and receive: the ways it hears, and the channel of the link on each.
+_Ears = tuple[tuple[tuple[tuple[Way, str], ...], ...], ...]
+
+
+def _ears(
+    system: CompiledSystem,
+    patterns: Sequence[LinearSite],
+    exchange: Exchange,
+    group: int,
+    read: Sequence[frozenset[tuple[int, int]]],
+) -> _Ears:
+    """Return what the receives of a group hear."""
+    pattern = patterns[system.groups[group].kind]
+    everybody: list[tuple[tuple[tuple[Way, str], ...], ...]] = []
+    for p, (partition, tick) in enumerate(zip(pattern.kind.clocks, pattern.ticks, strict=True)):
+        own: list[tuple[tuple[Way, str], ...]] = []
+        for place, (receive, channels) in enumerate(zip(partition.receives, tick.channels, strict=True)):
+            if (p, place) not in read[system.groups[group].kind] or not channels:
+                own.append(())
+                continue
+            names = _channels(system, group, receive.link)
+            sending = [
+                any(send.link == receive.link for send in system.kinds[one.kind].sends)
+                for one in system.groups
+            ]
+            senders = exchange.hears(receive.link, group, sending)
+            if not senders and receive.operator != "sum":
+                peer = int(exchange.starts[group])
+                check_mean(exchange, peer, receive.link, receive.operator, False, Fraction(0))
+            delays = dict.fromkeys(exchange.delay(receive.link, sender, group) for sender in senders)
+            edge = edge_name(partition, receive)
+            own.append(
+                tuple(
+                    (
+                        Way(receive.operator, receive.link, delay, edge, names[c] if edge else ""),
+                        names[c],
+                    )
+                    for delay in delays
+                    for c in channels
+                )
+            )
+        everybody.append(tuple(own))
+    return tuple(everybody)
+
+
+def _channels(system: CompiledSystem, group: int, link: str) -> tuple[str, ...]:
+    """Return the names of a link's channels, as the group's own kind sends them, or else some other kind."""
+    own = system.groups[group].kind
+    kinds = [system.kinds[own], *system.kinds]
+    return next(send.channels for kind in kinds for send in kind.sends if send.link == link)
 
 
 def _live_outputs(pattern: LinearSite) -> frozenset[tuple[int, int]]:
@@ -233,24 +314,24 @@ def _times(
     timings: Mapping[str, Fraction],
     patterns: Sequence[LinearSite],
     live: Sequence[frozenset[tuple[int, int]]],
-    read: Sequence[frozenset[tuple[int, int]]],
+    ears: Sequence[_Ears],
 ) -> _Times:
     """Find the quantum of which every period, phase and delay in use is a multiple, and the frame."""
     clock_of = {clock.name: clock for clock in system.clocks}
     link_of = {link.name: link for link in system.links}
     clocks: dict[str, Clock] = {}
     delays: dict[str, Fraction] = {}
-    for pattern, outputs, receives in zip(patterns, live, read, strict=True):
+    for pattern, outputs in zip(patterns, live, strict=True):
         for partition, _ in outputs:
             name = pattern.kind.clocks[partition].clock
             clocks[name] = clock_of[name]
         for hold, used in zip(pattern.kind.holds, _live_holds(pattern, outputs), strict=True):
             if used:
                 delays[hold.delay] = timings[hold.delay]
-        for partition, row in receives:
-            link = link_of[pattern.kind.clocks[partition].receives[row].link]
-            clocks[link.clock] = clock_of[link.clock]
-            delays[link.delay] = timings[link.delay]
+    for way, _ in (pair for own in ears for partition in own for receive in partition for pair in receive):
+        clock = link_of[way.link].clock
+        clocks[clock] = clock_of[clock]
+        delays[way.delay] = timings[way.delay]
     if not clocks:  # nothing is sampled: any frame will do
         clocks = dict(clock_of) or {"": Clock("", "", "")}
     period = {name: timings[clock.period] if name else Fraction(1) for name, clock in clocks.items()}
@@ -275,58 +356,54 @@ def _common_divisor(times: Iterable[Fraction]) -> Fraction:
 
 
 def _heard_at_ticks(
-    kind: Kind,
-    system: CompiledSystem,
+    pattern: LinearSite,
+    exchange: Exchange,
     live: frozenset[tuple[int, int]],
-    read: frozenset[tuple[int, int]],
+    ears: _Ears,
     times: _Times,
     rank: Mapping[str, int],
-) -> dict[tuple[int, int], tuple[Heard | None, ...]]:
+) -> dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]:
     """Return, for every (partition, tick) of the frame, what each receive of the partition hears."""
-    link_of = {link.name: link for link in system.links}
-    channels = {sending.link: sending.channels for sending in kind.sends}
-    heard: dict[tuple[int, int], tuple[Heard | None, ...]] = {}
+    heard: dict[tuple[int, int], tuple[tuple[Heard, ...], ...]] = {}
     for p in sorted({partition for partition, _ in live}):
-        partition = kind.clocks[p]
-        grid = times.clocks[partition.clock]
+        grid = times.clocks[pattern.kind.clocks[p].clock]
         for index in range(times.frame // grid.period):
-            row: list[Heard | None] = []
-            for place, receive in enumerate(partition.receives):
-                if (p, place) not in read:
-                    row.append(None)
-                    continue
-                number = _newest_packet(link_of[receive.link], grid.at(index), times, rank)
-                slots = times.frame // times.clocks[link_of[receive.link].clock].period
-                frames, slot = divmod(number, slots)
-                sent = Sent(receive.link, channels[receive.link][receive.channel], slot)
-                row.append(Heard(receive.operator, sent, -frames))
-            heard[p, index] = tuple(row)
+            heard[p, index] = tuple(
+                tuple(
+                    _newest(way, channel, exchange.links[way.link], grid.at(index), times, rank)
+                    for way, channel in receive
+                )
+                for receive in ears[p]
+            )
     return heard
 
 
-def _newest_packet(link: Link, instant: int, times: _Times, rank: Mapping[str, int]) -> int:
-    """Return the number of the newest packet a tick at `instant` sees; negative: of an earlier frame."""
-    delay = times.delays[link.delay]
+def _newest(
+    way: Way, channel: str, link: Link, instant: int, times: _Times, rank: Mapping[str, int]
+) -> Heard:
+    """Return the newest packet on a way that a tick at `instant` sees."""
+    delay, grid = times.delays[way.delay], times.clocks[link.clock]
     missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0
-    number = times.clocks[link.clock].newest(instant - delay, strictly=rank["tick"] < rank["deliver"])
-    return number - missed
+    number = grid.newest(instant - delay, strictly=rank["tick"] < rank["deliver"]) - missed
+    frames, slot = divmod(number, times.frame // grid.period)  # a negative number is of an earlier frame
+    return Heard(way, Sent(way.link, channel, slot), -frames)
 
 
 def _build(
     pattern: LinearSite,
     system: CompiledSystem,
     live: frozenset[tuple[int, int]],
-    heard_at: Mapping[tuple[int, int], tuple[Heard | None, ...]],
+    heard_at: Mapping[tuple[int, int], tuple[tuple[Heard, ...], ...]],
     depth: Mapping[Sent, int],
     times: _Times,
     rank: Mapping[str, int],
 ) -> Schedule:
-    """Build one kind's schedule, once it is known what the whole system hears."""
+    """Build one schedule, once it is known what the whole system hears."""
     kind, frame = pattern.kind, times.frame
     partition_of = {partition.clock: index for index, partition in enumerate(kind.clocks)}
     grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
     holds = _live_holds(pattern, live)
-    heard = tuple(sorted({one for row in heard_at.values() for one in row if one is not None}))
+    heard = tuple(sorted({one for row in heard_at.values() for receive in row for one in receive}))
     place_of = {one: index for index, one in enumerate(heard)}
     channels = {sending.link: sending.channels for sending in kind.sends}
     sent = tuple(sorted(one for one in depth if one.channel in channels.get(one.link, ())))
@@ -334,7 +411,7 @@ def _build(
     # Everything that happens, as (instant, rank, event); propagation fills the gaps.
     happenings: list[tuple[int, int, Event | None]] = []
     for (p, index), row in heard_at.items():
-        places = tuple(-1 if one is None else place_of[one] for one in row)
+        places = tuple(tuple(place_of[one] for one in receive) for receive in row)
         instant = times.clocks[kind.clocks[p].clock].at(index)
         happenings.append((instant, rank["tick"], Tick(p, index, places)))
     for p, sending in enumerate(kind.sends):

@@ -39,6 +39,10 @@ SMALL = 1e-2
 WIDE = 1e-8
 SPLITS_TRIED = 6
 
+# Above so many states, the vectors of small eigenvalues come from the Schur form: a singular value
+# decomposition for each of them costs n⁴.
+MOST_SINGULAR = 128
+
 # Powers of a block of small eigenvalues that bound its resolvent: a queue of that many packets is empty by
 # then.
 RESOLVENT_POWERS = 32
@@ -302,8 +306,8 @@ def _enclose(matrix: Floats, error: Floats, limit: float) -> _Enclosure:
     if not defect < 0.5:
         return whole
     rows = (weight @ doubt).sum(axis=1)
-    # A row of (I − F)⁻¹ Z: its own, and at most defect/(1 − defect) of the largest of them.
-    rows = rows + defect / (1 - defect) * float(rows.max())
+    # A row of (I − F)⁻¹ Z = Z + F (I − F)⁻¹ Z: its own, and F's own row over the largest of (I − F)⁻¹ Z.
+    rows = rows + wrong.sum(axis=1) / (1 - defect) * float(rows.max())
     centres, radii = values.copy(), rows
     centres[large:] = 0.0
     radii[large:] = _resolvent_radius(form[large:, large:], float(np.linalg.norm(rows[large:])))
@@ -399,10 +403,17 @@ def _plain_vectors(matrix: Floats, found: _Enclosure, values: Complexes) -> tupl
     """Return right vectors (columns) and left vectors (rows) in the order of the values.
 
     The large ones are columns of X and rows of its inverse. Of a small or defective one the vectors are
-    singular vectors of M − λ: some vector that is right to rounding, where no full set exists.
+    singular vectors of M − λ: some vector that is right to rounding, where no full set exists; in a large
+    matrix vectors of the Schur form, which are as good as the eigenvalue is apart from others.
     """
     n = len(matrix)
     right, left = found.right.copy(), found.inverse.copy()
+    if n > MOST_SINGULAR:
+        # Their part of the Schur form, still triangular; a vector's own size serves for its left one.
+        block = np.triu(found.inverse[found.large :] @ matrix @ found.right[:, found.large :])
+        right[:, found.large :] = found.right[:, found.large :] @ _triangular_vectors(block)
+        left[found.large :] = right[:, found.large :].conj().T
+        return right, left
     for i in range(found.large, n):
         rows, _, columns = np.linalg.svd(matrix - values[i] * np.eye(n))
         right[:, i], left[i] = columns[-1].conj(), rows[:, -1].conj()

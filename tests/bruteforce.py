@@ -18,7 +18,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything about the scene, times in exact seconds; `users` overrides values a user."""
+    """Everything about the scene, times in exact seconds; `users` overrides values a user.
+
+    `weights` are those of (sender, receiver) pairs, all others are not heard; None is 1 for every pair.
+    `late` are delays of pairs other than `comm`. With `pairs`, the stiffness between (receiver, sender), F_T
+    is the weighted operator over the differences to each other one, each with a stiffness of its own.
+    """
 
     operator: str = "mean"
     peers: int = 3
@@ -38,6 +43,16 @@ class Scene:
     haptic_phase: Fraction = Fraction(0)
     network_phase: Fraction = Fraction(0)
     users: tuple[dict[str, float], ...] = field(default=())
+    weights: dict[tuple[int, int], float] | None = None
+    late: dict[tuple[int, int], Fraction] = field(default_factory=dict)
+    pairs: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    def hears(self, receiver: int) -> list[tuple[int, float]]:
+        """Return whom a peer hears, with weights."""
+        others = (sender for sender in range(self.peers) if sender != receiver)
+        if self.weights is None:
+            return [(sender, 1) for sender in others]
+        return [(j, self.weights[j, receiver]) for j in others if (j, receiver) in self.weights]
 
 
 def frame_matrix(
@@ -50,7 +65,7 @@ def frame_matrix(
     """
     frame = _frame(scene.haptic, scene.network)
     force_depth = math.ceil(scene.comp / scene.haptic) + 1
-    packet_depth = math.ceil(scene.comm / scene.network) + 1
+    packet_depth = math.ceil(max(scene.comm, *scene.late.values(), Fraction(0)) / scene.network) + 1
     n = scene.peers * (4 + 3 * force_depth + 2 * packet_depth)
     columns = []
     for column in range(n):
@@ -119,21 +134,32 @@ def _one_frame(
             for i in range(scene.peers):
                 packets[i].append((now, motion[i][2], motion[i][3]))
         if (now - haptic_0) % scene.haptic == 0:
-            arrived = [newest(listed, now, scene.comm) for listed in packets]
             for i, (x, v, x_o, v_o) in enumerate(motion):
                 p = value[i]
-                heard = [arrived[j] for j in range(scene.peers) if j != i]
-                others = number(len(heard))
-                share = others if scene.operator == "mean" else number(1)
-                weight = number(1) if scene.operator == "mean" else others
-                position = sum((one[1] for one in heard), number(0)) / share
-                velocity = sum((one[2] for one in heard), number(0)) / share
+                weights = scene.hears(i)
+                heard = [
+                    (number(weight), j, newest(packets[j], now, scene.late.get((j, i), scene.comm)))
+                    for j, weight in weights
+                ]
+                total = sum((weight for weight, _, _ in heard), number(0))
+                share = total if scene.operator == "mean" else number(1)
+                own = number(1) if scene.operator == "mean" else number(scene.peers - 1)
+                position = sum((weight * one[1] for weight, _, one in heard), number(0)) / share
+                velocity = sum((weight * one[2] for weight, _, one in heard), number(0)) / share
+                owned = own * (p["kt"] * x_o + p["bt"] * v_o)
+                others = -p["kt"] * position - p["bt"] * velocity
+                if scene.pairs:
+                    owned, others = number(0), number(0)
+                    for weight, j, one in heard:
+                        stiffness = number(scene.pairs[i, j])
+                        owned += weight / share * (stiffness * x_o + p["bt"] * v_o)
+                        others -= weight / share * (stiffness * one[1] + p["bt"] * one[2])
                 forces[i].append(
                     (
                         now,
                         p["kc"] * (x - x_o) + p["bc"] * (v - v_o),
-                        weight * (p["kt"] * x_o + p["bt"] * v_o),
-                        -p["kt"] * position - p["bt"] * velocity,
+                        owned,
+                        others,
                     )
                 )
         duration = following - now

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from apc.compiler.compiled import (
     Clock,
     ClockPartition,
+    Column,
     CompiledSystem,
     Graph,
     Group,
@@ -19,6 +20,7 @@ from apc.compiler.compiled import (
     Kind,
     Link,
     Origin,
+    PairDelay,
     Parameter,
     Receive,
     SendPartition,
@@ -160,6 +162,61 @@ def paper(
         dropped=(),
         origin=Origin("paper.yaml", ()),
     )
+
+
+def linked(
+    system: CompiledSystem,
+    graph: str | Sequence[tuple[int, int, float]] = "complete",
+    *,
+    delays: Mapping[tuple[str, str], Fraction] | None = None,
+) -> CompiledSystem:
+    """Return the system with a graph, in words or as (sender, receiver, weight), and delays of pairs."""
+    [link] = system.links
+    if isinstance(graph, str):
+        shape = Graph(graph, COMPLETE.arcs, COMPLETE.weights)
+    else:
+        arcs = np.array([arc[:2] for arc in graph], np.int64).reshape(-1, 2)
+        shape = Graph("arcs", arcs, np.array([arc[2] for arc in graph], np.float64))
+    timed = [
+        (PairDelay(a, b, f"lan.delay {a} {b}"), Timing(f"lan.delay {a} {b}", value))
+        for (a, b), value in (delays or {}).items()
+    ]
+    return replace(
+        system,
+        links=(replace(link, graph=shape, delays=tuple(pair for pair, _ in timed)),),
+        timings=(*system.timings, *(timing for _, timing in timed)),
+    )
+
+
+def columned(system: CompiledSystem, **columns: Sequence[float]) -> CompiledSystem:
+    """Return the system, of one group, with parameters that differ from peer to peer (`device__mass=…`)."""
+    [group] = system.groups
+    listed = tuple(
+        Column(name.replace("__", "."), np.array(values, np.float64)) for name, values in columns.items()
+    )
+    return replace(system, groups=(replace(group, columns=listed),))
+
+
+def edged(system: CompiledSystem, operator: str = "sum", *, cubic: float = 0.0) -> CompiledSystem:
+    """Return the system with F_T an operator over the others of K_T d + B_T ḋ + cubic d³, d to each other."""
+    [kind] = system.kinds
+    [partition] = kind.clocks
+    x, p, t = casadi.SX.sym("x", 4), casadi.SX.sym("p", len(NAMES)), casadi.SX.sym("t")
+    u, m, s, r = (casadi.SX.sym(name, size) for name, size in (("u", 2), ("m", 0), ("s", 2), ("r", 2)))
+    named = dict(zip(NAMES, casadi.vertsplit(p), strict=True))
+    apart = x[2] - s[0]
+    pull = named["coordination.stiffness"] * apart + named["coordination.damping"] * (x[3] - s[1])
+    if cubic:
+        pull += cubic * apart**3
+    edge = casadi.Function("edge", [x, u, m, s, p, t], [pull])
+    contact = partition.tick(x, u, m, casadi.SX.zeros(2), p, t)[0]
+    clock = replace(
+        partition,
+        receives=(Receive("pull", operator, "lan", 0, edge), Receive("others", "count", "lan", 0)),
+        # The count is read, and changes nothing that moves.
+        tick=casadi.Function("tick", [x, u, m, r, p, t], [casadi.vertcat(contact, r[0] + 0.5 * r[1])]),
+    )
+    return replace(system, kinds=(replace(kind, clocks=(clock,)),))
 
 
 def alone(

@@ -7,14 +7,18 @@ import math
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import casadi
+import numpy as np
 import pytest
+from apc.compiler.compiled import Timing
+from apc.compiler.errors import ApcError
 from apc.runtime.analysis import analyze_dense, analyze_modes, prepare
 from apc.runtime.parameters import apply, parse_override
 
-from tests.sites import MS, alone, paper
+from tests.sites import MS, alone, columned, edged, grouped, linked, paper
 
 
 def test_the_answer_is_plain_data() -> None:
@@ -32,6 +36,7 @@ def test_the_answer_is_plain_data() -> None:
         "rigid_modes",
         "modes",
         "linearized",
+        "notes",
     ]
     assert (found["topology"], found["peers"], found["frame_s"]) == ("paper", 3, 0.008)
     assert (found["states_per_peer"], found["method"], found["stable"]) == (8, "modes", True)
@@ -60,9 +65,14 @@ def test_another_order_of_coincident_events_can_change_the_radius() -> None:
     assert analyze_modes(system, prepared=late).spectral_radius != analyze_modes(system).spectral_radius
 
 
-def test_one_peer_alone_hears_nobody_and_a_scene_that_says_otherwise_is_ours_to_refuse() -> None:
-    with pytest.raises(AssertionError, match="nobody else sends"):
+def test_a_mean_over_nobody_is_refused_and_a_sum_over_nobody_is_nothing() -> None:
+    with pytest.raises(ApcError, match=r"E801 user\[1\] hears nobody over lan: there is no mean over nobody"):
         analyze_modes(paper(peers=1))
+    alone_in_a_sum = analyze_modes(paper("sum", peers=1, kc=500.0))
+    nobody_to_hear = analyze_modes(paper("mean", peers=2, kc=500.0, kt=0.0))
+    # Without a network the frame is one tick of the force clock, an eighth of the other.
+    assert alone_in_a_sum.frame_s == 0.001
+    assert alone_in_a_sum.spectral_radius**8 == pytest.approx(nobody_to_hear.spectral_radius, abs=1e-12)
 
 
 def test_a_million_peers_cost_what_three_do() -> None:
@@ -122,3 +132,122 @@ def test_a_site_that_is_not_affine_is_said_to_be_linearized() -> None:
     cubic = alone(lambda x, u: -x - x**3 + u, lambda x, u, m: -3 * x)
     assert analyze_modes(cubic).linearized
     assert not analyze_modes(paper()).linearized
+
+
+# ---- graphs, and peers that differ ----
+
+
+def test_a_graph_that_splits_and_one_that_does_not_say_so() -> None:
+    ring = analyze_modes(linked(paper(peers=8), "ring"))
+    assert (ring.method, ring.notes) == (
+        "modes",
+        ("5 systems, one an eigenvalue of the graph of lan (ring)",),
+    )
+    assert ring.to_dict()["notes"] == list(ring.notes)
+    different = analyze_modes(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.1]))
+    assert different.method == "dense"
+    assert different.notes == ("all peers as one system: the peers on lan (ring) differ",)
+    assert analyze_modes(paper()).notes == ()
+
+
+@pytest.mark.parametrize("graph", ["ring", "star", [(0, 1, 0.5), (1, 0, 0.25), (1, 2, 1.0), (2, 0, 3.0)]])
+@pytest.mark.parametrize("values", [{}, {"kt": 0.0}, {"kc": 2500.0}])
+def test_on_a_graph_the_split_and_the_whole_agree(graph: str, values: dict[str, float]) -> None:
+    system = linked(paper(peers=4 if isinstance(graph, str) else 3, **values), graph)
+    few, whole = analyze_modes(system), analyze_dense(system)
+    assert (few.method, whole.method) == ("modes", "dense")
+    assert few.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-9)
+    assert (few.verdict, few.rigid_modes) == (whole.verdict, whole.rigid_modes)
+    assert few.spectral_radius_error < 1e-8
+    assert sum(mode.multiplicity for mode in few.modes) == len(whole.modes)
+
+
+def test_two_pairs_that_do_not_hear_each_other_translate_apart() -> None:
+    pairs = [(0, 1, 1.0), (1, 0, 1.0), (2, 3, 1.0), (3, 2, 1.0)]
+    found = analyze_modes(linked(paper(peers=4), pairs))
+    assert (found.rigid_modes, found.verdict) == (2, "stable up to a common translation")
+
+
+def test_a_mean_whose_weights_add_up_to_nothing_is_refused() -> None:
+    arcs = [(0, 1, 1.0), (2, 1, -1.0), (1, 0, 1.0), (1, 2, 1.0)]
+    message = r"E802 the weights of what user\[2\] hears over lan add up to 0: there is no mean"
+    for analyse in (analyze_modes, analyze_dense):
+        with pytest.raises(ApcError, match=message):
+            analyse(linked(paper(), arcs))
+        with pytest.raises(ApcError, match=r"E801 user\[1\] hears nobody over lan"):
+            analyse(linked(paper(), arcs[:2]))
+    assert analyze_modes(linked(paper("sum"), arcs)).method in ("modes", "dense")
+
+
+def test_more_different_peers_than_one_system_holds_are_refused_and_as_many_equal_ones_are_not() -> None:
+    many = 100_000
+    different = columned(paper(peers=many), device__mass=0.1 + 1e-6 * np.arange(many))
+    started = time.perf_counter()
+    with pytest.raises(ApcError, match=r"E804 100,000 different peers make one system of 800,000 states"):
+        analyze_modes(different)
+    moved = columned(paper(peers=many), device__x__start=1e-6 * np.arange(many))
+    assert analyze_modes(moved).spectral_radius == analyze_modes(paper(peers=many)).spectral_radius
+    assert time.perf_counter() - started < 10.0
+    with pytest.raises(ApcError, match=r"E804 200 peers make one system of 1,600 states"):
+        analyze_dense(paper(peers=200))
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+def test_an_affine_edge_function_says_the_same_as_the_formula_it_stands_for(operator: str) -> None:
+    gains = {"kt": 700.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
+    edge, plain = edged(paper(operator, **gains), operator), paper(operator, **gains)
+    one, other = analyze_modes(edge), analyze_modes(plain)
+    assert not one.linearized
+    assert one.spectral_radius == pytest.approx(other.spectral_radius, abs=1e-12)
+    assert (one.verdict, one.rigid_modes) == (other.verdict, other.rigid_modes)
+    assert analyze_modes(edged(paper(**gains), cubic=1.0)).linearized
+
+
+def test_the_largest_of_equal_peers_has_no_linearization() -> None:
+    message = r"E803 pull of user\[1\]: max over equal peers has no linearization"
+    with pytest.raises(ApcError, match=message):
+        analyze_modes(edged(paper(), "max"))
+    apart = columned(edged(paper(), "max"), cube__x__start=[0.0, 0.01, 0.02])
+    assert analyze_modes(apart).linearized
+    # Two peers: the only other one is the largest, and the smallest, and the mean.
+    two = [
+        analyze_modes(edged(paper(peers=2), operator)).spectral_radius for operator in ("max", "min", "mean")
+    ]
+    assert two == pytest.approx([two[0]] * 3, abs=1e-12)
+
+
+def test_the_largest_is_the_one_that_starts_furthest_away() -> None:
+    """F_T = K max_j (x_i − x_j): everyone hears the lowest, the lowest the next: a graph of arcs."""
+    starts = [0.03, 0.0, 0.01]
+    arcs = [(1, 0, 1.0), (2, 1, 1.0), (1, 2, 1.0)]
+    largest = columned(edged(paper(), "max"), cube__x__start=starts)
+    assert analyze_modes(largest).spectral_radius == pytest.approx(
+        analyze_dense(linked(paper(), arcs)).spectral_radius, abs=1e-10
+    )
+
+
+def test_a_group_of_its_own_delay_is_a_kind_with_a_timing_of_its_own() -> None:
+    """Kinds alike but for the timing of a hold: with equal times they are one, otherwise not."""
+    both = grouped(paper(kc=900.0), ("left", 1, {}), ("right", 2, {}))
+    [kind] = both.kinds
+    late = replace(kind, name="late", holds=tuple(replace(h, delay="late." + h.delay) for h in kind.holds))
+    names = [hold.delay for hold in late.holds]
+    for delay in (MS, 2 * MS):
+        system = replace(
+            both,
+            kinds=(kind, late),
+            groups=(both.groups[0], replace(both.groups[1], kind=1)),
+            timings=(*both.timings, *(Timing(name, delay) for name in names)),
+        )
+        found, whole = analyze_modes(system), analyze_dense(system)
+        assert found.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-10)
+        same = analyze_modes(both).spectral_radius
+        assert (found.spectral_radius == pytest.approx(same, abs=1e-10)) == (delay == MS)
+
+
+def test_the_largest_takes_no_weights() -> None:
+    cycle = [(0, 1, 0.7), (1, 2, 0.7), (2, 0, 0.7)]
+    largest = analyze_modes(linked(edged(paper(), "max"), cycle))
+    plain = analyze_modes(linked(paper("mean"), [(i, j, 1.0) for i, j, _ in cycle]))
+    assert largest.method == "dense"
+    assert largest.spectral_radius == pytest.approx(plain.spectral_radius, abs=1e-10)

@@ -17,7 +17,7 @@ from tests.sites import MS, alone, paper
 
 
 def _lifted(**values: object) -> LiftedSite:
-    [group] = lifted_groups(paper(**values))  # type: ignore[arg-type]
+    [group], _ = lifted_groups(paper(**values))  # type: ignore[arg-type]
     return group.lifted
 
 
@@ -52,7 +52,7 @@ def test_one_rate_without_delay_is_the_sampled_closed_loop_of_the_textbook() -> 
 
 def test_what_is_heard_and_sent_on_in_one_frame_is_nilpotent() -> None:
     lifted = _lifted(network=2 * MS, haptic=3 * MS, comm=Fraction(0), comp=Fraction(0))
-    [group] = lifted_groups(paper(network=2 * MS, haptic=3 * MS, comm=Fraction(0), comp=Fraction(0)))
+    [group], _ = lifted_groups(paper(network=2 * MS, haptic=3 * MS, comm=Fraction(0), comp=Fraction(0)))
     assert lifted.d.any()
     feedback = np.zeros((len(lifted.s), len(lifted.s)))
     for place, one in enumerate(group.schedule.heard):
@@ -79,7 +79,7 @@ def test_no_digit_is_lost_as_the_damping_goes_to_zero(damping: float) -> None:
             replace(p, value=damping) if p.name == "device.damping" else p for p in system.parameters
         ),
     )
-    [group] = lifted_groups(system)
+    [group], _ = lifted_groups(system)
     rate = damping / 0.1
     expected = -np.expm1(-rate * 0.008) / rate if rate else 0.008
     assert group.lifted.p[0, 1] == pytest.approx(expected, rel=1e-13)
@@ -92,7 +92,7 @@ GAMMA = float(-np.expm1(-0.001))
 
 
 def _alone(**values: Any) -> LiftedSite:
-    [group] = lifted_groups(alone(lambda x, u: -x + u, **values))
+    [group], _ = lifted_groups(alone(lambda x, u: -x + u, **values))
     return group.lifted
 
 
@@ -122,6 +122,6 @@ def test_a_tick_that_reads_a_hold_reads_it_before_it_switches() -> None:
 
 
 def test_a_site_without_clocks_is_its_exponential() -> None:
-    [group] = lifted_groups(alone())
+    [group], _ = lifted_groups(alone())
     assert group.lifted.frame_s == 1.0
     np.testing.assert_allclose(group.lifted.p, [[np.exp(-1.0)]], rtol=1e-15)

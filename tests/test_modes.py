@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis import lifted_groups
-from apc.runtime.modes import dense, modes
+from apc.runtime.modes import dense, modes, split
 
 from tests.bruteforce import Scene, frame_matrix
-from tests.sites import MS, grouped, paper
+from tests.sites import MS, columned, edged, grouped, linked, paper
 
 # Queues that run empty make defective eigenvalues at zero, which rounding scatters by its n-th root: all that
 # is smaller than this per frame is compared by number only.
@@ -20,9 +20,8 @@ SMALL = 1e-2
 
 def _split(system: CompiledSystem) -> np.ndarray:
     """Return all eigenvalues of the split system, each as often as it counts."""
-    return np.concatenate(
-        [np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in modes(lifted_groups(system))]
-    )
+    systems = split(*lifted_groups(system)).systems
+    return np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
 
 
 def _apart(one: np.ndarray, other: np.ndarray, *, same_size: bool = True) -> float:
@@ -47,7 +46,7 @@ def test_common_and_difference_modes_are_the_whole_spectrum(peers: int) -> None:
     gains = GAINS if operator == "mean" else {**GAINS, "kt": 800.0 / peers, "bt": 2.0 / peers}
     comp = MS if peers <= 8 else Fraction(0)
     system = paper(operator, peers=peers, comp=comp, **gains)
-    whole = np.linalg.eigvals(dense(lifted_groups(system)).matrix)
+    whole = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
     assert _apart(_split(system), whole) < 1e-12
 
 
@@ -58,21 +57,21 @@ def test_groups_are_the_whole_spectrum_too() -> None:
         ("right", 3, {"contact.stiffness": 900.0}),
         ("alone", 1, {"cube.damping": 7.0}),
     )
-    groups = lifted_groups(system)
-    assert [(one.name, one.multiplicity) for one in modes(groups)] == [
+    groups, exchange = lifted_groups(system)
+    assert [(one.name, one.multiplicity) for one in modes(groups, exchange)] == [
         ("common", 1),
         ("difference left", 1),
         ("difference right", 2),
     ]
-    assert modes(groups)[0].names[:2] == ("left.device.x", "left.device.v")
-    assert _apart(_split(system), np.linalg.eigvals(dense(groups).matrix)) < 1e-12
+    assert modes(groups, exchange)[0].names[:2] == ("left.device.x", "left.device.v")
+    assert _apart(_split(system), np.linalg.eigvals(dense(groups, exchange).matrix)) < 1e-12
 
 
 def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
     system = grouped(paper(), ("left", 2, {"device.x.start": 0.1}), ("right", 1, {"hand.force": 2.0}))
-    [group] = lifted_groups(system)
+    [group], exchange = lifted_groups(system)
     assert (group.name, group.count) == ("left+right", 3)
-    assert [one.name for one in modes([group])] == ["common", "difference"]
+    assert [one.name for one in modes([group], exchange)] == ["common", "difference"]
 
 
 CONVENTIONS: list[dict[str, object]] = [
@@ -112,6 +111,172 @@ def test_different_peers_stepped_one_by_one_have_the_same_spectrum() -> None:
     assert _apart(_split(system), whole, same_size=False) < 1e-12
 
 
+def _brute(scene: Scene) -> np.ndarray:
+    return np.linalg.eigvals(np.array(frame_matrix(scene)))
+
+
+def _arcs(name: str, peers: int) -> list[tuple[int, int, float]]:
+    """Return graphs as (sender, receiver, weight): by hand what `ring` and `star` mean, and others."""
+    both = {
+        "ring": [(i, (i + 1) % peers, 1.0) for i in range(peers)],
+        "star": [(0, i, 1.0) for i in range(1, peers)],
+        "path": [(i, i + 1, 0.5 + i) for i in range(peers - 1)],
+        "two pairs": [(0, 1, 1.0), (2, 3, 1.0)],
+    }
+    if name in both:
+        return sorted({arc for i, j, w in both[name] for arc in ((i, j, w), (j, i, w))})
+    return {
+        "cycle": [(i, (i + 1) % peers, 0.7) for i in range(peers)],
+        "one way": [(i, i + 1, 1.0) for i in range(peers - 1)],
+        "apart": [(0, 1, 2.0), (1, 0, 2.0), (0, 2, -0.5), (3, 2, 1.5), (2, 3, 1.0)],
+    }[name]
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize("peers", [2, 3, 4, 5])
+@pytest.mark.parametrize("shape", ["ring", "star"])
+def test_equal_peers_on_a_ring_or_star_are_one_small_system_an_eigenvalue(
+    shape: str, peers: int, operator: str
+) -> None:
+    gains = {**GAINS, "kt": 300.0}
+    system = linked(paper(operator, peers=peers, **gains), shape)
+    weights = {(i, j): weight for i, j, weight in _arcs(shape, peers)}
+    found = split(*lifted_groups(system))
+    assert found.method == "modes"
+    assert {len(one.matrix) for one in found.systems} == {8}
+    assert sum(one.multiplicity for one in found.systems) == peers
+    assert (
+        _apart(_split(system), _brute(Scene(operator, peers, weights=weights, **gains)), same_size=False)
+        < 1e-11
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "operator", "method"),
+    [
+        ("path", "mean", "modes"),
+        ("path", "sum", "modes"),
+        ("two pairs", "mean", "modes"),
+        ("cycle", "sum", "modes"),
+        ("cycle", "mean", "modes"),
+        ("apart", "mean", "modes"),
+        ("one way", "sum", "dense"),  # nilpotent: no full set of eigenvectors
+    ],
+)
+def test_equal_peers_on_any_graph_have_the_spectrum_of_all_of_them(
+    name: str, operator: str, method: str
+) -> None:
+    arcs = _arcs(name, 4)
+    system = linked(paper(operator, peers=4, **GAINS), arcs)
+    scene = Scene(operator, 4, weights={(i, j): weight for i, j, weight in arcs}, **GAINS)
+    assert split(*lifted_groups(system)).method == method
+    # A defective eigenvalue scatters by the root of its rounding, four peers deep.
+    assert _apart(_split(system), _brute(scene), same_size=False) < (1e-10 if method == "modes" else 2e-3)
+    whole = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
+    assert _apart(whole, _brute(scene), same_size=False) < (1e-10 if method == "modes" else 2e-3)
+
+
+def test_a_ring_of_many_peers_costs_half_as_many_systems() -> None:
+    found = split(*lifted_groups(linked(paper(peers=40), "ring")))
+    assert [one.multiplicity for one in found.systems] == [1, *[2] * 19, 1]
+    assert found.systems[0].name == "common"
+    assert found.notes == ("21 systems, one an eigenvalue of the graph of lan (ring)",)
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+def test_different_peers_on_a_graph_are_one_whole_system(operator: str) -> None:
+    system = columned(linked(paper(operator, peers=4, **GAINS), "ring"), device__mass=[0.1, 0.2, 0.1, 0.3])
+    scene = Scene(
+        operator,
+        4,
+        weights={(i, j): weight for i, j, weight in _arcs("ring", 4)},
+        users=({}, {"device": 0.2}, {}, {"device": 0.3}),
+        **GAINS,
+    )
+    found = split(*lifted_groups(system))
+    assert (found.method, found.notes) == (
+        "dense",
+        ("all peers as one system: the peers on lan (ring) differ",),
+    )
+    assert found.systems[0].names[8] == "user[2].device.x"
+    assert _apart(_split(system), _brute(scene), same_size=False) < 1e-12
+
+
+def test_peers_that_differ_one_by_one_are_grouped_by_what_they_share() -> None:
+    system = columned(
+        paper(peers=5, **GAINS),
+        device__mass=[0.1, 0.2, 0.1, 0.1, 0.2],
+        hand__force=[1.0, 2.0, 3.0, 4.0, 5.0],
+    )
+    groups, exchange = lifted_groups(system)
+    assert [(one.name, one.count, one.peers.tolist()) for one in groups] == [
+        ("user[1,3,4]", 3, [0, 2, 3]),
+        ("user[2,5]", 2, [1, 4]),
+    ]
+    scene = Scene(peers=5, users=({}, {"device": 0.2}, {}, {}, {"device": 0.2}), **GAINS)
+    assert _apart(_split(system), _brute(scene), same_size=False) < 1e-12
+    assert [one.multiplicity for one in modes(groups, exchange)] == [1, 2, 1]
+
+
+PAIRS = {("left", "right"): 12 * MS, ("right", "left"): 3 * MS, ("right", "right"): 8 * MS}
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize("graph", ["complete", "ring"])
+@pytest.mark.parametrize(
+    "delays",
+    [PAIRS, {("left", "left"): Fraction(0), ("left", "right"): 4 * MS}, {("left", "right"): 8 * MS}],
+)
+def test_pairs_of_groups_may_have_delays_of_their_own(
+    operator: str, graph: str, delays: dict[tuple[str, str], Fraction]
+) -> None:
+    base = grouped(paper(operator, **{**GAINS, "kt": 200.0}), ("left", 2, {}), ("right", 2, {}))
+    system = linked(base, graph, delays=delays)
+    names = ["left", "left", "right", "right"]
+    scene = Scene(
+        operator,
+        4,
+        weights={(i, j): w for i, j, w in _arcs("ring", 4)} if graph == "ring" else None,
+        late={(i, j): delays.get((names[i], names[j]), 8 * MS) for i in range(4) for j in range(4)},
+        **{**GAINS, "kt": 200.0},  # type: ignore[arg-type]
+    )
+    groups, exchange = lifted_groups(system)
+    # A delay equal to the usual one is none of its own.
+    assert len(groups) == (1 if set(delays.values()) == {8 * MS} else 2)
+    assert split(groups, exchange).method == ("dense" if len(groups) == 2 and graph == "ring" else "modes")
+    assert _apart(_split(system), _brute(scene), same_size=False) < 1e-11
+
+
+def _cubic_pairs(starts: list[float], cubic: float) -> dict[tuple[int, int], float]:
+    """Return the slopes of K d + c d³ where each pair starts."""
+    everyone = range(len(starts))
+    return {
+        (i, j): GAINS["kt"] + 3 * cubic * (starts[i] - starts[j]) ** 2
+        for i in everyone
+        for j in everyone
+        if i != j
+    }
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize("graph", ["complete", "ring", "star", "apart"])
+@pytest.mark.parametrize("starts", [[0.0, 0.0, 0.0, 0.0], [0.01, 0.02, 0.05, 0.02]])
+def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, starts: list[float]) -> None:
+    base = edged(paper(operator, peers=4, **GAINS), operator, cubic=2e5)
+    arcs = None if graph == "complete" else _arcs(graph, 4)
+    system = columned(linked(base, arcs or "complete"), cube__x__start=starts)
+    scene = Scene(
+        operator,
+        4,
+        weights={(i, j): weight for i, j, weight in arcs} if arcs else None,
+        pairs=_cubic_pairs(starts, 2e5),
+        **GAINS,
+    )
+    assert _apart(_split(system), _brute(scene), same_size=False) < 1e-11
+    whole = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
+    assert _apart(whole, _brute(scene), same_size=False) < 1e-11
+
+
 @pytest.mark.parametrize("peers", [2, 3, 5, 20])
 @pytest.mark.parametrize(
     "values",
@@ -127,7 +292,7 @@ def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values
     gains = {"kc": 1500.0, "bc": 2.0}
     mesh = paper("sum", peers=peers, kt=900.0 / others, bt=3.0 / others, **gains, **values)  # type: ignore[arg-type]
     mean = paper("mean", peers=peers, kt=900.0, bt=3.0, **gains, **values)  # type: ignore[arg-type]
-    for one, other in zip(modes(lifted_groups(mesh)), modes(lifted_groups(mean)), strict=True):
+    for one, other in zip(modes(*lifted_groups(mesh)), modes(*lifted_groups(mean)), strict=True):
         size = np.abs(other.matrix).max()
         np.testing.assert_allclose(one.matrix, other.matrix, rtol=1e-12, atol=1e-12 * size)
         assert _apart(np.linalg.eigvals(one.matrix), np.linalg.eigvals(other.matrix)) < 1e-12
@@ -135,13 +300,15 @@ def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values
 
 def test_two_peers_cannot_tell_a_mean_from_a_sum() -> None:
     for one, other in zip(
-        modes(lifted_groups(paper("sum", peers=2))), modes(lifted_groups(paper("mean", peers=2))), strict=True
+        modes(*lifted_groups(paper("sum", peers=2))),
+        modes(*lifted_groups(paper("mean", peers=2))),
+        strict=True,
     ):
         np.testing.assert_array_equal(one.matrix, other.matrix)
 
 
 def test_a_million_peers_are_two_small_systems() -> None:
-    systems = modes(lifted_groups(paper(peers=1_000_000)))
+    systems = modes(*lifted_groups(paper(peers=1_000_000)))
     assert [(len(one.matrix), one.multiplicity) for one in systems] == [(8, 1), (8, 999_999)]
 
 
@@ -151,7 +318,7 @@ def test_the_error_bound_covers_the_matrix() -> None:
     with mpmath.workdps(50):
         rows = frame_matrix(Scene(peers=2, **GAINS, comp=Fraction(0)), number=_number, exp=mpmath.exp)
     system = paper(peers=2, comp=Fraction(0), **GAINS)
-    whole = dense(lifted_groups(system))
+    whole = dense(*lifted_groups(system))
     assert [name.split(".", 1)[1] for name in whole.names[:6]] == [
         "device.x",
         "device.v",

@@ -7,6 +7,8 @@ from fractions import Fraction
 import pytest
 from apc.runtime.analysis import analyze_modes
 from apc.runtime.needs import needs
+
+from tests.sites import columned, edged, linked, paper
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
 
 CONTACT, COORDINATION, LINK = "haptic, delay: 1 ms}", "haptic, delay: 1 ms, link", "network, delay: 8 ms}"
@@ -54,10 +56,28 @@ def test_more_peers_need_no_more(count: int) -> None:
 
 def test_different_groups_are_one_larger_system_and_a_difference_each() -> None:
     system = compiled(
-        replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 2 kg}}\n  two: {count: 2}"))
+        replaced(
+            AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 2 kg}}\n  two: {count: 2}")
+        )
     )
     assert needs(system).systems == ((1, 16), (1, 8))
 
 
 def test_one_peer_alone_is_one_small_system() -> None:
     assert str(needs(compiled(ONE_MASS))) == "2 states a peer (2 motion), 1 peer; analysed as 1 mode of 2"
+
+
+def test_graphs_and_different_peers_are_counted_as_they_are_analysed() -> None:
+    assert str(needs(linked(paper(peers=8), "ring"))).endswith("8 peers; analysed as 5 modes of 8")
+    different = columned(paper(), device__mass=[0.1, 0.2, 0.3])
+    assert str(needs(different)).endswith("3 peers; analysed as 1 system of 24")
+    assert needs(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.1])).systems == ((1, 24),)
+
+
+def test_what_is_evaluated_once_a_pair_of_peers_is_named() -> None:
+    assert str(needs(edged(paper()))).endswith(
+        "analysed as 2 modes of 8; costs N²: pull is evaluated once a pair of peers"
+    )
+    assert "not analysed: pull of user[1]: max over equal peers has no linearization" in str(
+        needs(edged(paper(), "max"))
+    )

@@ -10,7 +10,7 @@ from apc.runtime.linearize import jacobians
 from apc.runtime.parameters import resolve
 from apc.runtime.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, Tick, Value, build_schedules
 
-from tests.sites import MS, paper
+from tests.sites import MS, grouped, linked, paper
 
 
 def _schedule(order: tuple[str, ...] = ORDER, **values: object) -> Schedule:
@@ -18,6 +18,10 @@ def _schedule(order: tuple[str, ...] = ORDER, **values: object) -> Schedule:
     patterns = [jacobians(kind).pattern for kind in system.kinds]
     [schedule] = build_schedules(system, resolve(system).timings, patterns, order=order)
     return schedule
+
+
+def _lags(schedule: Schedule, tick: Tick) -> set[int]:
+    return {schedule.heard[row].lag for rows in tick.heard for row in rows}
 
 
 def _kinds(schedule: Schedule) -> list[str]:
@@ -36,7 +40,7 @@ def test_an_instant_sends_then_computes_then_acts() -> None:
 def test_a_tick_at_exactly_the_arrival_sees_the_packet() -> None:
     schedule = _schedule(comm=3 * MS)
     ticks = [event for event in schedule.events if isinstance(event, Tick)]
-    lags = [{schedule.heard[place].lag for place in tick.heard} for tick in ticks]
+    lags = [_lags(schedule, tick) for tick in ticks]
     assert lags == [{1}, {1}, {1}, {0}, {0}, {0}, {0}, {0}]
 
 
@@ -108,7 +112,7 @@ def test_two_packets_a_frame_are_two_slots() -> None:
 def test_another_order_of_coincident_events_changes_what_a_tie_means() -> None:
     stale_packet = _schedule(("send", "tick", "deliver", "act"), comm=3 * MS)
     ticks = [event for event in stale_packet.events if isinstance(event, Tick)]
-    assert [{stale_packet.heard[place].lag for place in tick.heard} for tick in ticks][3] == {1}
+    assert [_lags(stale_packet, tick) for tick in ticks][3] == {1}
     stale_force = _schedule(("send", "deliver", "act", "tick"), comp=Fraction(0))
     assert len(stale_force.carried) == 2
     early = _schedule(("deliver", "send", "tick", "act"), comm=Fraction(0))
@@ -123,6 +127,21 @@ def test_every_order_keeps_packets_causal() -> None:
             if isinstance(event, Send):
                 sent_at |= {row for _, row in event.rows}
             if isinstance(event, Tick):
-                for place in event.heard:
+                for place in (row for rows in event.heard for row in rows):
                     one: Heard = schedule.heard[place]
                     assert one.lag > 0 or schedule.sent.index(one.sent) in sent_at
+
+
+def test_a_group_hears_each_class_of_senders_as_late_as_it_is() -> None:
+    base = grouped(paper(), ("left", 2, {}), ("right", 1, {}), ("far", 1, {}))
+    system = linked(base, delays={("left", "right"): 16 * MS})
+    patterns = [jacobians(kind).pattern for kind in system.kinds]
+    left, right, far = build_schedules(system, resolve(system).timings, patterns)
+    assert left is far
+    assert {one.lag for one in left.heard} == {1}
+    assert {(one.way.delay, one.lag) for one in right.heard} == {
+        ("lan.delay left right", 2),
+        ("lan.delay", 1),
+    }
+    # Everyone keeps as many packets as anyone asks for.
+    assert left.depths == right.depths == (2, 2)

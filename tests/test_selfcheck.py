@@ -8,9 +8,9 @@ from fractions import Fraction
 import apc.runtime.selfcheck as selfcheck
 import pytest
 from apc.runtime.lift import LiftedSite, lift
-from apc.runtime.selfcheck import check_frame
+from apc.runtime.selfcheck import check_frame, skipped
 
-from tests.sites import MS, grouped, paper
+from tests.sites import MS, columned, edged, grouped, linked, paper
 
 
 @pytest.mark.parametrize(
@@ -39,3 +39,11 @@ def test_a_wrong_lift_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selfcheck, "lift", spoiled)
     with pytest.raises(AssertionError, match="one frame of user, stepped and lifted, differ by"):
         check_frame(paper())
+
+
+def test_pairs_with_other_delays_and_different_peers_are_checked_too() -> None:
+    base = grouped(paper(kt=800.0, bt=2.0), ("left", 2, {}), ("right", 2, {}))
+    assert check_frame(linked(base, delays={("left", "right"): 3 * MS})) < 1e-13
+    assert check_frame(columned(paper(), device__mass=[0.1, 0.2, 0.3])) < 1e-13
+    assert skipped(base) == ()
+    assert skipped(edged(base)) == ("user",)

@@ -14,7 +14,7 @@ from apc.runtime.analysis import Analysis, analyze_dense, analyze_modes
 from apc.runtime.spectrum import _eigen
 
 from tests.bruteforce import Scene, frame_matrix
-from tests.sites import MS, grouped, paper
+from tests.sites import MS, grouped, linked, paper
 
 # Rakhsha and Constantinescu's section III: device 0.1 kg, copy 0.2 kg, both 5 N·s/m, 1 ms and 8 ms; limits
 # were computed apart from this project by propagating the full map.
@@ -195,6 +195,28 @@ def test_near_the_boundary_the_verdict_is_right_or_undecided() -> None:
         "undecided: |ρ−1| below the error bound",
         "unstable",
     }
+
+
+@pytest.mark.parametrize(
+    "arcs",
+    [
+        [(0, 1, 0.7), (1, 2, 0.7), (2, 0, 0.7)],  # a complex pair
+        [(0, 1, 0.3), (1, 0, 0.3), (1, 2, 1.1), (2, 1, 1.1)],  # unequal weights
+    ],
+)
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+def test_on_a_graph_the_truth_is_within_every_bound(
+    operator: str, arcs: list[tuple[int, int, float]]
+) -> None:
+    gains = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
+    found = analyze_modes(linked(paper(operator, **gains), arcs))
+    truth = _truth(Scene(operator, weights={(i, j): weight for i, j, weight in arcs}, **gains))
+    assert found.method == "modes"
+    for mode in found.modes:
+        place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
+        assert min(float(abs(place - value).mid()) for value in truth) <= mode.error
+    assert sum(float(abs(value - 1).mid()) < 1e-40 for value in truth) == found.rigid_modes
+    assert found.spectral_radius_error < 1e-9
 
 
 def test_mpmath_at_50_digits_agrees() -> None:

@@ -6,13 +6,15 @@ import pytest
 import sympy
 from apc.compiler.errors import Place
 from apc.compiler.expression import parse_expression
-from apc.compiler.symbolic import derivative_symbol, head, is_opaque_in, symbol, to_sympy
+from apc.compiler.symbolic import derivative_symbol, head, symbol, to_sympy
 
 X, Y = symbol("x"), symbol("y")
 
 
 def build(text: str) -> sympy.Expr:
-    return to_sympy(parse_expression(text, Place("a.yaml")), lambda expression: sympy.Function("D")(expression))
+    return to_sympy(
+        parse_expression(text, Place("a.yaml")), lambda expression: sympy.Function("D")(expression)
+    )
 
 
 @pytest.mark.parametrize(
@@ -45,13 +47,3 @@ def test_the_same_name_is_the_same_symbol() -> None:
 
 def test_names_of_sympys_own_stay_plain_names() -> None:
     assert all(build(name) == symbol(name) for name in ("E", "I", "S", "N", "pi", "oo", "Q", "beta", "gamma"))
-
-
-@pytest.mark.parametrize("text", ["max(x, 1)", "abs(x)*y", "if y < x then 1 else 2", "sign(floor(x))"])
-def test_an_unknown_inside_a_kinked_function_is_seen(text: str) -> None:
-    assert is_opaque_in(build(text), X)
-
-
-@pytest.mark.parametrize("text", ["x + max(y, 1)", "sin(x)", "x^2"])
-def test_an_unknown_outside_is_not(text: str) -> None:
-    assert not is_opaque_in(build(text), X)

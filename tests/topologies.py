@@ -17,8 +17,15 @@ from apc.compiler.structure import SortedSystem, sort
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ROOT / "models" / "scenes"
-AVERAGE = (SCENES / "three-users-average.yaml").read_text(encoding="utf-8")
-MESH = (SCENES / "three-users-mesh.yaml").read_text(encoding="utf-8")
+
+
+def _scene(name: str) -> str:
+    """Return a scene's text without its first line, which is for editors."""
+    return (SCENES / name).read_text(encoding="utf-8").partition("\n")[2]
+
+
+AVERAGE = _scene("three-users-average.yaml")
+MESH = _scene("three-users-mesh.yaml")
 
 # One part alone at one peer: what it does is all that happens.
 ONE_MASS = """\

@@ -13,7 +13,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from apc.api import analyze, compile, load, save, set_parameters
+    from apc.api import analyze, compile, load, save, schema, set_parameters, show
     from apc.compiler.compiled import CompiledSystem
     from apc.compiler.errors import ApcError
     from apc.runtime.analysis import Analysis
@@ -27,7 +27,9 @@ _HOMES = {
     "compile": "apc.api",
     "load": "apc.api",
     "save": "apc.api",
+    "schema": "apc.api",
     "set_parameters": "apc.api",
+    "show": "apc.api",
 }
 
 __all__ = [
@@ -38,7 +40,9 @@ __all__ = [
     "compile",
     "load",
     "save",
+    "schema",
     "set_parameters",
+    "show",
 ]
 
 

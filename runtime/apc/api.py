@@ -7,17 +7,20 @@ Does not: print.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
     from apc.runtime.analysis import Analysis
 
 Method = Literal["modes", "dense"]
+Format = Literal["text", "json", "dot", "svg"]
 
 
 def compile(path: str | Path) -> CompiledSystem:
@@ -112,3 +115,44 @@ def analyze(
     if set:
         model = set_parameters(model, set)
     return analyze_modes(model) if method == "modes" else analyze_dense(model)
+
+
+def show(path: str | Path, *, format: Format = "text") -> str:
+    """Tell what a scene is made of: its graph, its equations, and what happens in one frame.
+
+    Parameters
+    ----------
+    path
+        The topology, a YAML file.
+    format
+        "text" for a person; "json", the same as one document; "dot", the graph in Graphviz's language;
+        "svg", the graph as a picture.
+
+    Raises
+    ------
+    ApcError
+        The file is at fault, or is a compiled model, which no longer has the equations as written.
+    """
+    from apc import contents
+
+    path = Path(path)
+    if path.suffix == ".apc":
+        what = "is a compiled model, which no longer has the equations as they were written"
+        raise ApcError(Mistake("E615", Place(str(path)), what, hint=f"apc show {path.with_suffix('.yaml')}"))
+    match format:
+        case "text":
+            return contents.show_text(path)
+        case "json":
+            return json.dumps(contents.show_document(path), ensure_ascii=False, allow_nan=False, indent=2)
+        case "dot":
+            return contents.show_dot(path)
+        case "svg":
+            return contents.show_svg(path)
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of topologies, generated from the language and the library."""
+    from apc.compiler.library import Library
+    from apc.compiler.schema import topology_schema
+
+    return topology_schema(Library())

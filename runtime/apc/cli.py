@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}\Z")
+SCHEMA_FILE = "topology.schema.json"
+FORMATS = {".txt": "text", ".json": "json", ".dot": "dot", ".gv": "dot", ".svg": "svg"}
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
 
 
@@ -51,6 +54,7 @@ def apc() -> None:
         apc new            write a topology.yaml to start from
         apc compile        check it and turn it into topology.apc
         apc analyze        stable or not, by how much, in which modes
+        apc show           what the scene is made of, as text or a picture
 
     Without FILE a command takes the only topology of the folder.
     """
@@ -70,6 +74,10 @@ def new(name: str) -> None:
     from importlib.resources import files
 
     text = files("apc.models").joinpath("scenes/template.yaml").read_text(encoding="utf-8")
+    # Its first line names the schema beside the library; a schema beside the new topology serves as well.
+    _, _, text = text.partition("\n")
+    if Path(SCHEMA_FILE).is_file():
+        text = f"# yaml-language-server: $schema={SCHEMA_FILE}\n{text}"
     path = Path(f"{name}.yaml")
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -109,34 +117,114 @@ def check(file: str | None) -> None:
     metavar="STAGE",
     help=f"Stop after a stage, print what it made and write nothing. One of {', '.join(STAGES[:-1])}.",
 )
-def compile_command(file: str | None, until: str) -> None:
+@click.option("--force", is_flag=True, help="Compile even if nothing has changed since it was compiled.")
+@click.option("--timings", is_flag=True, help="Print how long each stage took; implies --force.")
+def compile_command(file: str | None, until: str, force: bool, timings: bool) -> None:
     """Turn a topology into equations: NAME.yaml to NAME.apc beside it.
 
     Prints what the scene needed: states, delays and packets kept for a peer,
-    and how large the systems are that decide its stability.
+    and how large the systems are that decide its stability. Compiles nothing
+    if the topology, every file it names and apc itself are as they were.
     """
-    from apc.inputs import find_input
-    from apc.compiler.pipeline import run_stages
+    from apc.inputs import compiled_already, find_input
 
     path = Path(file) if file else find_input(compiled_too=False)
     if until != "compiled":
         from apc.compiler.listing import describe
+        from apc.compiler.pipeline import run_stages
 
         click.echo(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
         return
-    from apc.compiler.pipeline import compile_topology
+    if path.suffix == ".apc":
+        raise ApcError(Mistake("E614", Place(str(path)), "is compiled already", hint=f"apc analyze {path}"))
+    target = path.with_suffix(".apc")
+    if not (force or timings) and compiled_already(path):
+        click.echo(f"{path} → {target}: unchanged, not compiled again (--force does)")
+        return
+    _compile(path, target, timings=timings)
+
+
+def _compile(path: Path, target: Path, *, timings: bool) -> None:
+    """Compile, check, save and report; with `timings`, how long each of it took."""
+    from apc.compiler.pipeline import each_stage
     from apc.compiler.store import save
-    from apc.report import compile_report
+    from apc.report import compile_report, timings_report
     from apc.runtime.needs import needs
     from apc.runtime.selfcheck import check_frame
 
-    if path.suffix == ".apc":
-        raise ApcError(Mistake("E614", Place(str(path)), "is compiled already", hint=f"apc analyze {path}"))
-    system = compile_topology(path)
+    taken: list[tuple[str, float]] = []
+    last = time.perf_counter()
+
+    def lap(name: str) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        taken.append((name, now - last))
+        last = now
+
+    value: object = None
+    for stage, value in each_stage(path):
+        lap(stage)
+    system = cast("CompiledSystem", value)  # the last stage's
     difference = check_frame(system)
-    target = path.with_suffix(".apc")
+    lap("self-check")
     save(system, target)
+    lap("save")
     click.echo(compile_report(system, needs(system), target, difference))
+    if timings:
+        click.echo(timings_report(taken))
+
+
+@apc.command()
+@click.argument("file", required=False)
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["text", "json", "dot", "svg"]),
+    help="text: graph, equations, schedule. json: the same as one document. dot: the graph for Graphviz. "
+    "svg: the graph as a picture. Taken from --out if not given, else text.",
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal.")
+def show(file: str | None, format_: str | None, out: Path | None) -> None:
+    """Show what a scene is made of: its graph, equations and schedule.
+
+    The graph has the parts of one peer and how they are joined, and the
+    peers and the links between them. The schedule says what ticks when, how
+    long what it computes is held, and which packets are on their way.
+    """
+    from apc.api import show as shown
+    from apc.inputs import find_input
+
+    path = Path(file) if file else find_input(compiled_too=False)
+    wanted = format_ or (FORMATS.get(out.suffix, "text") if out else "text")
+    _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
+
+
+@apc.command()
+@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal.")
+def schema(out: Path | None) -> None:
+    """Print the JSON Schema of topologies, for editors.
+
+    An editor that knows YAML schemas completes and checks a topology whose
+    first line is, with the schema beside it as topology.schema.json,
+
+    \b
+        # yaml-language-server: $schema=topology.schema.json
+
+    `apc new` writes that line where the schema is.
+    """
+    from apc.api import schema as generated
+
+    _print_or_write(json.dumps(generated(), ensure_ascii=False, indent=1), out)
+
+
+def _print_or_write(text: str, out: Path | None) -> None:
+    if out is None:
+        click.echo(text)
+        return
+    from apc.compiler.store import write_atomically
+
+    write_atomically(out, lambda temporary: temporary.write_bytes(f"{text}\n".encode()))
+    click.echo(f"{out} is written")
 
 
 @apc.command()
@@ -182,22 +270,19 @@ def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: b
 
 def _model(path: Path | None) -> CompiledSystem:
     """Return the compiled model of a file; a topology is compiled in memory unless a fresh model is beside it."""
-    from apc.inputs import find_input, is_fresh, load_fresh
+    from apc.inputs import compiled_already, find_input, load_fresh
 
     path = find_input(compiled_too=True) if path is None else path
     if path.suffix == ".apc":
         return load_fresh(path)
     beside = path.with_suffix(".apc")
-    if beside.is_file() and path.is_file():
+    if path.is_file() and compiled_already(path):
         from apc.compiler.store import load
 
         try:
-            system = load(beside)
+            return load(beside)
         except ApcError:
             pass  # it is only a saving of time; the topology itself decides
-        else:
-            if is_fresh(system, beside) and system.origin.topology == path.name:
-                return system
     from apc.compiler.pipeline import compile_topology
 
     return compile_topology(path)

@@ -1,20 +1,23 @@
-"""Which file a command means, and whether a compiled model still matches its topology.
+"""Which file a command means, and whether a compiled model still matches what it was made from.
 
 Takes: paths. Gives: the topology or compiled model to work on.
-Guarantees: a compiled model that no longer matches its topology is never used.
+Guarantees: a compiled model is used only while its topology, every text the topology names and the program
+are those it was made from, by their content; a model that has no topology beside it speaks for itself.
 Does not: compile.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.cache import Record, changed, read_record
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.source import MAX_BYTES
-from apc.compiler.store import load
+
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
 
 _TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
 
@@ -62,18 +65,29 @@ def _is_topology(path: Path) -> bool:
 
 
 def load_fresh(path: Path) -> CompiledSystem:
-    """Read a compiled model. Raises ApcError if it is damaged, or if its topology has changed since."""
+    """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
+    from apc.compiler.store import load
+
     system = load(path)
-    if not is_fresh(system, path):
-        what = f"is stale: {system.origin.topology} has changed since it was compiled"
+    now = _changed(Record(system.origin.topology, system.origin.texts), path)
+    if now:
+        what = f"is stale: {now} has changed since it was compiled"
         hint = f"apc compile {path.with_name(system.origin.topology)}"
         raise ApcError(Mistake("E605", Place(str(path)), what, hint=hint))
     return system
 
 
 def is_fresh(system: CompiledSystem, path: Path) -> bool:
-    """Return whether the topology beside a compiled model, if there is one, still has the same text."""
-    topology = path.with_name(system.origin.topology)
-    if not topology.is_file():
-        return True
-    return dict(system.origin.texts).get(topology.name) == hashlib.sha256(topology.read_bytes()).hexdigest()
+    """Return whether the texts a compiled model was made from, if its topology is there, are the same now."""
+    return not _changed(Record(system.origin.topology, system.origin.texts), path)
+
+
+def compiled_already(topology: Path) -> bool:
+    """Return whether the compiled model beside a topology is what compiling it now would give."""
+    record = read_record(topology.with_suffix(".apc"))
+    return record is not None and record.topology == topology.name and not changed(record, topology.parent)
+
+
+def _changed(record: Record, path: Path) -> str:
+    there = path.with_name(record.topology).is_file()
+    return changed(record, path.parent) if there else ""

@@ -8,6 +8,7 @@ Does not: compute.
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -54,8 +55,35 @@ def compile_report(system: CompiledSystem, needs: Needs, target: Path, differenc
         f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
         f"  self-check: one frame event by event and lifted differ by {difference:.0e}",
     ]
+    lines += [_wrapped(line) for line in _pairwise(system)]
     lines += [_wrapped(f"left out: {name}, as {reason}") for name, reason in system.dropped]
     return "\n".join(lines)
+
+
+def _pairwise(system: CompiledSystem) -> Iterator[str]:
+    """Yield what is evaluated once a pair of peers, and why it can't be once a peer."""
+    found = {
+        receive.name: receive
+        for kind in system.kinds
+        for clock in kind.clocks
+        for receive in clock.receives
+        if receive.edge is not None or receive.operator in ("max", "min")
+    }
+    for name, receive in found.items():
+        why = (
+            f"what it runs over is not linear in what the others send over {receive.link}"
+            if receive.edge is not None and receive.operator in ("sum", "mean")
+            else f"a {receive.operator} can't be taken apart into one number a peer"
+        )
+        yield f"costs N²: {name} is evaluated once a pair of peers, as {why}"
+
+
+def timings_report(taken: Sequence[tuple[str, float]]) -> str:
+    """Return what `apc compile --timings` prints: stages and their seconds."""
+    total = sum(seconds for _, seconds in taken)
+    rows = [*taken, ("all", total)]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"  {name:<{width}}  {seconds * 1e3:8.1f} ms" for name, seconds in rows)
 
 
 def analysis_report(result: Analysis) -> str:

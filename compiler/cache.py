@@ -1,0 +1,174 @@
+"""Whether a compiled model on disk is still what its texts compile to.
+
+Takes: the path of a NAME.apc. Gives: `Record`, what it was made from, and `changed`, the first of it that is
+different now.
+Guarantees: decided by content alone: no modification time, nothing unpickled, no algebra imported; a file
+that is damaged or of another format has no record.
+Does not: compile, or read what a model holds (see `store`).
+
+What a model was made from, by name:
+
+    scene.yaml      the topology, beside the model
+    ./users.csv     a table the topology names, from the topology's folder
+    ./parts/        a folder of the user's own components: all definitions in it
+    Mass            a definition of the built-in library
+    apc             the compiler itself: its version and its modules
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import lzma
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path, PurePath
+
+FORMAT = 3  # of NAME.apc
+MEMBER = "model.json"  # of the archive: structure, numbers and the digests of the other members
+LARGEST = 256 * 2**20
+PROGRAM = "apc"
+# What zipfile, its decompressors, json and our own reading of the document raise at what isn't theirs.
+DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError),
+    *(AttributeError, KeyError, IndexError, ValueError, TypeError, RuntimeError),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What a model says it was made from: its topology's name, and the digest of every text by name."""
+
+    topology: str
+    texts: tuple[tuple[str, str], ...]
+
+
+def read_record(path: Path) -> Record | None:
+    """Return what a compiled model was made from; None if it isn't there, is damaged or of another format."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(info.file_size for info in archive.infolist()) > LARGEST:
+                return None
+            document = json.loads(archive.read(MEMBER))
+            if document["format"] != FORMAT:
+                return None
+            for name, digest in document["members"].items():
+                if hashlib.sha256(archive.read(name)).hexdigest() != digest:
+                    return None
+            origin = document["system"]["origin"]
+            texts = tuple((str(name), str(digest)) for name, digest in origin["texts"])
+            return Record(str(origin["topology"]), texts)
+    except (OSError, *DAMAGE):
+        return None
+
+
+def changed(record: Record, folder: Path) -> str:
+    """Return the name of the first text that is different now, in words; empty when none is.
+
+    Parameters
+    ----------
+    record
+        What the model was made from.
+    folder
+        Where its topology is.
+    """
+    if not {PROGRAM, record.topology} <= dict(record.texts).keys():
+        return "apc itself"  # a model that doesn't say what it was made from wasn't made by this one
+    for name, digest in record.texts:
+        if name == PROGRAM:
+            now, shown = program_digest(), "apc itself"
+        elif name == record.topology or _is_path(name):
+            now, shown = _path_digest(folder / name), name.removeprefix("./")
+        else:
+            now, shown = builtin_digest(name), f"the library's {name}"
+        if now != digest:
+            return shown
+    return ""
+
+
+def origin_texts(
+    topology: tuple[str, str],
+    files: Iterable[tuple[str, str]],
+    folders: Iterable[str],
+    definitions: Iterable[tuple[str, str]],
+    where: Path,
+) -> tuple[tuple[str, str], ...]:
+    """Return what a model is made from, in the form `changed` compares.
+
+    Parameters
+    ----------
+    topology
+        The topology's file name and digest.
+    files
+        The tables the topology names, as it names them, and their digests.
+    folders
+        The folders of components it names.
+    definitions
+        The components and connectors read and their digests; those that are not the built-in library's are
+        counted with their folder.
+    where
+        The topology's folder.
+    """
+    texts = [topology]
+    texts += [(_relative(name), digest) for name, digest in files]
+    for name in folders:
+        shown = _relative(name).rstrip("/") + "/"
+        texts.append((shown, _path_digest(where / shown)))
+    texts += [(name, digest) for name, digest in definitions if builtin_digest(name) == digest]
+    return (*dict.fromkeys(texts), (PROGRAM, program_digest()))
+
+
+@functools.cache
+def builtin_files() -> dict[str, Path]:
+    """Return the built-in library's files by the name of what they define, the file's name in camel case."""
+    # Beside the compiler in a checkout and in an installed package alike.
+    models = Path(__file__).resolve().parent.parent / "models"
+    return {
+        "".join(word.capitalize() for word in path.stem.split("-")): path
+        for path in sorted(models.rglob("*.yaml"))
+        if "scenes" not in path.relative_to(models).parts
+    }
+
+
+def builtin_digest(name: str) -> str:
+    """Return the SHA-256 of a definition of the built-in library; empty if there is none of that name."""
+    path = builtin_files().get(name)
+    return "" if path is None else _path_digest(path)
+
+
+@functools.cache
+def program_digest() -> str:
+    """Return the SHA-256 of what compiles: the version of apc and every module of the compiler."""
+    whole = hashlib.sha256(version("apc").encode())
+    for path in sorted(Path(__file__).resolve().parent.glob("*.py")):
+        whole.update(f"\0{path.name}\0".encode())
+        whole.update(path.read_bytes())
+    return whole.hexdigest()
+
+
+def _is_path(name: str) -> bool:
+    return name.startswith(("./", "../")) or PurePath(name).is_absolute()
+
+
+def _relative(name: str) -> str:
+    plain = PurePath(name).as_posix()
+    return plain if _is_path(plain) else f"./{plain}"
+
+
+def _path_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, or of all YAML files in a folder with their names; empty if unreadable."""
+    try:
+        if not path.is_dir():
+            return hashlib.sha256(path.read_bytes()).hexdigest()
+        whole = hashlib.sha256()
+        for file in sorted(path.rglob("*.yaml")):
+            content = hashlib.sha256(file.read_bytes()).hexdigest()
+            whole.update(f"{file.relative_to(path).as_posix()}\0{content}\n".encode())
+        return whole.hexdigest()
+    except (OSError, ValueError):  # ValueError: a NUL in the name
+        return ""

@@ -1,0 +1,185 @@
+"""`cache`: a compiled model serves as long as everything it was made from is the same, by content alone."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from apc.__main__ import run
+from apc.api import load
+from apc.compiler import cache, store
+from apc.compiler.cache import Record, changed, read_record
+from apc.inputs import compiled_already, is_fresh
+from tests.topologies import replaced, told
+
+SCENE = Path("scene.yaml")
+MODEL = Path("scene.apc")
+PART = """\
+component: Tie
+about: A spring to where the device is at rest.
+connectors: {flange: Flange}
+parameters: {stiffness: {unit: N/m, min: 0}}
+equations: [flange.f = stiffness*flange.x]
+"""
+TEXT = """\
+topology: scene
+library: parts
+peers: {user: {table: users.csv}}
+masses: {device: {mass: 1 kg, damping: 2 N*s/m}}
+couplers: {tie: {type: Tie, flange: device, stiffness: 3 N/m}}
+"""
+
+
+@pytest.fixture(autouse=True)
+def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Compile a scene that names a table and a folder of components."""
+    monkeypatch.chdir(tmp_path)
+    Path("parts").mkdir()
+    Path("parts/tie.yaml").write_text(PART, encoding="utf-8")
+    Path("users.csv").write_text("device.mass [kg]\n1\n2\n", encoding="utf-8")
+    SCENE.write_text(TEXT, encoding="utf-8")
+    assert run(["compile"]) == 0, capsys.readouterr().err
+    capsys.readouterr()
+
+
+def change_the_topology() -> None:
+    SCENE.write_text(replaced(TEXT, ("3 N/m", "4 N/m")), encoding="utf-8")
+
+
+def change_a_table() -> None:
+    Path("users.csv").write_text("device.mass [kg]\n1\n3\n", encoding="utf-8")
+
+
+def remove_a_table() -> None:
+    Path("users.csv").unlink()
+
+
+def change_a_component() -> None:
+    Path("parts/tie.yaml").write_text(replaced(PART, ("= stiffness", "= 2*stiffness")), encoding="utf-8")
+
+
+def add_a_component_that_hides_one_of_the_library() -> None:
+    Path("parts/mass.yaml").write_text(PART.replace("Tie", "Mass"), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("change", "shown"),
+    [
+        (change_the_topology, "scene.yaml"),
+        (change_a_table, "users.csv"),
+        (remove_a_table, "users.csv"),
+        (change_a_component, "parts/"),
+        (add_a_component_that_hides_one_of_the_library, "parts/"),
+    ],
+)
+def test_a_change_of_anything_it_was_made_from_is_noticed(change: Callable[[], None], shown: str) -> None:
+    assert compiled_already(SCENE)
+    change()
+    assert not compiled_already(SCENE)
+    assert not is_fresh(store.load(MODEL), MODEL)
+    assert told(load, MODEL) == [
+        f"scene.apc: E605 is stale: {shown} has changed since it was compiled. Write: apc compile scene.yaml"
+    ]
+
+
+def test_a_change_of_the_library_or_of_the_program_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "builtin_digest", lambda name: "other" if name == "Mass" else "")
+        assert not compiled_already(SCENE)
+        assert "is stale: the library's " in told(load, MODEL)[0]
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "program_digest", lambda: "other")
+        assert not compiled_already(SCENE)
+        assert "is stale: apc itself has changed" in told(load, MODEL)[0]
+    assert compiled_already(SCENE)
+
+
+def test_times_of_modification_mean_nothing() -> None:
+    SCENE.write_text(TEXT, encoding="utf-8")
+    for path in (SCENE, Path("users.csv"), Path("parts/tie.yaml")):
+        os.utime(path, (4e9, 4e9))
+    os.utime(MODEL, (0, 0))
+    assert compiled_already(SCENE)
+
+
+def test_a_change_taken_back_is_no_change() -> None:
+    change_a_table()
+    Path("users.csv").write_text("device.mass [kg]\n1\n2\n", encoding="utf-8")
+    assert compiled_already(SCENE)
+
+
+def test_the_folder_may_move() -> None:
+    here = Path.cwd()
+    moved = here.with_name(f"{here.name}-moved")
+    here.rename(moved)
+    os.chdir(moved)
+    assert compiled_already(SCENE)
+
+
+def test_compiling_again_says_unchanged_and_force_compiles(capsys: pytest.CaptureFixture[str]) -> None:
+    before = MODEL.read_bytes()
+    assert run(["compile"]) == 0
+    line = "scene.yaml → scene.apc: unchanged, not compiled again (--force does)\n"
+    assert capsys.readouterr().out == line
+    assert run(["compile", "--force"]) == 0
+    assert "self-check" in capsys.readouterr().out
+    assert MODEL.read_bytes() == before, "the same texts give the same bytes"
+    change_the_topology()
+    assert run(["compile"]) == 0
+    assert "self-check" in capsys.readouterr().out
+    assert compiled_already(SCENE)
+
+
+def test_timings_name_every_stage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["compile", "--timings"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.endswith(" ms")]
+    stages = ["source", "scene", "flat", "clocked", "sorted", "compiled", "self-check", "save", "all"]
+    assert [row[0] for row in rows] == stages
+    numbers = [float(row[-2]) for row in rows]
+    assert sum(numbers[:-1]) == pytest.approx(numbers[-1], abs=1.0)
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"PK\x05\x06" + 18 * b"\0"])
+def test_a_damaged_model_has_no_record(content: bytes) -> None:
+    MODEL.write_bytes(content)
+    assert read_record(MODEL) is None
+    assert not compiled_already(SCENE)
+
+
+def test_a_model_with_a_changed_member_has_no_record() -> None:
+    with zipfile.ZipFile(MODEL) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["function0.casadi"] += b"x"
+    with zipfile.ZipFile(MODEL, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    assert read_record(MODEL) is None
+
+
+def test_a_record_that_names_no_program_is_of_another_one() -> None:
+    record = read_record(MODEL)
+    assert record is not None
+    assert changed(record, Path()) == ""
+    without = tuple(pair for pair in record.texts if pair[0] != "apc")
+    assert changed(Record(record.topology, without), Path()) == "apc itself"
+
+
+def test_what_it_was_made_from_is_named_from_the_topology() -> None:
+    record = read_record(MODEL)
+    assert record is not None
+    assert {name for name, _ in record.texts} == {
+        *("scene.yaml", "./users.csv", "./parts/", "Flange", "Mass", "apc"),
+    }
+
+
+def test_saying_unchanged_needs_no_algebra_no_units_and_no_numbers() -> None:
+    code = "import sys\nfrom apc.__main__ import run\nassert run(['compile']) == 0\n"
+    code += "assert not {'sympy', 'pint', 'casadi', 'numpy'} & set(sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert "unchanged" in ran.stdout

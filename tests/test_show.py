@@ -1,0 +1,290 @@
+"""`show`: the graph, the equations and the schedule of a scene, as text, document, Graphviz text and picture."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import apc
+import pytest
+from apc.__main__ import run
+from apc.compiler.diagram import Diagram, build_diagram
+from apc.compiler.picture import Box, Line, Picture, Text, draw_svg, place
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, scene, told
+
+AVERAGE_FILE = SCENES / "three-users-average.yaml"
+RING = replaced(AVERAGE, ("count: 3", "count: 8"), ("lan: {", "lan: {graph: ring, "))
+STAR = replaced(AVERAGE, ("count: 3", "count: 300"), ("lan: {", "lan: {graph: star, "))
+ARCS = replaced(AVERAGE, ("lan: {", "lan: {graph: {arcs: [[1, 2], [2, 3], [3, 1, 0.5]]}, "))
+MANY = """\
+topology: many
+about: A chain on the ground, a rod of two masses, a long array, and groups that differ in much.
+clocks: {haptic: 1 ms, video: {period: 1/90 s, phase: 1 ms}, network: 8 ms, wide: 50 ms}
+parameters: {kt: 2000 N/m}
+peers:
+  right: {count: 1, set: {hand.force: -4 N, device.x: 30 mm, contact.clock: video, contact.delay: 2 ms}}
+  left:  {set: {hand.force: 2 N, device.x: -30 mm, device.mass: [0.1 kg, 0.2 kg], near.stiffness: 1 N/m}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube:   {mass: 0.3 kg, damping: 5 N*s/m, shared: true}
+  chain:  {count: 3, mass: 10 g}
+  long:   {count: 40, mass: 1 g}
+  end:    {mass: 1 g, flange: cube}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 3900 N/m, damping: 1 N*s/m, clock: haptic}
+  near: {type: FullMesh, object: device, stiffness: kt/(peers - 1), clock: haptic, link: lan, delays: own}
+  far: {type: AveragePosition, object: cube, stiffness: 7 N/m, clock: haptic, link: wan, at: [left]}
+  tail: {type: SampledSpringDamper, count: 2, a: "chain[1:2]", b: "chain[2:3]", stiffness: 1 N/m, clock: wide}
+  leash: {type: SampledSpringDamper, a: "chain[3]", b: ground, stiffness: 10 N/m, clock: wide}
+  links: {type: SampledSpringDamper, count: 39, a: "long[1:39]", b: "long[2:40]", stiffness: 1 N/m, clock: wide}
+links:
+  lan: {clock: network, delay: 8 ms, delays: {left: {right: 12 ms}}}
+  wan: {clock: wide, graph: star}
+hands:
+  hand: {type: ConstantForce, flange: device, force: 0 N}
+"""
+TEXTS = {
+    "average": AVERAGE,
+    "mesh": MESH,
+    "one": ONE_MASS,
+    "ring": RING,
+    "star": STAR,
+    "arcs": ARCS,
+    "many": MANY,
+}
+
+
+def diagram(text: str) -> Diagram:
+    return build_diagram(scene(text))
+
+
+Rectangle = tuple[float, float, float, float]
+
+
+def apart(one: Rectangle, two: Rectangle) -> bool:
+    return one[2] <= two[0] or two[2] <= one[0] or one[3] <= two[1] or two[3] <= one[1]
+
+
+def along(line: Line) -> list[tuple[float, float]]:
+    """Return points along a line, as close as a letter is wide."""
+    steps = [i / 100 for i in range(101)]
+    if line.curved:
+        (x0, y0), (x1, y1) = line.points
+        return [
+            (x0 + (x1 - x0) * (1.5 * t - 1.5 * t**2 + t**3), y0 + (y1 - y0) * (3 * t**2 - 2 * t**3))
+            for t in steps
+        ]
+    return [
+        (a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t)
+        for a, b in itertools.pairwise(line.points)
+        for t in steps
+    ]
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_no_text_overlaps_another_and_no_line_crosses_one(name: str) -> None:
+    picture: Picture = place(diagram(TEXTS[name]))
+    texts = [mark for mark in picture.marks if isinstance(mark, Text)]
+    for one, two in itertools.combinations(texts, 2):
+        assert apart(one.box, two.box), (one.text, two.text)
+    for line in (mark for mark in picture.marks if isinstance(mark, Line)):
+        for x, y in along(line):
+            for text in texts:
+                assert apart((x, y, x, y), text.box), (line, text.text)
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_boxes_stand_apart_and_everything_is_on_the_page(name: str) -> None:
+    picture = place(diagram(TEXTS[name]))
+    boxes = [mark for mark in picture.marks if isinstance(mark, Box) and mark.fill != "none"]
+    for one, two in itertools.combinations(boxes, 2):
+        sides = [(b.x, b.y, b.x + b.width, b.y + b.height) for b in (one, two)]
+        assert apart(*sides), (one, two)
+    for mark in picture.marks:
+        if isinstance(mark, Text):
+            left, top, right, bottom = mark.box
+            assert 0 <= left <= right <= picture.width and 0 <= top <= bottom <= picture.height, mark
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_line_of_the_peer_runs_beside_every_box(name: str) -> None:
+    picture = place(diagram(TEXTS[name]))
+    boxes = [mark for mark in picture.marks if isinstance(mark, Box) and mark.fill != "none"]
+    for line in (mark for mark in picture.marks if isinstance(mark, Line) and (mark.curved or mark.dashed)):
+        for x, y in along(line)[1:-1]:
+            for b in boxes:
+                assert apart((x, y, x, y), (b.x + 1, b.y + 1, b.x + b.width - 1, b.y + b.height - 1)), (
+                    line,
+                    b,
+                )
+
+
+def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
+    document = ET.fromstring(draw_svg(diagram(AVERAGE)))
+    words = [element.text for element in document.iter("{http://www.w3.org/2000/svg}text")]
+    for word in (
+        *("three-users-average", "one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
+        *("contact", "SampledSpringDamper", "stiffness 1000 N/m", "delay 1 ms", "coordination"),
+        *("AveragePosition", "lan", "available 8 ms later", "3 peers, complete graph"),
+        *("clock haptic: every 1 ms", "one frame, 8 ms"),
+    ):
+        assert word in words, word
+
+
+def test_text_of_a_scene_cannot_break_out_of_the_picture() -> None:
+    text = replaced(
+        AVERAGE, ("about: Three", 'about: "<script>alert(1)</script> & Three'), ("others.  ", 'others."  ')
+    )
+    drawn = draw_svg(diagram(text))
+    assert "<script>" not in drawn
+    ET.fromstring(drawn)
+
+
+def test_parts_are_joined_as_the_topology_says() -> None:
+    assert diagram(AVERAGE).joints == (("device", "contact"), ("cube", "contact"), ("cube", "coordination"))
+    found = diagram(MANY)
+    assert ("ground of leash", "leash") in found.joints
+    assert ("end and cube", "end") in found.joints and ("cube", "end and cube") in found.joints
+    assert ("long", "links") in found.joints, "a long array is one node"
+    assert "40 of them" in next(node.lines for node in found.nodes if node.name == "long")
+    assert next(node.links for node in found.nodes if node.name == "far") == ("wan",)
+    assert "only at left" in next(node.lines for node in found.nodes if node.name == "far")
+
+
+def test_a_star_of_hundreds_is_a_small_picture() -> None:
+    assert len(place(diagram(STAR)).marks) < 120
+    assert len(place(diagram(replaced(STAR, ("count: 300", "count: 1000000")))).marks) < 120
+
+
+def test_the_text_tells_graph_equations_and_schedule() -> None:
+    lines = apc.show(AVERAGE_FILE).splitlines()
+    for line in (
+        "    device: mass 0.1 kg, damping 5 N·s/m",
+        "      joins device and cube",
+        "      hears the others over lan",
+        "  18 equations, 18 unknowns",
+        "    device.mass*der(device.v) = device.flange.f - device.damping*device.v",
+        "    der(device.v) := (-device.damping*device.v + device.flange.f)/device.mass",
+        "  frame of 8 ms, after which every clock stands as before",
+        "  network ticks every 8 ms, once a frame: packets leave over lan",
+        "  contact.f acts from 1 ms after its tick, held for 1 ms until the next one acts",
+    ):
+        assert line in lines, line
+    schedule = " ".join(" ".join(lines[lines.index("SCHEDULE") :]).split())
+    assert (
+        "lan: a packet (coordination.x, coordination.v) every 8 ms, available 8 ms later; "
+        "1 packet of each sender on the way; the newest one heard is 8 ms to 16 ms old"
+    ) in schedule
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_scene_can_be_shown_in_80_columns(path: Path) -> None:
+    wide = [line for line in apc.show(path).splitlines() if len(line) > 80]
+    assert wide == []
+    ET.fromstring(apc.show(path, format="svg"))
+
+
+def test_a_scene_without_clocks_is_continuous(tmp_path: Path) -> None:
+    path = tmp_path / "one.yaml"
+    path.write_text(ONE_MASS, encoding="utf-8")
+    assert "  No clock ticks: everything is continuous." in apc.show(path).splitlines()
+
+
+@pytest.mark.parametrize(
+    ("delay", "number", "age"),
+    [
+        ("0 s", 0, (0, 8)),
+        ("1 ms", 1, (1, 9)),
+        ("8 ms", 1, (8, 16)),
+        ("9 ms", 2, (9, 17)),
+        ("24 ms", 3, (24, 32)),
+    ],
+)
+def test_the_packets_on_their_way_are_counted(
+    tmp_path: Path, delay: str, number: int, age: tuple[int, int]
+) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(replaced(AVERAGE, ("delay: 8 ms", f"delay: {delay}")), encoding="utf-8")
+    (link,) = json.loads(apc.show(path, format="json"))["schedule"]["links"]
+    assert link["on_the_way"] == number
+    assert link["age_s"] == [pytest.approx(age[0] / 1e3), pytest.approx(age[1] / 1e3)]
+
+
+def test_the_document_holds_what_the_text_tells() -> None:
+    document = json.loads(apc.show(AVERAGE_FILE, format="json"))
+    (kind,) = document["kinds"]
+    assert len(kind["equations"]) == len(kind["unknowns"]) == 18
+    assert kind["states"] == ["device.x", "device.v", "cube.x", "cube.v"]
+    assert [p["clock"] for p in kind["partitions"]] == ["continuous", "haptic"]
+    assert {c["clock"]: c["ticks"] for c in document["schedule"]["clocks"]} == {"haptic": 8, "network": 1}
+    assert [part["name"] for part in document["graph"]["parts"]] == [
+        "device",
+        "cube",
+        "contact",
+        "coordination",
+    ]
+
+
+def test_what_costs_a_pair_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scene.yaml"
+    text = replaced(AVERAGE, ("topology: three-users-average", "topology: furthest\nlibrary: ."))
+    text = replaced(text, ("type: AveragePosition, object: cube,", "type: Furthest, object: cube,"))
+    path.write_text(text, encoding="utf-8")
+    (tmp_path / "furthest.yaml").write_text(FURTHEST, encoding="utf-8")
+    assert "over lan; one evaluation a pair of peers" in " ".join(apc.show(path).split())
+    assert run(["compile", str(path)]) == 0, capsys.readouterr().err
+    report = " ".join(capsys.readouterr().out.split())
+    assert re.search(
+        r"costs N²: sum\(.*others\.coordination\.x.*\) is evaluated once a pair of peers, as what it runs over is "
+        "not linear in what the others send over lan",
+        report,
+    )
+
+
+FURTHEST = """\
+component: Furthest
+about: Pulls by tanh of each distance.
+connectors: {object: Flange}
+sends: {x: sample(object.x)}
+parameters: {stiffness: {unit: N/m}, reach: {unit: m, default: 1}, clock: clock, link: link, delay: {unit: s, default: 0}}
+equations:
+  - f = stiffness*sum(reach*tanh((sample(object.x) - others.x)/reach))
+  - object.f = hold(f, delay)
+"""
+
+
+def test_graphviz_text_has_every_node_once_and_closes_every_quote() -> None:
+    text = apc.show(AVERAGE_FILE, format="dot")
+    assert text.startswith('digraph "three-users-average" {\n') and text.endswith("\n}")
+    for name in ("device", "cube", "contact", "coordination"):
+        assert len(re.findall(rf'^ *"{name}" \[', text, re.MULTILINE)) == 1
+    assert '"cube" -> "contact"' in text
+    assert all(len(re.findall(r'(?<!\\)"', line)) % 2 == 0 for line in text.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("suffix", "start"), [("svg", "<svg"), ("dot", "digraph"), ("json", "{"), ("txt", "three")]
+)
+def test_the_file_says_the_format(
+    suffix: str, start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / f"scene.{suffix}"
+    assert run(["show", str(AVERAGE_FILE), "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"{out} is written\n"
+    assert out.read_text(encoding="utf-8").startswith(start)
+
+
+def test_the_command_prints_what_the_function_returns(capsys: pytest.CaptureFixture[str]) -> None:
+    for form in ("text", "json", "dot", "svg"):
+        assert run(["show", str(AVERAGE_FILE), "--format", form]) == 0
+        assert capsys.readouterr().out == apc.show(AVERAGE_FILE, format=form) + "\n"  # type: ignore[arg-type] # a word
+
+
+def test_a_compiled_model_has_no_equations_to_show() -> None:
+    assert told(apc.show, "scene.apc") == [
+        "scene.apc: E615 is a compiled model, which no longer has the equations as they were written. "
+        "Write: apc show scene.yaml"
+    ]
