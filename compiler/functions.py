@@ -15,6 +15,7 @@ from typing import Any
 
 import casadi
 import sympy
+
 from apc.compiler.clocks import HoldCrossing
 from apc.compiler.compiled import (
     PEERS,

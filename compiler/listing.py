@@ -13,6 +13,7 @@ from typing import Any
 
 import casadi
 import sympy
+
 from apc.compiler.clocks import ClockedSystem
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.expression import format_expression

@@ -32,7 +32,7 @@ def compile_topology(path: Path) -> CompiledSystem:
 
 
 def run_stages(path: Path, *, until: Stage) -> StageValue:
-    """Run the stages up to and including `until`. Raises ApcError with the mistakes of the first that fails."""
+    """Run the stages up to and including `until`. Raises ApcError with the mistakes of one that fails."""
     source = read_source(path)
     if until == "source":
         return source

@@ -50,7 +50,7 @@ def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "
 
 
 def read_name(node: Scalar, what: str, mistakes: Mistakes) -> str | None:
-    """Return the text of a scalar when it can serve as a name: a letter, then letters, digits, underscores."""
+    """Return the text of a scalar that can serve as a name: a letter, then letters, digits, underscores."""
     if IDENTIFIER.match(node.text):
         return node.text
     mistakes.add(

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import casadi
+
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 

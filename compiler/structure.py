@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import sympy
+
 from apc.compiler.clocks import (
     CONTINUOUS,
     ClockedKind,
@@ -348,7 +349,7 @@ def _flip(column: int, start: int, came_from: dict[int, int], match: list[int | 
 
 
 def strong_components(needs: Sequence[Iterable[int]]) -> list[list[int]]:
-    """Return the strongly connected components of a graph, each after all that it needs (Tarjan, iterative)."""
+    """Return the strongly connected components of a graph, each after all it needs (Tarjan, iterative)."""
     order: dict[int, int] = {}
     low: dict[int, int] = {}
     on_stack: set[int] = set()

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import sympy
+
 from apc.compiler.expression import (
     Binary,
     Call,

@@ -19,10 +19,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from apc.runtime.linearize import LinearSite, magnitudes
-from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from numpy.typing import NDArray
 from scipy.linalg import expm
+
+from apc.runtime.linearize import LinearSite, magnitudes
+from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value
 
 Floats = NDArray[np.float64]
 

@@ -22,9 +22,10 @@ from typing import Any
 
 import casadi
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import PEERS, Kind
 from apc.runtime.exact import evaluate_exact
-from numpy.typing import NDArray
 
 Matrix = NDArray[Any]
 

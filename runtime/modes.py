@@ -21,11 +21,12 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.lift import UNIT, LiftedSite, lift
 from apc.runtime.linearize import LinearSite, SiteJacobians, linearize, linearize_exact, same_dynamics
 from apc.runtime.schedule import Schedule
-from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 

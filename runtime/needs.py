@@ -40,7 +40,7 @@ class SiteNeeds:
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What a scene keeps: `sites` one a kind, `ticks` of each clock in a frame, `systems` as (count, size)."""
+    """What a scene keeps: `sites` one a kind, `ticks` a clock and frame, `systems` as (count, size)."""
 
     peers: int
     frame: Fraction  # s

@@ -25,10 +25,11 @@ from typing import Any
 
 import flint
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.runtime.linearize import LinearSite
 from apc.runtime.modes import ClosedSystem, PeerGroup
 from apc.runtime.schedule import Act, Propagate, Send, Tick, Value
-from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+
 from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
 from apc.runtime.linearize import LinearSite
 

@@ -11,14 +11,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.runtime.lift import UNIT, lift
 from apc.runtime.linearize import jacobians, linearize
 from apc.runtime.parameters import resolve
 from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value, build_schedules
 from apc.runtime.threads import single_threaded
-from numpy.typing import NDArray
-from scipy.linalg import expm
 
 Floats = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ from fractions import Fraction
 from typing import Any
 
 import casadi
+
 from apc.compiler.compiled import (
     Clock,
     ClockPartition,

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import casadi
 import pytest
+
 from apc.runtime.analysis import analyze_dense, analyze_modes, prepare
 from apc.runtime.parameters import apply, parse_override
-
 from tests.sites import MS, alone, paper
 
 

@@ -7,10 +7,11 @@ import math
 from pathlib import Path
 from typing import Any
 
-import apc
 import casadi
 import numpy as np
 import pytest
+
+import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.library import Library
 from apc.runtime.selfcheck import check_frame
@@ -74,7 +75,9 @@ def test_mass_without_damping_drifts() -> None:
 
 
 def test_mass_of_a_shared_object_is_divided_and_its_damping_is_not() -> None:
-    text = ONE_MASS.replace("damping: 3 N*s/m", "damping: 3 N*s/m, shared: true").replace("count: 1", "count: 4")
+    text = ONE_MASS.replace("damping: 3 N*s/m", "damping: 3 N*s/m, shared: true").replace(
+        "count: 1", "count: 4"
+    )
     assert apc.analyze(compiled(text)).spectral_radius == pytest.approx(math.exp(-3 / (2 / 4)), rel=1e-14)
 
 
@@ -95,9 +98,13 @@ def test_constant_force_pushes_towards_larger_x() -> None:
 
 
 def test_sampled_spring_damper_pulls_its_ends_together() -> None:
-    text = TWO + CLOCK + (
-        "couplers: {spring: {type: SampledSpringDamper, a: device, b: wall, stiffness: 70 N/m,"
-        " damping: 4 N*s/m, clock: tick}}\n"
+    text = (
+        TWO
+        + CLOCK
+        + (
+            "couplers: {spring: {type: SampledSpringDamper, a: device, b: wall, stiffness: 70 N/m,"
+            " damping: 4 N*s/m, clock: tick}}\n"
+        )
     )
     system = compiled(text)
     x = [0.5, -1.0, 0.2, 3.0]
@@ -130,10 +137,14 @@ def test_sampled_spring_damper_on_a_heavy_wall_is_the_sampled_oscillator_of_the_
 @pytest.mark.parametrize(("name", "weight"), [("AveragePosition", 1), ("FullMesh", 3)])
 def test_average_position_and_full_mesh_follow_their_equations(name: str, weight: int) -> None:
     """F_T = K (x − mean x_j) + B (v − mean v_j), and Σ_j K (x − x_j) + B (v − v_j), for four peers."""
-    text = ONE_MASS.replace("count: 1", "count: 4") + CLOCK + (
-        "links: {lan: {clock: tick}}\n"
-        f"couplers: {{all: {{type: {name}, object: device, stiffness: 70 N/m, damping: 4 N*s/m,"
-        " clock: tick, link: lan}}\n"
+    text = (
+        ONE_MASS.replace("count: 1", "count: 4")
+        + CLOCK
+        + (
+            "links: {lan: {clock: tick}}\n"
+            f"couplers: {{all: {{type: {name}, object: device, stiffness: 70 N/m, damping: 4 N*s/m,"
+            " clock: tick, link: lan}}\n"
+        )
     )
     system = compiled(text)
     x, v = 0.5, -1.0
@@ -146,7 +157,7 @@ def test_average_position_and_full_mesh_follow_their_equations(name: str, weight
 
 
 def test_average_position_over_a_fast_network_is_a_spring_of_n_over_n_minus_one() -> None:
-    """In the difference mode x − mean of the others = x N/(N − 1): stiffness 3/2 K for three, 5/4 K for five."""
+    """In the difference mode x − mean of the others = x N/(N − 1): 3/2 K for three, 5/4 K for five."""
     for n, factor in ((3, 1.5), (5, 1.25)):
         assert effective("AveragePosition", n) == pytest.approx(factor, rel=1e-3)
 
@@ -182,10 +193,15 @@ def test_average_position_and_full_mesh_may_delay_their_own_part_only(text: str)
 
 
 def test_link_brings_each_packet_after_its_delay() -> None:
-    """A mass that follows another, undriven one: M has the link's delay as a chain of shifts."""
-    text = ONE_MASS.replace("count: 1", "count: 2") + CLOCK + (
-        "links: {lan: {clock: tick, delay: 3 ms}}\n"
-        "couplers: {all: {type: AveragePosition, object: device, stiffness: 70 N/m, clock: tick, link: lan}}\n"
+    """Two masses that follow each other: the link is a chain of shifts, as long as its delay."""
+    text = (
+        ONE_MASS.replace("count: 1", "count: 2")
+        + CLOCK
+        + (
+            "links: {lan: {clock: tick, delay: 3 ms}}\n"
+            "couplers: {all: {type: AveragePosition, object: device, stiffness: 70 N/m,"
+            " clock: tick, link: lan}}\n"
+        )
     )
     result = apc.analyze(compiled(text), method="dense")
     assert result.states_per_peer == 2 + 2 * 3, "x and v, each three packets deep"

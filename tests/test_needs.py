@@ -5,6 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 import pytest
+
 from apc.runtime.analysis import analyze_modes
 from apc.runtime.needs import needs
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
@@ -54,7 +55,9 @@ def test_more_peers_need_no_more(count: int) -> None:
 
 def test_different_groups_are_one_larger_system_and_a_difference_each() -> None:
     system = compiled(
-        replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 2 kg}}\n  two: {count: 2}"))
+        replaced(
+            AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 2 kg}}\n  two: {count: 2}")
+        )
     )
     assert needs(system).systems == ((1, 16), (1, 8))
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 from fractions import Fraction
 
 import pytest
+
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError
 from apc.runtime.parameters import Override, apply, parse_override, resolve
-
 from tests.sites import NAMES, grouped, paper
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 import sympy
-from apc.compiler.structure import SortedKind, match_columns, sort, strong_components
-from apc.compiler.symbolic import symbol
 from hypothesis import given
 from hypothesis import strategies as st
+
+from apc.compiler.structure import SortedKind, match_columns, sort, strong_components
+from apc.compiler.symbolic import symbol
 from tests.topologies import AVERAGE, MESH, ONE_MASS, clocked, library, ordered, replaced, told
 
 GRAPHS = st.integers(1, 6).flatmap(
@@ -70,7 +71,7 @@ def test_a_variable_of_a_component_outlives_its_aliases() -> None:
 
 def test_samples_and_sends_are_in_states() -> None:
     kind = only(AVERAGE)
-    assert dict((name, expression) for name, _, expression in kind.samples)[
+    assert {name: expression for name, _, expression in kind.samples}[
         "sample(contact.a.x, haptic)"
     ] == symbol("device.x")
     assert [send.expression for send in kind.sends] == [symbol("cube.x"), symbol("der(cube.x)")]
@@ -90,7 +91,7 @@ def test_a_linear_loop_is_solved(tmp_path: Path) -> None:
     found = assignments(with_part(tmp_path, "p + q = k*flange.x", "p - 2*q = 0"))
     k, x = symbol("hand.k"), symbol("device.x")
     solved = {name: sympy.simplify(value) for name, value in found.items() if name.startswith("hand.")}
-    p = solved.get("hand.p", None)
+    p = solved.get("hand.p")
     p = p if p is not None else -solved["hand.flange.f"]
     by_name = {symbol(name): value for name, value in found.items()}
     while p.free_symbols & by_name.keys():

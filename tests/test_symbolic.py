@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import sympy
+
 from apc.compiler.errors import Place
 from apc.compiler.expression import parse_expression
 from apc.compiler.symbolic import derivative_symbol, head, is_opaque_in, symbol, to_sympy
@@ -12,7 +13,9 @@ X, Y = symbol("x"), symbol("y")
 
 
 def build(text: str) -> sympy.Expr:
-    return to_sympy(parse_expression(text, Place("a.yaml")), lambda expression: sympy.Function("D")(expression))
+    return to_sympy(
+        parse_expression(text, Place("a.yaml")), lambda expression: sympy.Function("D")(expression)
+    )
 
 
 @pytest.mark.parametrize(

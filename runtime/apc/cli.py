@@ -92,8 +92,8 @@ def check(file: str | None) -> None:
 
     Exit code 0 if there is none, 1 otherwise.
     """
-    from apc.inputs import find_input
     from apc.compiler.pipeline import compile_topology
+    from apc.inputs import find_input
 
     path = Path(file) if file else find_input(compiled_too=False)
     system = compile_topology(path)
@@ -115,8 +115,8 @@ def compile_command(file: str | None, until: str) -> None:
     Prints what the scene needed: states, delays and packets kept for a peer,
     and how large the systems are that decide its stability.
     """
-    from apc.inputs import find_input
     from apc.compiler.pipeline import run_stages
+    from apc.inputs import find_input
 
     path = Path(file) if file else find_input(compiled_too=False)
     if until != "compiled":
@@ -153,7 +153,7 @@ def compile_command(file: str | None, until: str) -> None:
     type=click.Choice(["modes", "dense"]),
     default="modes",
     show_default=True,
-    help="modes: a few small systems, whatever the number of peers. dense: all peers in one system, to check.",
+    help="modes: a few small systems, however many peers there are. dense: all peers in one, to check.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: bool) -> None:
@@ -181,7 +181,7 @@ def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: b
 
 
 def _model(path: Path | None) -> CompiledSystem:
-    """Return the compiled model of a file; a topology is compiled in memory unless a fresh model is beside it."""
+    """Return the compiled model of a file; a topology without a fresh one beside it is compiled in memory."""
     from apc.inputs import find_input, is_fresh, load_fresh
 
     path = find_input(compiled_too=True) if path is None else path
