@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.lift import UNIT, LiftedSite, lift
+from apc.runtime.discretize import UNIT
+from apc.runtime.lift import LiftedSite, lift
 from apc.runtime.linearize import LinearSite, SiteJacobians, linearize, linearize_exact, same_dynamics
 from apc.runtime.schedule import Schedule
 
@@ -121,7 +122,7 @@ def peer_groups(
                     jacobians[group.kind],
                     site,
                     schedule,
-                    lift(site, schedule),
+                    lift(site, schedule, exact=linearize_exact(jacobians[group.kind], vector)),
                 )
             )
     return tuple(groups)

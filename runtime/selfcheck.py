@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.runtime.lift import UNIT, lift
+from apc.runtime.discretize import UNIT
+from apc.runtime.lift import lift
 from apc.runtime.linearize import jacobians, linearize
 from apc.runtime.parameters import resolve
 from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value, build_schedules

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import matrix_balance, schur, solve_sylvester
 
-from apc.runtime.lift import UNIT
+from apc.runtime.discretize import UNIT
 from apc.runtime.modes import ClosedSystem
 from apc.runtime.rigid import RigidModes, find_rigid_modes
 
