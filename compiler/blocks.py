@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterable, Sequence, Set
 from dataclasses import dataclass
 
 import sympy
+
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.flatten import FlatEquation
 from apc.compiler.symbolic import LinearForm, ZeroTest, linear_form, symbol

@@ -161,7 +161,7 @@ def _relative(name: str) -> str:
 
 
 def _path_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of all YAML files in a folder with their names; empty if unreadable."""
+    """Return the SHA-256 of a file, or of a folder's YAML files and their names; empty if unreadable."""
     try:
         if not path.is_dir():
             return hashlib.sha256(path.read_bytes()).hexdigest()

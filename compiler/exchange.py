@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.clocks import HoldCrossing, count_of
 from apc.compiler.compiled import PEERS, Clock, Column, Group, Kind, Link, PairDelay, Parameter, Timing
 from apc.compiler.component import Number as NumberParameter
@@ -20,7 +22,6 @@ from apc.compiler.flatten import FlatKind
 from apc.compiler.scene import PeerGroup, Scene, SceneLink
 from apc.compiler.units import format_dimension
 from apc.compiler.values import Value
-from numpy.typing import NDArray
 
 NO_DELAY = "no delay"
 COUNT_ABOUT = "peers heard over the link, counted with their weights"

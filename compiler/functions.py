@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 
 import casadi
 import sympy
+
 from apc.compiler.blocks import ImplicitBlock
 from apc.compiler.clocks import HoldCrossing, ReceiveCrossing
 from apc.compiler.compiled import (

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from apc.compiler.compiled import Graph
 from apc.compiler.errors import ApcError, Mistakes
 from apc.compiler.reading import add_unknown, brief, check_keys, entries, form, read_mapping, read_text

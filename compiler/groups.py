@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.component import Number, Option, Reference, Variable
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.reading import (
@@ -31,7 +33,6 @@ from apc.compiler.source import Node, Scalar, Sequence
 from apc.compiler.tables import Column, Table, read_table
 from apc.compiler.units import format_dimension
 from apc.compiler.values import Value
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from apc.compiler.scene import Settable

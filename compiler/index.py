@@ -21,6 +21,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import sympy
+
 from apc.compiler.blocks import Residual, match_columns, report_singular
 from apc.compiler.errors import Mistakes
 from apc.compiler.symbolic import (

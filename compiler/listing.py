@@ -13,6 +13,7 @@ from typing import Any
 
 import casadi
 import sympy
+
 from apc.compiler.blocks import Assignment, ImplicitBlock
 from apc.compiler.clocks import ClockedSystem, ReceiveCrossing
 from apc.compiler.compiled import CompiledSystem

@@ -102,7 +102,7 @@ class Picture:
 
 
 def text_width(text: str, size: float, *, bold: bool = False) -> float:
-    """Return about how wide a text is, rather too wide: the widths of DejaVu Sans, the widest of the fonts."""
+    """Return about how wide a text is, rather too wide: as in DejaVu Sans, the widest font."""
     em = sum(
         0.36 if c in "iljtfrI.,:;|!'()[]/ -" else 0.98 if c in "mwMW@%…" else 0.72 if c.isupper() else 0.64
         for c in text
@@ -394,7 +394,7 @@ def _shape(net: Net) -> str:
 def _who_hears_whom(
     diagram: Diagram, net: Net, x: float, y: float, colours: dict[str, str]
 ) -> Iterable[Mark]:
-    """Draw the peers on a circle and their arcs; of many peers the first ones. The one drawn whole is larger."""
+    """Draw the peers on a circle and their arcs; of many peers the first. The one drawn whole is larger."""
     number = min(diagram.peers, MOST_PEERS)
     owners = [crowd.name for crowd in diagram.crowds for _ in range(min(crowd.count, MOST_PEERS))][:number]
     radius = THUMB / 2 - 8

@@ -15,6 +15,8 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import Graph
 from apc.compiler.component import Component, Number, Option, Reference, Variable
 from apc.compiler.definitions import RESERVED, read_type
@@ -48,7 +50,6 @@ from apc.compiler.values import (
     resolve_in_order,
     settle,
 )
-from numpy.typing import NDArray
 
 SECTIONS = ("masses", "couplers", "links", "hands")
 KEYS = (

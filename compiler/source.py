@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import IO, Any, NoReturn
 
 import yaml
+
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
 
 MAX_BYTES = 1 << 20  # 1 MiB; the largest scene we know of is a hundredth of it

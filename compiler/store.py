@@ -27,6 +27,7 @@ from typing import Any
 
 import casadi
 import numpy as np
+
 from apc.compiler.cache import DAMAGE, FORMAT, LARGEST, MEMBER
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place

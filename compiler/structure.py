@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence, Set
 from dataclasses import dataclass
 
 import sympy
+
 from apc.compiler.blocks import Assignment, ImplicitBlock, Residual, Step, assigned, solve_blocks
 from apc.compiler.clocks import (
     CONTINUOUS,

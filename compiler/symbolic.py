@@ -12,6 +12,7 @@ from collections.abc import Callable, Set
 from math import prod
 
 import sympy
+
 from apc.compiler.expression import (
     Binary,
     Call,

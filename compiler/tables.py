@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.reading import brief
 from apc.compiler.units import NO_UNIT, Unit, parse_unit
-from numpy.typing import NDArray
 
 MAX_BYTES = 1 << 28  # 256 MiB: some ten million numbers
 MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows

@@ -14,7 +14,11 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.discretize import TOO_LARGE
 from apc.runtime.exchange import Exchange, build_exchange
 from apc.runtime.linearize import SiteJacobians, jacobians
 from apc.runtime.modes import Split, dense, split
@@ -155,9 +159,11 @@ def _analyze(
     method: Callable[[Sequence[PeerGroup], Exchange], Split],
 ) -> Analysis:
     """Analyse a system, split into closed systems by a method."""
-    with single_threaded():
+    with single_threaded(), np.errstate(all="ignore"):
         groups, exchange = lifted_groups(system, prepared=prepared)
         found = method(groups, exchange)
+        if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in found.systems):
+            raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
         spectrum = solve_spectrum(found.systems)
     return Analysis(
         topology=system.name,

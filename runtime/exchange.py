@@ -16,14 +16,15 @@ from fractions import Fraction
 
 import flint
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import CompiledSystem, Graph, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from numpy.typing import NDArray
+from apc.runtime.discretize import UNIT
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-UNIT = float(np.finfo(np.float64).eps) / 2  # the unit roundoff of double precision
 
 # Backward error of LAPACK's eigenvalue solvers in units of n·UNIT·‖W‖_F: 'a modest constant' (LAPACK Users'
 # Guide, 3rd ed., section 4.7).

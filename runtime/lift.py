@@ -19,24 +19,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.discretize import UNIT, discretize
 from apc.runtime.linearize import LinearSite, magnitudes
 from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value
-from numpy.typing import NDArray
-from scipy.linalg import expm
 
 Floats = NDArray[np.float64]
-
-UNIT = float(np.finfo(np.float64).eps) / 2  # the unit roundoff of double precision
 
 # Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
 # short polynomials of the parameters, a few roundings an entry.
 COEFFICIENT_ROUNDINGS = 8
-
-# Rounding errors charged to an entry of a matrix exponential, per row of the matrix and per squaring,
-# relative to the same entry of the exponential of magnitudes. Higham, The Scaling and Squaring Method for
-# the Matrix Exponential Revisited (2005), sections 2 and 4: Padé degree at most 13, then one product a
-# squaring.
-EXPONENTIAL_ROUNDINGS = 13
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +53,7 @@ class LiftedSite:
     inside: Floats  # (marks, n_x, n_z + n_r)
 
 
-def lift(site: LinearSite, schedule: Schedule) -> LiftedSite:
+def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = None) -> LiftedSite:
     """Compose a site's events over one frame.
 
     Parameters
@@ -69,6 +62,9 @@ def lift(site: LinearSite, schedule: Schedule) -> LiftedSite:
         The site's matrices, in floats.
     schedule
         What happens in a frame.
+    exact
+        The site's matrices in rationals, whose exponentials are taken; without it, those of `site` count as
+        exact.
 
     Notes
     -----
@@ -77,23 +73,19 @@ def lift(site: LinearSite, schedule: Schedule) -> LiftedSite:
     composition, so the whole frame is off by at most γ times the composition of the magnitudes, with the
     roundings of every event added up. That bound holds whatever the scaling of the states.
     """
-    block = np.block([[site.a, site.b], [np.zeros((site.b.shape[1], site.a.shape[1] + site.b.shape[1]))]])
-    steps, large_steps, squarings = {}, {}, 0
-    for duration in {event.duration for event in schedule.events if isinstance(event, Propagate)}:
-        scaled = block * float(duration * schedule.quantum)
-        steps[duration] = expm(scaled)
-        large_steps[duration] = expm(np.abs(scaled))
-        norm = float(np.abs(scaled).sum(axis=0).max(initial=0.0))
-        squarings = max(squarings, int(np.ceil(np.log2(max(norm, 1.0)))))
+    durations = sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
+    exact = site if exact is None else exact
+    found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
+    steps = {duration: step.matrix for duration, step in zip(durations, found, strict=True)}
+    large_steps = {duration: step.size for duration, step in zip(durations, found, strict=True)}
     frame = _compose(site, schedule, steps)
     large = _compose(magnitudes(site), schedule, large_steps)
 
-    size = len(block)
+    size = sum(site.b.shape)
     width = size + max((tick.m.shape[1] + tick.r.shape[1] for tick in site.ticks), default=0)
     width += len(schedule.heard)
-    exponential = (EXPONENTIAL_ROUNDINGS + squarings + COEFFICIENT_ROUNDINGS) * size
     roundings = sum(
-        size + exponential if isinstance(event, Propagate) else width + COEFFICIENT_ROUNDINGS
+        size + 1 if isinstance(event, Propagate) else width + COEFFICIENT_ROUNDINGS
         for event in schedule.events
         if not isinstance(event, Act)
     )

@@ -26,9 +26,10 @@ from typing import Any
 
 import casadi
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import PEERS, ClockPartition, Kind, Receive
 from apc.runtime.exact import evaluate_exact
-from numpy.typing import NDArray
 
 Matrix = NDArray[Any]
 
@@ -110,6 +111,11 @@ class SiteJacobians:
     pattern: LinearSite
     affine: bool
     edges: Mapping[tuple[int, int], Edge]
+
+    @property
+    def walkable(self) -> bool:
+        """Whether the function is a list of scalar operations; one with a Newton solver inside isn't."""
+        return bool(self.function.is_a("SXFunction"))
 
 
 def jacobians(kind: Kind) -> SiteJacobians:
@@ -329,6 +335,15 @@ def start_sends(
 def _channels_of(site: SiteJacobians) -> list[tuple[tuple[int, ...], ...]]:
     """Return the channels each partition's receives depend on."""
     return [tick.channels for tick in site.pattern.ticks]
+
+
+def rational_floats(site: LinearSite) -> LinearSite:
+    """Return the site with every float as the rational it is."""
+    exact = [
+        np.array([[Fraction(v) for v in row] for row in m], dtype=object).reshape(m.shape)
+        for m in _matrices(site)
+    ]
+    return _assemble(site.kind, site.affine, exact)
 
 
 def magnitudes(site: LinearSite) -> LinearSite:

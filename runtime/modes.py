@@ -25,11 +25,12 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.discretize import UNIT
 from apc.runtime.exchange import Exchange, GraphMode, check_mean, graph_modes
-from apc.runtime.lift import UNIT
 from apc.runtime.peers import MOST_STATES, PeerGroup, states_of, too_large, used_ways
 from apc.runtime.schedule import Way
-from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis import Prepared, lifted_groups, prepare

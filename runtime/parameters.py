@@ -18,9 +18,10 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import PEERS, CompiledSystem, Group, Parameter, Timing
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
-from numpy.typing import NDArray
 
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")

@@ -16,6 +16,8 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.exact import evaluate_exact
@@ -29,13 +31,13 @@ from apc.runtime.linearize import (
     linearize,
     linearize_exact,
     linearize_rows,
+    rational_floats,
     site_of_row,
     start_sends,
     start_values,
 )
 from apc.runtime.parameters import Numbers
 from apc.runtime.schedule import Schedule, Way
-from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -77,8 +79,9 @@ class PeerGroup:
     gains: Gains
 
     def exact(self) -> LinearSite:
-        """The site's matrices in exact rationals."""
-        return linearize_exact(self.jacobians, self.parameters, self.listening)
+        """The site's matrices in exact rationals; where they can't be had, its floats taken at their word."""
+        exact = _rational(self.jacobians, self.parameters, self.listening)
+        return rational_floats(self.site) if exact is None else exact
 
     def sends(self, link: str) -> bool:
         """Say whether these peers send over a link."""
@@ -234,13 +237,18 @@ def _group(
         jacobians=built,
         site=site,
         schedule=schedule,
-        lifted=lift(site, schedule),
+        lifted=lift(site, schedule, exact=_rational(built, vector, listening)),
         peers=peers,
         role=exchange.role(parts[0][0]),
         place=place,
         listening=listening,
         gains=gains or {},
     )
+
+
+def _rational(built: SiteJacobians, vector: Floats, listening: Listening | None) -> LinearSite | None:
+    """Return the site's matrices in rationals, or None where its functions can't be walked one by one."""
+    return linearize_exact(built, vector, listening) if built.walkable else None
 
 
 def _by_start(

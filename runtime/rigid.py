@@ -25,12 +25,13 @@ from typing import Any
 
 import flint
 import numpy as np
+from numpy.typing import NDArray
+
 from apc.runtime.exchange import QUICK_PRIME
 from apc.runtime.linearize import LinearSite
 from apc.runtime.modes import ClosedSystem
 from apc.runtime.peers import PeerGroup
 from apc.runtime.schedule import Act, Propagate, Send, Tick, Value
-from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 

@@ -18,12 +18,17 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+
 from apc.compiler.compiled import Clock, CompiledSystem, Link
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.exchange import Exchange, build_exchange, check_mean
 from apc.runtime.linearize import LinearSite, edge_name
 
 # The order of coincident events. Continuous variables are continuous, so sampling needs no place in it.
 ORDER = ("send", "deliver", "tick", "act")
+
+MOST_TICKS = 20_000  # in a frame: each is a step of the lifting
+MOST_PACKETS = 1000  # of one peer: a dense eigenproblem of this size takes seconds
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -192,7 +197,7 @@ def build_schedules(
     Raises
     ------
     ApcError
-        E801 a mean, maximum or minimum over nobody.
+        E801 a mean, maximum or minimum over nobody; E805 too many ticks or packets in a frame.
     """
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
     rank = {name: place for place, name in enumerate(order)}
@@ -210,6 +215,7 @@ def build_schedules(
             known[group.kind, own] = heard
             for one in (one for row in heard.values() for receive in row for one in receive):
                 depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
+    _check_depth(system, depth)
     built = {
         (kind, own): _build(patterns[kind], system, live[kind], heard, depth, times, rank)
         for (kind, own), heard in known.items()
@@ -340,12 +346,47 @@ def _times(
     }
     quantum = _common_divisor([*period.values(), *phase.values(), *delays.values()])
     count = {name: int(value / quantum) for name, value in period.items()}
+    frame = math.lcm(*count.values())
+    _check_frame_length(system, period, count, frame, quantum)
     return _Times(
         quantum=quantum,
-        frame=math.lcm(*count.values()),
+        frame=frame,
         clocks={name: _Grid(int(phase[name] / quantum), count[name]) for name in clocks},
         delays={name: int(value / quantum) for name, value in delays.items()},
     )
+
+
+def _check_frame_length(
+    system: CompiledSystem,
+    period: Mapping[str, Fraction],
+    count: Mapping[str, int],
+    frame: int,
+    quantum: Fraction,
+) -> None:
+    """Refuse clocks that stand as before only after too many ticks to step through."""
+    ticks = sum(frame // number for number in count.values())
+    if ticks > MOST_TICKS:
+        clocks = ", ".join(f"{name} {float(value) * 1e3:.9g} ms" for name, value in period.items() if name)
+        what = (
+            f"all clocks stand as before only after {float(frame * quantum):.6g} s and {ticks} ticks "
+            f"({clocks}); at most {MOST_TICKS} can be analysed"
+        )
+        hint = "periods that are simple multiples of one another"
+        raise ApcError(Mistake("E805", Place(system.name), what, hint=hint))
+
+
+def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
+    """Refuse delays so long that a peer would keep more packets than can be analysed."""
+    packets = sum(depth.values())
+    if packets > MOST_PACKETS:
+        links = ", ".join(sorted({sent.link for sent in depth}))
+        what = (
+            f"with these delays each peer keeps {packets} numbers on their way over {links}; "
+            f"at most {MOST_PACKETS} can be analysed"
+        )
+        raise ApcError(
+            Mistake("E805", Place(system.name), what, hint="a shorter delay, or a slower link clock")
+        )
 
 
 def _common_divisor(times: Iterable[Fraction]) -> Fraction:

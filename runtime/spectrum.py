@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from apc.runtime.lift import UNIT
-from apc.runtime.modes import ClosedSystem
-from apc.runtime.rigid import RigidModes, find_rigid_modes
 from numpy.typing import NDArray
 from scipy.linalg import matrix_balance, schur, solve_sylvester
+
+from apc.runtime.discretize import UNIT
+from apc.runtime.modes import ClosedSystem
+from apc.runtime.rigid import RigidModes, find_rigid_modes
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -9,6 +9,7 @@ from typing import Any
 
 import casadi
 import numpy as np
+
 from apc.compiler.compiled import (
     Clock,
     ClockPartition,

@@ -13,11 +13,11 @@ from pathlib import Path
 import casadi
 import numpy as np
 import pytest
+
 from apc.compiler.compiled import Timing
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis import analyze_dense, analyze_modes, prepare
 from apc.runtime.parameters import apply, parse_override
-
 from tests.sites import MS, alone, columned, edged, grouped, linked, paper
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import apc
 import pytest
+
+import apc
 from tests.topologies import SCENES, told
 
 PATH = SCENES / "three-users-average.yaml"

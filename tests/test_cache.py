@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
 from apc.__main__ import run
 from apc.api import load
 from apc.compiler import cache, store
@@ -154,7 +155,7 @@ def test_a_damaged_model_has_no_record(content: bytes) -> None:
 def test_a_model_with_a_changed_member_has_no_record() -> None:
     with zipfile.ZipFile(MODEL) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-    members["function0.casadi"] += b"x"
+    members[next(name for name in members if name.endswith(".casadi"))] += b"x"
     with zipfile.ZipFile(MODEL, "w") as archive:
         for name, data in members.items():
             archive.writestr(name, data)

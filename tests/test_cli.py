@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+
 from apc.__main__ import run
 from tests.topologies import AVERAGE, MESH
 
@@ -136,7 +137,9 @@ def test_an_unstable_scene_is_an_answer(cli: Cli) -> None:
 
 def test_set_may_be_repeated_and_the_section_may_be_named(cli: Cli) -> None:
     written("scene.yaml")
-    one = cli("analyze", "--set", "couplers.contact.stiffness=1.5 N/mm", "--set", "links.lan.delay=0 s", "--json")
+    one = cli(
+        "analyze", "--set", "couplers.contact.stiffness=1.5 N/mm", "--set", "links.lan.delay=0 s", "--json"
+    )
     text = AVERAGE.replace("1000 N/m", "1500 N/m").replace("delay: 8 ms", "delay: 0 s")
     two = cli("analyze", written("scene.yaml", text), "--json")
     assert (one.code, two.code) == (0, 0)

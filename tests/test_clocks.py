@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from apc.compiler.clocks import ClockedKind
 from apc.compiler.expression import format_expression
 from tests.topologies import AVERAGE, MESH, ONE_MASS, clocked, library, replaced, told
@@ -20,7 +21,9 @@ equations:
   - {second}
   - {third}
 """
-TEXT = ONE_MASS + "clocks: {tick: 1 ms, tock: 2 ms}\nhands:\n  hand: {type: Part, flange: device, clock: tick}\n"
+TEXT = (
+    ONE_MASS + "clocks: {tick: 1 ms, tock: 2 ms}\nhands:\n  hand: {type: Part, flange: device, clock: tick}\n"
+)
 
 
 def only(text: str) -> ClockedKind:
@@ -117,7 +120,8 @@ def test_a_clocked_variable_needs_hold_to_act(tmp_path: Path) -> None:
 def test_what_is_continuous_already_cannot_be_held(tmp_path: Path) -> None:
     (line,) = told_of(tmp_path, "s = flange.x", "w = s", "flange.f = k*hold(w)")
     assert line == (
-        "part0.yaml:8:5: E505 hold(hand.w, 0) of hand holds hand.w, which is continuous already. Write: hand.w"
+        "part0.yaml:8:5: E505 hold(hand.w, 0) of hand holds hand.w, which is continuous already. "
+        "Write: hand.w"
     )
 
 
@@ -143,6 +147,8 @@ def test_the_time_convention_stands_in_the_docstring_of_this_stage() -> None:
     import apc.compiler.clocks as stage
 
     assert stage.__doc__ is not None
-    order = [stage.__doc__.index(word) for word in ("are sampled", "network clocks tick", "force clocks tick")]
+    order = [
+        stage.__doc__.index(word) for word in ("are sampled", "network clocks tick", "force clocks tick")
+    ]
     assert order == sorted(order)
     assert "a tick at exactly t + T_d sees it" in stage.__doc__

@@ -1,6 +1,7 @@
 """`dimensions`: what fits together, and which term is named when something does not."""
 
 import pytest
+
 from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.expression import Name, parse_equation, parse_expression

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
 from tests.topologies import ROOT
 
 FILES = sorted([*(ROOT / "compiler").glob("*.py"), *(ROOT / "runtime").rglob("*.py")])
@@ -60,7 +61,9 @@ def test_a_parameters_section_names_every_parameter(path: Path) -> None:
     for name, node in public(parsed(path)):
         if isinstance(node, ast.ClassDef):
             continue
-        section = re.search(r"Parameters\n-+\n(.*?)(?:\n\n\w[\w ]*\n-+\n|\Z)", ast.get_docstring(node) or "", re.S)
+        section = re.search(
+            r"Parameters\n-+\n(.*?)(?:\n\n\w[\w ]*\n-+\n|\Z)", ast.get_docstring(node) or "", re.S
+        )
         if section is None:
             continue
         headings = [line for line in section.group(1).splitlines() if line and not line[0].isspace()]

@@ -1,6 +1,7 @@
 """`errors`: what a message looks like, and in which order messages come."""
 
 import pytest
+
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
 
 

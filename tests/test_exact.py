@@ -8,6 +8,7 @@ from fractions import Fraction
 import casadi
 import mpmath
 import pytest
+
 from apc.runtime.exact import evaluate_exact
 
 

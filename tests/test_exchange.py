@@ -6,10 +6,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+
 from apc.compiler.compiled import Graph
 from apc.runtime.exchange import GraphMode, arcs, build_exchange, graph_modes
 from apc.runtime.parameters import resolve
-
 from tests.sites import COMPLETE, MS, grouped, linked, paper
 
 

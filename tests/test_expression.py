@@ -6,6 +6,9 @@ from collections.abc import Callable
 from fractions import Fraction
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.expression import (
     FUNCTIONS,
@@ -30,8 +33,6 @@ from apc.compiler.expression import (
     transform,
     walk,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 A, B, C, X = (Name((letter,)) for letter in "abcx")
 TWO = Number(Fraction(2))

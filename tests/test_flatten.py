@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from apc.compiler.flatten import FlatKind
 from tests.topologies import AVERAGE, MESH, ONE_MASS, flat, library, replaced, scene, told
 
@@ -73,12 +74,17 @@ def test_samples_and_others_carry_their_clock_and_part() -> None:
         " - coordination.damping*sum(others.coordination.v)"
     )
     sends = only(MESH).sends
-    assert [(send.name, send.link) for send in sends] == [("coordination.x", "lan"), ("coordination.v", "lan")]
+    assert [(send.name, send.link) for send in sends] == [
+        ("coordination.x", "lan"),
+        ("coordination.v", "lan"),
+    ]
 
 
 def test_groups_that_differ_in_numbers_only_are_one_kind() -> None:
     kind = only(
-        replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 2 kg}}\n  two: {count: 9}"))
+        replaced(
+            AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 2 kg}}\n  two: {count: 9}")
+        )
     )
     assert kind.groups == ("one", "two")
     assert kind.name == "one and two"

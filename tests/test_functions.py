@@ -8,6 +8,7 @@ from typing import Any
 
 import casadi
 import pytest
+
 from apc.compiler.compiled import CompiledSystem, Kind, Parameter
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, library, replaced, told
 
@@ -76,7 +77,9 @@ def test_timings_are_exact_and_each_is_there_once() -> None:
 
 
 def test_a_parameter_keeps_its_bounds_its_unit_and_its_expression() -> None:
-    text = replaced(AVERAGE, ("clocks:", "parameters: {kt: 2 N/mm}\nclocks:"), ("500 N/m,", "kt/(peers + 1),"))
+    text = replaced(
+        AVERAGE, ("clocks:", "parameters: {kt: 2 N/mm}\nclocks:"), ("500 N/m,", "kt/(peers + 1),")
+    )
     found = {parameter.name: parameter for parameter in compiled(text).parameters}
     assert found["coordination.stiffness"] == Parameter(
         *("coordination.stiffness", "N/m", 500.0, "kt/(peers + 1)", 0.0, False, None),
@@ -141,8 +144,9 @@ def test_a_value_of_the_tick_before_is_a_memory(tmp_path: Path) -> None:
 
 def test_every_function_of_the_language_has_its_meaning(tmp_path: Path) -> None:
     terms = (
-        "max(a, 1) + min(a, 1) + abs(a) + sign(a) + floor(a) + exp(a) + log(a + 9) + sin(a) + cos(a) + tanh(a)"
-        " + sqrt(a + 9) + a^3 + 1/(a + 9)^2 + (a + 9)^(1/3) + (if a < 1 and not a >= 2 or a == 3 then 4 else 5)"
+        "max(a, 1) + min(a, 1) + abs(a) + sign(a) + floor(a) + exp(a) + log(a + 9) + sin(a) + cos(a)"
+        " + tanh(a) + sqrt(a + 9) + a^3 + 1/(a + 9)^2 + (a + 9)^(1/3)"
+        " + (if a < 1 and not a >= 2 or a == 3 then 4 else 5)"
     )
     own = library(
         tmp_path,
@@ -172,7 +176,9 @@ def test_a_delay_is_the_same_for_all_peers() -> None:
 
 def test_groups_of_one_kind_share_its_functions() -> None:
     system = compiled(
-        replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 2 kg}}\n  two: {count: 9}"))
+        replaced(
+            AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 2 kg}}\n  two: {count: 9}")
+        )
     )
     one, two = system.groups
     assert (one.kind, two.kind, len(system.kinds)) == (0, 0, 1)

@@ -1,4 +1,4 @@
-"""The stages `flat` and `sorted` of five scenes, as files that were read and found right, and the same everywhere.
+"""The stages `flat` and `sorted` of five scenes, as files that were read and found right.
 
 When a change of the compiler is meant to change them: `python -m tests.test_golden` writes them again; read
 the difference before it is committed, equation by equation. They say how the text of a scene becomes
@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from apc.compiler.listing import describe
 from apc.compiler.pipeline import Stage, run_stages
 from tests.topologies import ROOT, SCENES

@@ -11,6 +11,7 @@ import math
 import time
 
 import pytest
+
 from apc.compiler.blocks import ImplicitBlock
 from apc.compiler.clocks import CONTINUOUS, ClockedKind, HoldCrossing, Partition, SampleCrossing
 from apc.compiler.errors import ApcError, Mistakes, Place

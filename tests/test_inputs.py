@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from apc.compiler import store
 from apc.compiler.pipeline import compile_topology
 from apc.inputs import find_input, is_fresh, load_fresh
@@ -77,7 +78,8 @@ def test_a_model_is_fresh_until_its_topology_changes() -> None:
     Path("scene.yaml").write_text(AVERAGE + "# more\n", encoding="utf-8")
     assert not is_fresh(store.load(path), path)
     assert told(load_fresh, path) == [
-        "scene.apc: E605 is stale: scene.yaml has changed since it was compiled. Write: apc compile scene.yaml"
+        "scene.apc: E605 is stale: scene.yaml has changed since it was compiled. "
+        "Write: apc compile scene.yaml"
     ]
     Path("scene.yaml").unlink()
     assert load_fresh(path).name == "three-users-average", "no topology there to be older than"

@@ -6,6 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import pytest
+
 from apc.compiler.errors import ApcError
 from apc.compiler.library import Library, Number, Option, Reference, option_test
 from apc.compiler.units import format_dimension
@@ -180,7 +181,11 @@ def test_an_option_test_names_its_option_and_word(tmp_path: Path) -> None:
             "mass: {unit: m}, x: {unit: m, start: 0 m}",
             "part0.yaml:4:13: E205 the name mass is used twice in this component",
         ),
-        ("mass: {unit: kg, above: 0}", "mass: mass", "part0.yaml:3:20: E203 parameter mass wants clock, link,"),
+        (
+            "mass: {unit: kg, above: 0}",
+            "mass: mass",
+            "part0.yaml:3:20: E203 parameter mass wants clock, link,",
+        ),
         ("mass: {unit: kg, above: 0}", "mass: {above: 0}", "part0.yaml:3:20: E201 mass has no unit"),
         (
             "mass: {unit: kg, above: 0}",

@@ -8,14 +8,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import apc
 import casadi
 import pytest
+
+import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.component import Reference
 from apc.compiler.library import Library
 from apc.compiler.pipeline import compile_topology
-
 from tests.topologies import MESH, ONE_MASS, compiled, library, replaced, scene, told
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,10 +9,10 @@ from typing import Any
 import casadi
 import numpy as np
 import pytest
-from apc.runtime.analysis import lifted_groups
-from apc.runtime.lift import LiftedSite
 from scipy.linalg import expm
 
+from apc.runtime.analysis import lifted_groups
+from apc.runtime.lift import LiftedSite
 from tests.sites import MS, alone, paper
 
 

@@ -7,9 +7,9 @@ from fractions import Fraction
 
 import casadi
 import numpy as np
+
 from apc.runtime.linearize import jacobians, linearize, linearize_exact
 from apc.runtime.parameters import resolve
-
 from tests.sites import NAMES, paper, user
 
 

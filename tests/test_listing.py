@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+
 from apc.compiler.listing import describe
 from tests.topologies import AVERAGE, clocked, compiled, flat, ordered, scene, source
 

@@ -6,12 +6,12 @@ import cmath
 import math
 from typing import Any
 
-import apc
 import casadi
 import numpy as np
 import pytest
-from apc.compiler.compiled import CompiledSystem
 
+import apc
+from apc.compiler.compiled import CompiledSystem
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
 
 CLOCK = "clocks: {tick: 1 ms}\n"

@@ -6,10 +6,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis import lifted_groups
 from apc.runtime.modes import dense, modes, split
-
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, columned, edged, grouped, linked, paper
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from fractions import Fraction
 
 import pytest
+
 from apc.runtime.analysis import analyze_modes
 from apc.runtime.needs import needs
-
 from tests.sites import columned, edged, linked, paper
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
 

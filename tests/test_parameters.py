@@ -8,10 +8,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError
 from apc.runtime.parameters import Override, apply, parse_override, resolve
-
 from tests.sites import NAMES, columned, grouped, paper
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 
 import pytest
+
 from apc.compiler.clocks import ClockedSystem
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.flatten import FlatSystem

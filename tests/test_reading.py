@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.reading import (
     add_unknown,
@@ -80,7 +81,8 @@ def test_a_name_is_a_letter_then_letters_digits_underscores(text: str) -> None:
     assert read_name(scalar, "a clock", mistakes) is None
     wanted = "a letter followed by letters, digits or underscores (63 at most)"
     assert sentences(mistakes) == [
-        f"a.yaml:1:1: E205 the name of a clock wants {wanted}, got {brief(scalar.text)}" + ("" if len(text) > 60 else ".")
+        f"a.yaml:1:1: E205 the name of a clock wants {wanted}, got {brief(scalar.text)}"
+        + ("" if len(text) > 60 else ".")
     ]
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+
 from apc.report import WIDTH, analysis_report, compile_report
 from apc.runtime.analysis import analyze_modes
 from apc.runtime.needs import needs
@@ -61,8 +62,22 @@ def test_an_analysis_names_verdict_radius_and_error() -> None:
 def test_a_conjugate_pair_is_one_row_and_the_rest_is_counted() -> None:
     result = analyze_modes(compiled(AVERAGE))
     rows = [line for line in analysis_report(result).splitlines() if " Hz " in line or " – " in line]
-    shown = [mode for mode in result.modes if mode.eigenvalue.imag >= 0 and mode.magnitude > 1e-6]
-    assert len(rows) == len(shown)
+    alive = [mode for mode in result.modes if mode.magnitude > 1e-3]
+    assert len(rows) == sum(1 for mode in alive if mode.eigenvalue.imag >= 0)
+    dead = len(result.modes) - len(alive)
+    assert analysis_report(result).endswith(f"  and {dead} faster-dying ones (--json lists all)")
+
+
+def test_what_rounding_makes_of_a_zero_changes_nothing_that_is_printed() -> None:
+    result = analyze_modes(compiled(AVERAGE))
+    other = dataclasses.replace(
+        result,
+        modes=tuple(
+            dataclasses.replace(mode, eigenvalue=-1e-9j, magnitude=1e-9) if mode.magnitude < 1e-6 else mode
+            for mode in result.modes
+        ),
+    )
+    assert analysis_report(other) == analysis_report(result)
 
 
 @pytest.mark.parametrize(

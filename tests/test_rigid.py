@@ -7,11 +7,11 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis import lifted_groups
 from apc.runtime.modes import ClosedSystem, dense, modes
 from apc.runtime.rigid import find_rigid_modes
-
 from tests.sites import MS, grouped, paper
 
 

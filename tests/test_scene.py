@@ -5,6 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 import pytest
+
 from apc.compiler.scene import LARGEST_COUNT
 from tests.topologies import AVERAGE, MESH, ONE_MASS, replaced, scene, told
 
@@ -55,7 +56,10 @@ def test_the_papers_scene_is_read_whole_and_in_exact_si() -> None:
 def test_units_convert_exactly() -> None:
     found = scene(
         replaced(
-            AVERAGE, ("mass: 0.1 kg", "mass: 100 g"), ("1000 N/m", "1 N/mm"), ("haptic: 1 ms", "haptic: 1/90 s")
+            AVERAGE,
+            ("mass: 0.1 kg", "mass: 100 g"),
+            ("1000 N/m", "1 N/mm"),
+            ("haptic: 1 ms", "haptic: 1/90 s"),
         )
     )
     assert dict(found.part("device").values)["mass"].number == Fraction(1, 10)
@@ -132,7 +136,11 @@ def test_all_mistakes_of_a_file_come_together_in_its_order() -> None:
             "12:76: E204 stiffness wants N/m, got 1000 N*m. Write: stiffness: 1000 N/m",
         ),
         ("stiffness: 1000 N/m, ", "", "12:3: E201 contact has no stiffness. Write: stiffness: 1 N/m"),
-        ("clock: haptic, delay: 1 ms}", "delay: 1 ms}", "12:3: E201 contact has no clock. Write: clock: haptic"),
+        (
+            "clock: haptic, delay: 1 ms}",
+            "delay: 1 ms}",
+            "12:3: E201 contact has no clock. Write: clock: haptic",
+        ),
         ("a: device, ", "", "12:3: E210 contact does not say what its a is joined to. Write: a: device"),
         (
             "a: device",
@@ -156,13 +164,21 @@ def test_all_mistakes_of_a_file_come_together_in_its_order() -> None:
             "13:24: E206 there is no component Flange; there are: AveragePosition, ConstantForce, FullMesh, "
             "Link, Mass, SampledSpringDamper.",
         ),
-        ("type: SampledSpringDamper, ", "", "12:3: E201 contact has no type. Write: type: SampledSpringDamper"),
+        (
+            "type: SampledSpringDamper, ",
+            "",
+            "12:3: E201 contact has no type. Write: type: SampledSpringDamper",
+        ),
         (
             "link: lan",
             "link: lan, delays: som",
             "13:122: E206 delays wants all or own, got som. Write: delays: all",
         ),
-        ("shared: true", "shared: yes", "10:52: E203 shared wants true or false, got yes. Write: shared: true"),
+        (
+            "shared: true",
+            "shared: yes",
+            "10:52: E203 shared wants true or false, got yes. Write: shared: true",
+        ),
         (
             "clock: network, delay",
             "clock: network, shared: true, delay",
@@ -228,7 +244,11 @@ def test_all_mistakes_of_a_file_come_together_in_its_order() -> None:
             "experiment: {seed: -1}\nclocks:",
             "3:20: E203 seed wants a whole number, 0 or more, got -1.",
         ),
-        ("studies:", "studis:", "16:1: E202 a topology has no key studis; the nearest is studies. Write: studies"),
+        (
+            "studies:",
+            "studis:",
+            "16:1: E202 a topology has no key studis; the nearest is studies. Write: studies",
+        ),
         (
             "couplers:",
             "coupler:",

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import apc
 import numpy as np
 import pytest
+
+import apc
 from apc.compiler.pipeline import compile_topology, run_stages
 from apc.compiler.scene import Scene
 from apc.runtime.selfcheck import check_frame
-
 from tests.topologies import SCENES, compiled, replaced
 
 COMMON = "stable up to a common translation"

@@ -6,10 +6,10 @@ import itertools
 from fractions import Fraction
 
 import pytest
+
 from apc.runtime.linearize import jacobians
 from apc.runtime.parameters import resolve
 from apc.runtime.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, Tick, Value, build_schedules
-
 from tests.sites import MS, grouped, linked, paper
 
 

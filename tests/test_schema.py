@@ -1,4 +1,4 @@
-"""`schema`: what the compiler accepts fits it, typical slips do not, and the file in the package is current."""
+"""`schema`: what the compiler accepts fits it, typical slips do not, the file in the package is current."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from apc.__main__ import run
 from apc.compiler.library import Library
 from apc.compiler.scene import KEYS, PART_KEYS
@@ -33,7 +34,7 @@ masses:
   chain: {type: Mass, count: 3, mass: kt*1 s^2}
   bar: {type: MyOwn, length: 3}
 couplers:
-  contact: {type: SampledSpringDamper, a: device, b: "chain[1:3].flange", stiffness: kt/(peers - 1), clock: haptic}
+  contact: {type: SampledSpringDamper, a: device, b: "chain[3].flange", stiffness: kt/peers, clock: late}
 links:
   lan: {clock: late, delay: 0 s, graph: ring, delays: {left: {right: 12 ms}}}
   wan: {clock: late, graph: {edges: [[1, 2], ["left[1]", 3, 0.5]]}}

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 
-import apc.runtime.selfcheck as selfcheck
 import pytest
+
+import apc.runtime.selfcheck as selfcheck
 from apc.runtime.lift import LiftedSite, lift
 from apc.runtime.selfcheck import check_frame, skipped
-
 from tests.sites import MS, columned, edged, grouped, linked, paper
 
 

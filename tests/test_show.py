@@ -1,4 +1,4 @@
-"""`show`: the graph, the equations and the schedule of a scene, as text, document, Graphviz text and picture."""
+"""`show`: graph, equations and schedule of a scene, as text, document, Graphviz text and picture."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import apc
 import pytest
+
+import apc
 from apc.__main__ import run
 from apc.compiler.diagram import Diagram, build_diagram
 from apc.compiler.picture import Box, Line, Picture, Text, draw_svg, place
@@ -34,12 +35,13 @@ masses:
   long:   {count: 40, mass: 1 g}
   end:    {mass: 1 g, flange: cube}
 couplers:
-  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 3900 N/m, damping: 1 N*s/m, clock: haptic}
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 39 N/m, damping: 1 N*s/m, clock: haptic}
   near: {type: FullMesh, object: device, stiffness: kt/(peers - 1), clock: haptic, link: lan, delays: own}
   far: {type: AveragePosition, object: cube, stiffness: 7 N/m, clock: haptic, link: wan, at: [left]}
   tail: {type: SampledSpringDamper, count: 2, a: "chain[1:2]", b: "chain[2:3]", stiffness: 1 N/m, clock: wide}
   leash: {type: SampledSpringDamper, a: "chain[3]", b: ground, stiffness: 10 N/m, clock: wide}
-  links: {type: SampledSpringDamper, count: 39, a: "long[1:39]", b: "long[2:40]", stiffness: 1 N/m, clock: wide}
+  links: {type: SampledSpringDamper, count: 39, a: "long[1:39]", b: "long[2:40]", stiffness: 1 N/m,
+          clock: wide}
 links:
   lan: {clock: network, delay: 8 ms, delays: {left: {right: 12 ms}}}
   wan: {clock: wide, graph: star}
@@ -238,8 +240,8 @@ def test_what_costs_a_pair_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     assert run(["compile", str(path)]) == 0, capsys.readouterr().err
     report = " ".join(capsys.readouterr().out.split())
     assert re.search(
-        r"costs N²: sum\(.*others\.coordination\.x.*\) is evaluated once a pair of peers, as what it runs over is "
-        "not linear in what the others send over lan",
+        r"costs N²: sum\(.*others\.coordination\.x.*\) is evaluated once a pair of peers, as what it "
+        "runs over is not linear in what the others send over lan",
         report,
     )
 
@@ -249,10 +251,10 @@ component: Furthest
 about: Pulls by tanh of each distance.
 connectors: {object: Flange}
 sends: {x: sample(object.x)}
-parameters: {stiffness: {unit: N/m}, reach: {unit: m, default: 1}, clock: clock, link: link, delay: {unit: s, default: 0}}
+parameters: {stiffness: {unit: N/m}, reach: {unit: m, default: 1}, clock: clock, link: link}
 equations:
   - f = stiffness*sum(reach*tanh((sample(object.x) - others.x)/reach))
-  - object.f = hold(f, delay)
+  - object.f = hold(f)
 """
 
 

@@ -6,6 +6,9 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.source import (
     MAX_BYTES,
@@ -17,8 +20,6 @@ from apc.compiler.source import (
     place_in,
     read_source,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 
 def root(text: str | bytes) -> Node:

@@ -9,10 +9,10 @@ import flint
 import mpmath
 import numpy as np
 import pytest
+
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis import Analysis, analyze_dense, analyze_modes
 from apc.runtime.spectrum import _eigen
-
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, grouped, linked, paper
 

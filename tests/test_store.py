@@ -9,14 +9,17 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from tests.topologies import AVERAGE, MESH, compiled, replaced, told
 
-TWO_KINDS = replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 1 kg}}\n  two: {count: 2}"))
+TWO_KINDS = replaced(
+    AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {device.mass: 1 kg}}\n  two: {count: 2}")
+)
 TWO_KINDS += "hands:\n  hand: {type: ConstantForce, flange: device, force: 1 N, at: [one]}\n"
 
 
@@ -85,7 +88,9 @@ def test_another_format_version_is_refused_by_number(model: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", "null", '{"format": 1}', "{", '{"format": 1, "functions": 3}'])
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{}", "null", '{"format": 1}', "{", '{"format": 1, "functions": 3}']
+)
 def test_a_document_of_another_shape_is_refused(model: Path, content: str) -> None:
     rewritten(model, "model.json", content)
     assert told(store.load, model) == [

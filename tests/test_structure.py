@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import sympy
-from apc.compiler.blocks import match_columns, strong_components
-from apc.compiler.structure import SortedKind, sort
-from apc.compiler.symbolic import symbol
 from hypothesis import given
 from hypothesis import strategies as st
 
+from apc.compiler.blocks import match_columns, strong_components
+from apc.compiler.structure import SortedKind, sort
+from apc.compiler.symbolic import symbol
 from tests.topologies import AVERAGE, MESH, ONE_MASS, clocked, library, ordered, replaced, told
 
 GRAPHS = st.integers(1, 6).flatmap(

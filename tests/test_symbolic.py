@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import sympy
+
 from apc.compiler.errors import Place
 from apc.compiler.expression import parse_expression
 from apc.compiler.symbolic import derivative_symbol, head, symbol, to_sympy

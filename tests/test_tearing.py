@@ -7,6 +7,9 @@ import math
 import casadi
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
 from apc.compiler.blocks import ImplicitBlock, Residual, match_columns, solve_blocks, strong_components
 from apc.compiler.compiled import Kind, SendPartition, State
 from apc.compiler.errors import Mistakes, Place
@@ -15,8 +18,6 @@ from apc.compiler.flatten import FlatEquation
 from apc.compiler.functions import _Writer
 from apc.compiler.symbolic import no_derivative, symbol, to_sympy
 from apc.runtime.linearize import jacobians, linearize
-from hypothesis import given
-from hypothesis import strategies as st
 
 PLACE = Place("test.yaml", 1, 1)
 

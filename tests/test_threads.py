@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from apc.runtime.threads import single_threaded
 from threadpoolctl import threadpool_info
+
+from apc.runtime.threads import single_threaded
 
 
 def _threads() -> list[int]:

@@ -6,6 +6,9 @@ from collections.abc import Callable
 from fractions import Fraction
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.units import (
     DIMENSIONLESS,
@@ -17,8 +20,6 @@ from apc.compiler.units import (
     parse_unit,
     quantity,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 HERE = Place("a.yaml", 1, 1)
 LENGTH, TIME = Dimension((("m", 1),)), Dimension((("s", 1),))

@@ -55,7 +55,7 @@ def save(model: CompiledSystem, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> CompiledSystem:
-    """Read a compiled model from a .apc file. Raises ApcError if it is damaged, or older than its topology."""
+    """Read a compiled model from a .apc file. Raises ApcError if it is damaged or older than its topology."""
     from apc.inputs import load_fresh
 
     return load_fresh(Path(path))

@@ -100,8 +100,8 @@ def check(file: str | None) -> None:
 
     Exit code 0 if there is none, 1 otherwise.
     """
-    from apc.inputs import find_input
     from apc.compiler.pipeline import compile_topology
+    from apc.inputs import find_input
 
     path = Path(file) if file else find_input(compiled_too=False)
     system = compile_topology(path)
@@ -161,10 +161,11 @@ def _compile(path: Path, target: Path, *, timings: bool) -> None:
         taken.append((name, now - last))
         last = now
 
-    value: object = None
+    values = []
     for stage, value in each_stage(path):
         lap(stage)
-    system = cast("CompiledSystem", value)  # the last stage's
+        values.append(value)
+    system = cast("CompiledSystem", values[-1])
     difference = check_frame(system)
     lap("self-check")
     save(system, target)
@@ -223,7 +224,10 @@ def _print_or_write(text: str, out: Path | None) -> None:
         return
     from apc.compiler.store import write_atomically
 
-    write_atomically(out, lambda temporary: temporary.write_bytes(f"{text}\n".encode()))
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(f"{text}\n".encode())
+
+    write_atomically(out, write)
     click.echo(f"{out} is written")
 
 
@@ -241,7 +245,7 @@ def _print_or_write(text: str, out: Path | None) -> None:
     type=click.Choice(["modes", "dense"]),
     default="modes",
     show_default=True,
-    help="modes: a few small systems, whatever the number of peers. dense: all peers in one system, to check.",
+    help="modes: a few small systems, whatever the number of peers. dense: all peers in one, to check.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: bool) -> None:
@@ -269,7 +273,7 @@ def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: b
 
 
 def _model(path: Path | None) -> CompiledSystem:
-    """Return the compiled model of a file; a topology is compiled in memory unless a fresh model is beside it."""
+    """Return the compiled model of a file; a topology is compiled in memory unless its model is fresh."""
     from apc.inputs import compiled_already, find_input, load_fresh
 
     path = find_input(compiled_too=True) if path is None else path

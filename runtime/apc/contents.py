@@ -43,7 +43,7 @@ def show_svg(path: Path) -> str:
 
 def show_text(path: Path) -> str:
     """Return graph, equations and schedule of a topology as text."""
-    scene, flat, clocked, ordered, compiled = _stages(path)
+    scene, flat, _, ordered, compiled = _stages(path)
     diagram = build_diagram(scene)
     lines = [diagram.title, *_wrapped(diagram.about, "", "")]
     lines += ["", "GRAPH", *_graph_lines(diagram)]
@@ -303,7 +303,8 @@ def _schedule_lines(facts: dict[str, Any]) -> Iterator[str]:
     yield f"  frame of {_time(facts['frame_s'])}, after which every clock stands as before"
     for clock in facts["clocks"]:
         first = f", first at {_time(clock['first_s'])}" if clock["first_s"] else ""
-        text = f"{clock['clock']} ticks every {_time(clock['period_s'])}{first}, {_times(clock['ticks'])} a frame"
+        text = f"{clock['clock']} ticks every {_time(clock['period_s'])}{first}"
+        text += f", {_times(clock['ticks'])} a frame"
         doing = []
         if clock["sends"]:
             doing.append(f"packets leave over {', '.join(clock['sends'])}")
@@ -347,7 +348,7 @@ def _time(number: float) -> str:
 
 
 def _wrapped(text: str, indent: str, later: str) -> list[str]:
-    """Return a text as lines of at most `WIDTH` columns, broken at spaces, or if need be behind an operator."""
+    """Return a text as lines of at most `WIDTH` columns, broken at spaces, at need behind an operator."""
     lines: list[str] = []
     line, between = indent, ""
     for word in text.split():

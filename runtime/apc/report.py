@@ -21,6 +21,7 @@ from apc.runtime.spectrum import Mode
 
 WIDTH = 80
 MOST_ROWS = 16
+LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
 MOVES_WIDTH = 30  # what the other columns leave of 80
 
 _WORDS = {
@@ -108,8 +109,10 @@ def analysis_report(result: Analysis) -> str:
 
 
 def _mode_table(modes: tuple[Mode, ...]) -> str:
-    rows = [mode for mode in modes if mode.eigenvalue.imag >= 0]  # a conjugate pair is one row
-    shown = [mode for mode in rows if mode.magnitude > 1e-6][:MOST_ROWS]
+    # What can't be told from zero is counted only: its rounding differs from machine to machine.
+    alive = [mode for mode in modes if mode.magnitude > max(mode.error, LEAST_MAGNITUDE)]
+    rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
+    shown = rows[:MOST_ROWS]
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for heading in ("magnitude", "shape", "times", "frequency", "damping"):
         table.add_column(heading, justify="left" if heading == "shape" else "right", no_wrap=True)
@@ -126,7 +129,7 @@ def _mode_table(modes: tuple[Mode, ...]) -> str:
     stream = io.StringIO()
     Console(file=stream, width=WIDTH - 2, color_system=None).print(table)
     text = "\n".join("  " + line.rstrip() for line in stream.getvalue().splitlines())
-    left = len(rows) - len(shown)
+    left = len(modes) - len(alive) + len(rows) - len(shown)
     return f"{text}\n  and {left} faster-dying ones (--json lists all)" if left else text
 
 

@@ -1,0 +1,1 @@
+"""Measurements of time: run one with `python -m tests.bench.language`."""

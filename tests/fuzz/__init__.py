@@ -1,0 +1,1 @@
+"""Hostile and random input for the compiler: run it with `python -m tests.fuzz`."""

@@ -1,0 +1,56 @@
+"""`python -m tests.fuzz --inputs 100000 --seed 1`: exit code 1 when an input does what none may.
+
+Each different failure is told once, with a smaller input of the same failure in a folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from tests.fuzz.running import once, run_all, shrunk
+
+
+def main() -> int:
+    """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("--inputs", type=int, default=2000, help="how many hostile inputs (default 2000)")
+    parser.add_argument("--scenes", type=int, default=0, help="how many valid scenes against brute force")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--start", type=int, default=0, help="the first input of the seed to run")
+    parser.add_argument("--out", type=Path, default=Path("fuzz-failures"), help="where failures are written")
+    options = parser.parse_args()
+    began = time.monotonic()
+    failures, often, outcomes = run_all(
+        options.inputs,
+        options.seed,
+        start=options.start,
+        progress=lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    for outcome, number in sorted(outcomes.items()):
+        print(f"{number:8d}  {outcome}")
+    print(f"{options.inputs - options.start} inputs in {time.monotonic() - began:.0f} s")
+    for number, failure in enumerate(sorted(failures, key=lambda one: -often[one.key]), start=1):
+        small = shrunk(failure)
+        _, told = once(small)
+        folder = options.out / f"{number:02d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in small.files:
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(data)
+        text = f"{failure.key}\nseed {options.seed}, input {failure.index}, {often[failure.key]} times\n\n{told or failure.told}\n"
+        (folder / "told.txt").write_text(text, encoding="utf-8")
+        print(f"\n{folder}: {text}")
+    wrong = bool(failures)
+    if options.scenes:
+        from tests.test_properties import check_scenes
+
+        check_scenes(options.scenes)
+        print(f"{options.scenes} scenes agree with brute force")
+    return int(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

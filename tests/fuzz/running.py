@@ -1,0 +1,348 @@
+"""Runs inputs through the compiler under a watchdog, and says what is wrong with what came out.
+
+Takes: inputs. Gives: `Failure`, `run_all`, `shrunk`.
+Guarantees: one input can't bring the run down, whether it crashes, hangs or eats memory.
+Does not: make inputs.
+
+An input may compile, or be refused with `ApcError` whose mistakes each have a code, a sentence of one line and
+a place that exists, in the order of the file, none twice. Anything else is a failure.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import random
+import re
+import resource
+import select
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.pipeline import run_stages
+from tests.fuzz.inputs import SENTINEL, TOPOLOGY, Input, make_input
+
+SECONDS = 5.0  # the longest an input may take
+MEMORY = 1 << 30  # bytes an input may ask for beyond what is in use
+BATCH = 4000  # inputs a process runs before a fresh one takes over
+LONGEST_SENTENCE = 2000
+WHOLE_FILE = re.compile(r"E(10[1-8]|110|701)\Z")  # mistakes about a file as a whole may have no line
+
+# What no input may cause; events of Python's own audit hooks.
+_FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "os.remove",
+            "os.rename", "os.mkdir", "shutil.rmtree", "exec", "compile")  # fmt: skip
+
+_MODULE = re.compile(r'<code object <module> .*\.py", line 1>')  # what runs when a module is loaded
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What went wrong: `key` is the same for failures of one cause, as far as can be told."""
+
+    key: str
+    told: str
+    index: int
+    given: Input
+
+
+def run_all(
+    count: int, seed: int, *, start: int = 0, progress: Callable[[str], None] = lambda text: None
+) -> tuple[list[Failure], Counter[str], Counter[str]]:
+    """Run inputs number `start` to `count` of a seed.
+
+    Returns
+    -------
+    failures
+        The first of each cause.
+    often
+        How often each came.
+    outcomes
+        How many inputs of each sort came to what.
+    """
+    _warm_up()
+    failures: dict[str, Failure] = {}
+    often: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter()
+    following = start
+    shown = time.monotonic()
+    while following < count:
+        for index, key, told in _worker(seed, following, min(count, following + BATCH)):
+            following = index + 1
+            given = nth_input(seed, index)
+            outcomes[f"{given.sort}: {key if key in ('compiled', 'refused') else 'FAILED'}"] += 1
+            if key not in ("compiled", "refused"):
+                often[key] += 1
+                if key not in failures:
+                    failures[key] = Failure(key, told, index, given)
+            if time.monotonic() - shown > 10:
+                shown = time.monotonic()
+                progress(f"{following} inputs, {len(failures)} different failures")
+    return list(failures.values()), often, outcomes
+
+
+def nth_input(seed: int, index: int) -> Input:
+    """Return one input of a run."""
+    return make_input(random.Random(f"{seed}/{index}"))
+
+
+def _warm_up() -> None:
+    """Load everything once, so that no input pays for it and processes share it."""
+    importlib.import_module("numpy.ma")  # NumPy loads it when it first meets some arrays, and compiles text
+    for scene in ("three-users-average", "finger", "users-table"):
+        run_stages(
+            Path(__file__).resolve().parents[2] / "models" / "scenes" / f"{scene}.yaml", until="compiled"
+        )
+
+
+def _worker(seed: int, start: int, stop: int) -> Iterator[tuple[int, str, str]]:
+    """Yield (index, outcome, text) of inputs run in a process of their own; ends early if that had to be killed."""
+    yield from _watched(
+        lambda tell: [tell(i, *_judged(nth_input(seed, i))) for i in range(start, stop)], start, stop
+    )
+
+
+def once(given: Input) -> tuple[str, str]:
+    """Return the outcome and text of one input, run in a process of its own."""
+    [(_, key, told)] = list(_watched(lambda tell: tell(0, *_judged(given)), 0, 1))
+    return key, told
+
+
+def _watched(
+    work: Callable[[Callable[[int, str, str], None]], object], start: int, stop: int
+) -> Iterator[tuple[int, str, str]]:
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read)
+        _become_worker(work, write)
+    os.close(write)
+    following, rest = start, b""
+    limit = SECONDS + 3  # the worker measures itself; this is for what never comes back
+    killed = ""
+    with os.fdopen(read, "rb", buffering=0) as stream:
+        while following < stop:
+            ready, _, _ = select.select([stream], [], [], limit)
+            data = stream.read(1 << 16) if ready else b""
+            if not data:
+                killed = "" if ready else f"takes more than {SECONDS:g} s"
+                break
+            *lines, rest = (rest + data).split(b"\0")
+            for line in lines:
+                number, key, told = line.decode("utf-8", "replace").split("\x1f")
+                yield int(number), key, told
+                following = int(number) + 1
+    if killed:
+        os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    if following < stop:
+        ended = (
+            f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"exit {os.WEXITSTATUS(status)}"
+        )
+        yield following, killed or f"process ended by {ended}", ""
+
+
+def _become_worker(work: Callable[[Callable[[int, str, str], None]], object], write: int) -> None:
+    """Do the work and leave; never returns."""
+    code = 1
+    try:
+        in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (in_use + MEMORY, in_use + MEMORY))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        os.dup2(null, 2)
+        sys.addaudithook(_listen)
+
+        def tell(index: int, key: str, told: str) -> None:
+            line = "\x1f".join((str(index), key, told.replace("\x1f", " ").replace("\0", " ")))
+            data = line.encode("utf-8", "replace") + b"\0"
+            while data:
+                data = data[os.write(write, data) :]
+
+        work(tell)
+        code = 0
+    finally:
+        os._exit(code)
+
+
+_foreign: list[str] = []
+_listening = False
+
+
+def _listen(event: str, arguments: tuple[object, ...]) -> None:
+    """Note what no input may cause, and files opened to write."""
+    if not _listening:
+        return
+    if (event in _FOREIGN and not (event == "exec" and _MODULE.search(str(arguments)))) or (
+        event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax+")
+    ):
+        _foreign.append(f"{event} {str(arguments)[:200]}")
+
+
+def _judged(given: Input) -> tuple[str, str]:
+    """Run one input in this process: "compiled", "refused", or the key and text of what is wrong."""
+    global _listening
+    with tempfile.TemporaryDirectory(prefix="apc-fuzz-", dir=_memory_folder()) as name:
+        folder = Path(name)
+        for file, data in given.files:
+            (folder / file).parent.mkdir(exist_ok=True)
+            (folder / file).write_bytes(data)
+        before = Path.cwd()
+        os.chdir(folder)
+        _foreign.clear()
+        started = time.monotonic()
+        signal.signal(signal.SIGALRM, _too_long)
+        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        try:
+            _listening = True
+            try:
+                run_stages(Path(TOPOLOGY), until="compiled")
+                outcome = "compiled", ""
+            finally:
+                _listening = False
+                signal.setitimer(signal.ITIMER_REAL, 0)
+        except ApcError as error:
+            fault = _fault_of(error, dict(given.files))
+            outcome = fault or ("refused", "")
+        except BaseException as error:  # whatever it is, it is what we are looking for
+            outcome = _key_of(error), "".join(traceback.format_exception(error, limit=-12))[-4000:]
+        finally:
+            os.chdir(before)
+        took = time.monotonic() - started
+        if took > SECONDS and "takes more" not in outcome[0]:
+            outcome = f"takes more than {SECONDS:g} s", f"{took:.1f} s"
+        if (folder / SENTINEL).exists() or _foreign:
+            outcome = (
+                f"does what it may not: {_foreign[0].split()[0] if _foreign else SENTINEL}",
+                "\n".join(_foreign),
+            )
+        return outcome
+
+
+def _memory_folder() -> str | None:
+    return "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+
+
+class TooLongError(BaseException):
+    """Raised by the alarm; no handler of `Exception` can swallow it."""
+
+
+def _too_long(number: int, frame: object) -> None:
+    raise TooLongError
+
+
+def _key_of(error: BaseException) -> str:
+    """Return the kind of an exception and the innermost line of ours."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in frames if "/compiler/" in frame.filename]
+    where = f"{Path(ours[-1].filename).name}:{ours[-1].name}" if ours else "?"
+    if isinstance(error, TooLongError):
+        stage = next(
+            (f.name for f in ours if Path(f.filename).name == "pipeline.py" and f.name != "run_stages"), ""
+        )
+        outer = next(
+            (f"{Path(f.filename).name}:{f.name}" for f in ours if Path(f.filename).name != "pipeline.py"), ""
+        )
+        return f"takes more than {SECONDS:g} s in {outer}{stage and ''}"
+    return f"{type(error).__name__} in {where}:{ours[-1].lineno if ours else 0}"
+
+
+# ---- what an ApcError must be ----
+
+
+def _fault_of(error: ApcError, files: dict[str, bytes]) -> tuple[str, str] | None:
+    """Return what is wrong with the mistakes of an error."""
+    told = str(error)[:3000]
+    mistakes = error.mistakes
+    if len(set(mistakes)) < len(mistakes) or len({str(m) for m in mistakes}) < len(mistakes):
+        return f"told twice: {_twice(mistakes)}", told
+    for mistake in mistakes:
+        fault = _fault_in(mistake, files)
+        if fault:
+            return f"{fault}: {mistake.code} {_shape(mistake.sentence)}", told
+    by_file: dict[str, list[Mistake]] = {}
+    for mistake in mistakes:
+        by_file.setdefault(mistake.place.file, []).append(mistake)
+    for own in by_file.values():
+        places = [(mistake.place.line, mistake.place.column) for mistake in own]
+        if places != sorted(places):
+            return f"not in the file's order: {mistakes[0].code}", told
+    return None
+
+
+def _twice(mistakes: tuple[Mistake, ...]) -> str:
+    (text, _), *_ = Counter(f"{m.code} {_shape(m.sentence)}" for m in mistakes).most_common(1)
+    return text
+
+
+def _shape(sentence: str) -> str:
+    """Return the first words of a sentence, its names taken out."""
+    return " ".join(re.sub(r"[^a-z ,']+", "_", sentence).split()[:5])
+
+
+def _fault_in(mistake: Mistake, files: dict[str, bytes]) -> str:
+    sentence, place = mistake.sentence, mistake.place
+    if not re.fullmatch(r"E\d{3}", mistake.code):
+        return "no code"
+    if len(sentence.strip(" .")) < 8:
+        return "no sentence"
+    if any(ord(c) < 32 for c in sentence):
+        return "a sentence of several lines"
+    if len(sentence) > LONGEST_SENTENCE:
+        return "a sentence that doesn't end"
+    if re.search(r"<[\w.]+ object at|Traceback|NoneType|\bFraction\(|Error\(", sentence):
+        return "Python's own words"
+    if not place.file:
+        return "no file"
+    if not place.line and not WHOLE_FILE.match(mistake.code):
+        return "no line"
+    data = files.get(place.file, files.get(place.file.removeprefix("./")))
+    if place.line and data is not None:
+        lines = re.split(rb"\r\n|\n|\r", data)
+        if place.line > len(lines):
+            return "a line that isn't there"
+        if not 1 <= place.column <= len(lines[place.line - 1]) + 2:
+            return "a column that isn't there"
+    return ""
+
+
+# ---- shrinking ----
+
+
+def shrunk(failure: Failure, *, seconds: float = 40.0) -> Input:
+    """Return a smaller input that fails in the same way: pieces taken out as long as that goes."""
+    deadline = time.monotonic() + seconds
+    files = dict(failure.given.files)
+
+    def fails(trial: dict[str, bytes]) -> bool:
+        key, _ = once(Input(failure.given.sort, tuple(trial.items())))
+        return key == failure.key
+
+    if not fails(files):
+        return failure.given  # it needs what ran before it
+    for name in list(files):
+        if name != TOPOLOGY and fails({k: v for k, v in files.items() if k != name}):
+            del files[name]
+    for name in list(files):
+        for separator in (b"\n", b", ", b" ", b""):
+            pieces = files[name].split(separator) if separator else [bytes([b]) for b in files[name]]
+            size = max(1, len(pieces) // 2)
+            while size and time.monotonic() < deadline and len(pieces) < 5000:
+                at = 0
+                while at < len(pieces) and time.monotonic() < deadline:
+                    trial = pieces[:at] + pieces[at + size :]
+                    if fails({**files, name: separator.join(trial)}):
+                        pieces = trial
+                    else:
+                        at += size
+                size //= 2
+            files[name] = separator.join(pieces) if len(pieces) < 5000 else files[name]
+    return Input(failure.given.sort, tuple(files.items()))
