@@ -33,7 +33,7 @@ from apc.compiler.component import (
     option_test,
 )
 from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
-from apc.compiler.errors import ApcError, Mistakes, Place, nearest
+from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.expression import (
     FUNCTIONS,
     KEYWORDS,
@@ -180,9 +180,8 @@ def _found(name: str, place: Place, library: Definitions, mistakes: Mistakes) ->
         mistakes.take(error)
         return None
     if component is None:
-        close = nearest(name, library.names)
-        what = f"there is no component {brief(name)}"
-        add_unknown("E206", place, what, name, (close,) if close else library.names, mistakes)
+        known = [known for known in library.names if known != name]  # a connector type is no component
+        add_unknown("E206", place, f"there is no component {brief(name)}", name, known, mistakes)
     return component
 
 
@@ -229,6 +228,7 @@ def _read_inner(
         parts={name: component for name, (_, component, _) in bodies.items()},
         counts={},
         faulty=faulty,
+        whole=f"the parts of {outer.name}",
         outer=outer,
     )
     inner = []

@@ -188,6 +188,9 @@ def _expression(value: Value) -> str:
 def _quantity(part: Part, own: str, value: Value) -> str:
     """Return a number in the unit that its component declares."""
     declared = part.component.parameter(own) or part.component.variable(own)
+    for word, number in declared.words if isinstance(declared, Number) else ():
+        if number == value.number:
+            return word
     unit = getattr(declared, "unit", None)
     if value.dimension == SECOND:
         return seconds(value.number)

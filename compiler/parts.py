@@ -34,7 +34,8 @@ class Scope:
     `dimension` and `names` are the names an expression may use; `references` gives the names of a role, or
     None when the section that would hold them is missing or faulty and was reported; `parts` are the
     components of the parts that can be joined, `counts` how many of an array there are; `faulty` names parts
-    that can't be read and were reported; `outer` is the component around the entry, if there is one.
+    that can't be read and were reported; `whole` is what the entry stands in, in words; `outer` is the
+    component around it, if there is one.
     """
 
     dimension: Callable[[tuple[str, ...]], Dimension | None]
@@ -43,6 +44,7 @@ class Scope:
     parts: Mapping[str, Component]
     counts: Mapping[str, int]
     faulty: Collection[str]
+    whole: str
     outer: Component | None = None
 
 
@@ -81,7 +83,7 @@ def read_entry(
     connectors = dict(component.connectors)
     parameters = [p.name for p in component.parameters]
     variables = [v.name for v in component.variables if v.start is not None]
-    check_keys(
+    body = check_keys(
         body,
         ("type", *more_keys, *connectors, *parameters, *variables),
         f"{name} ({component.name})",
@@ -207,7 +209,7 @@ class _EntryReader:
         known_names = self.scope.references(parameter.role, word, node.place)
         if known_names is None or word in known_names:
             return word
-        what = f"{self.name} names {parameter.role} {brief(word)}, which isn't there"
+        what = f"{self.name} names {parameter.role} {brief(word)}, which isn't in {parameter.role}s"
         add_unknown("E206", node.place, what, word, list(known_names), self.mistakes)
         return None
 
@@ -240,10 +242,12 @@ class _EntryReader:
 
     def _target(self, found: re.Match[str], connector: str, node: Node) -> str | None:
         other = found["part"]
-        if other in self.scope.faulty:
-            return None
+        if other in self.scope.faulty or not self.scope.parts:
+            return None  # reported where it is, or as a missing section
         if other not in self.scope.parts:
-            what = f"{self.name} joins its {connector} to {brief(other)}, which is no part here"
+            what = (
+                f"{self.name} joins its {connector} to {brief(other)}, which is no part of {self.scope.whole}"
+            )
             known = [*(n for n in self.scope.parts if n != self.name), GROUND]
             add_unknown("E206", node.place, what, other, known, self.mistakes)
             return None

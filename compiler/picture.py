@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from html import escape
 
@@ -25,6 +25,7 @@ LINE = 15.0  # from one line of text to the next
 PAD, GAP, BETWEEN = 10.0, 42.0, 20.0  # inside a box, between columns, between rows
 SYMBOL = 26.0  # height of a spring or damper
 THUMB = 96.0  # diameter of a picture of who hears whom
+WIDEST_ABOUT = 900.0  # what a longer sentence is cut to, unless the picture is wider
 MOST_PEERS = 16  # in such a picture
 MOST_TICKS = 120  # of one clock along the frame
 INK, FAINT, FILL, EDGE = "#1f2933", "#6b7785", "#e8eff8", "#2b4a72"
@@ -121,6 +122,19 @@ class _Cell:
     node: Node | None
     width: float
     height: float
+    link: str = ""  # where the line leads
+    after: str = ""  # the cell it comes from
+
+
+@dataclass(frozen=True, slots=True)
+class _Spot:
+    """Where a cell stands: its left side and middle, and the sides of its column."""
+
+    cell: _Cell
+    x: float
+    middle: float
+    left: float
+    right: float
 
 
 def place(diagram: Diagram) -> Picture:
@@ -133,16 +147,14 @@ def place(diagram: Diagram) -> Picture:
     y = top + 30
     ports: list[tuple[str, float, float]] = []  # link, x, y: where a line leaves the peer
     right = left + text_width(heading, SIZE, bold=True) + 2 * PAD
-    for members in _connected(diagram):
-        placed, width, height = _layered(members, diagram)
-        moved = {key: (x + left + 18, cell_y + y) for key, (x, cell_y) in placed.items()}
-        cells = {cell.key: cell for column in members for cell in column}
-        marks += _joints(diagram, cells, moved)
-        ports += _outgoing(members, moved)
-        for key, (x, cell_y) in moved.items():
-            node = cells[key].node
-            if node is not None:
-                marks += _drawn(cells[key], node, x, cell_y, colours)
+    for columns in _connected(diagram):
+        spots, width, height = _layered(columns, diagram, left + 18, y)
+        marks += _joints(diagram, spots)
+        for spot in spots.values():
+            marks += _drawn(spot, colours)
+        for link, way, port in _outgoing(columns, spots):
+            marks += way
+            ports.append((link, *port))
         right = max(right, left + 18 + width + 18)
         y += height + 2 * BETWEEN
     bottom = y - BETWEEN
@@ -152,7 +164,8 @@ def place(diagram: Diagram) -> Picture:
     legend, legend_right, end = _legend(
         diagram, left, max(bottom, net_bottom) + 34, max(right, net_right), colours
     )
-    width = max(right, net_right, legend_right, left + text_width(diagram.title, TITLE, bold=True)) + 24
+    heads = text_width(diagram.title, TITLE, bold=True), min(text_width(diagram.about, SIZE), WIDEST_ABOUT)
+    width = max(right, net_right, legend_right, *(left + head for head in heads)) + 24
     about = _cut(diagram.about, width - 2 * left, SIZE)
     head = [Text(left, 32, diagram.title, TITLE, bold=True), Text(left, 52, about, SIZE, colour=FAINT)]
     return Picture(width, end + 20, (frame, *marks, *net_marks, title, *head[: 2 if about else 1], *legend))
@@ -200,88 +213,103 @@ def _connected(diagram: Diagram) -> list[list[list[_Cell]]]:
             ahead = dict.fromkeys(two for one in layer for two in neighbours[one] if two not in seen)
             seen |= ahead.keys()
             layer = list(ahead)
-        for depth, cells in enumerate(list(layers)):
+        for depth, cells in enumerate([list(cells) for cells in layers]):
             for cell in cells:
                 for link in cell.node.links if cell.node else ():
-                    for after in range(depth + 1, len(layers)):
-                        layers[after].append(_Cell(f"{link}\n{cell.key}\n{after}", None, 0, 6))
+                    after = cell.key
+                    for column in layers[depth + 1 :]:
+                        key = f"{link} behind {after}"
+                        column.append(_Cell(key, None, 0, 6, link, after))
+                        after = key
         found.append(layers)
     return found
 
 
 def _layered(
-    columns: list[list[_Cell]], diagram: Diagram
-) -> tuple[dict[str, tuple[float, float]], float, float]:
-    """Return each cell's left upper corner, and the width and height of all."""
-    before: dict[str, list[str]] = {cell.key: [] for column in columns for cell in column}
+    columns: list[list[_Cell]], diagram: Diagram, left: float, top: float
+) -> tuple[dict[str, _Spot], float, float]:
+    """Return where each cell stands, and the width and height of all."""
     depth = {cell.key: i for i, column in enumerate(columns) for cell in column}
+    before: dict[str, list[str]] = {key: [] for key in depth}
     for one, two in diagram.joints:
         if one in depth and two in depth:
             first, second = sorted((one, two), key=lambda name: depth[name])
             before[second].append(first)
-    for key in before:
-        if "\n" in key:
-            link, name, at = key.split("\n")
-            previous = f"{link}\n{name}\n{int(at) - 1}"
-            before[key].append(previous if previous in depth else name)
+    for column in columns:
+        for cell in column:
+            if cell.after:
+                before[cell.key].append(cell.after)
     centre: dict[str, float] = {}
-    placed: dict[str, tuple[float, float]] = {}
-    x = 0.0
+    spots: dict[str, _Spot] = {}
+    x = left
     for column in columns:
         width = max(cell.width for cell in column)
         wanted = {
-            cell.key: sum(centre[name] for name in before[cell.key]) / len(before[cell.key])
-            if before[cell.key]
-            else 0.0
+            cell.key: sum(centre[name] for name in before[cell.key]) / max(1, len(before[cell.key]))
             for cell in column
         }
         ordered = sorted(column, key=lambda cell: wanted[cell.key])
         edge = -math.inf
         for cell in ordered:
-            middle = max(wanted[cell.key], edge + cell.height / 2)
-            centre[cell.key] = middle
-            edge = middle + cell.height / 2 + BETWEEN
+            centre[cell.key] = max(wanted[cell.key], edge + cell.height / 2)
+            edge = centre[cell.key] + cell.height / 2 + BETWEEN
         shift = sum(wanted[cell.key] - centre[cell.key] for cell in ordered) / len(ordered)
         for cell in ordered:
             centre[cell.key] += shift
-            placed[cell.key] = (x + (width - cell.width) / 2, centre[cell.key] - cell.height / 2)
+            start = x if cell.node is None else x + (width - cell.width) / 2
+            spots[cell.key] = _Spot(cell, start, centre[cell.key], x, x + width)
         x += width + GAP
-    highest = min(y for _, y in placed.values())
-    lowest = max(placed[cell.key][1] + cell.height for column in columns for cell in column)
-    return {key: (px, py - highest) for key, (px, py) in placed.items()}, x - GAP, lowest - highest
+    highest = min(spot.middle - spot.cell.height / 2 for spot in spots.values())
+    lowest = max(spot.middle + spot.cell.height / 2 for spot in spots.values())
+    moved = {key: replace(spot, middle=spot.middle - highest + top) for key, spot in spots.items()}
+    return moved, x - GAP - left, lowest - highest
 
 
-def _joints(diagram: Diagram, cells: dict[str, _Cell], at: dict[str, tuple[float, float]]) -> Iterable[Line]:
+def _joints(diagram: Diagram, spots: dict[str, _Spot]) -> Iterable[Line]:
     for one, two in diagram.joints:
-        if one in at and two in at:
-            first, second = sorted((one, two), key=lambda name: at[name][0])
-            start = _side(cells[first], at[first], right=True)
-            yield Line((start, _side(cells[second], at[second], right=False)), curved=True)
+        if one in spots and two in spots:
+            first, second = sorted((spots[one], spots[two]), key=lambda spot: spot.left)
+            yield from _way(first, second, INK)
 
 
-def _side(cell: _Cell, at: tuple[float, float], *, right: bool) -> tuple[float, float]:
-    return at[0] + (cell.width if right else 0), at[1] + cell.height / 2
+def _way(first: _Spot, second: _Spot, colour: str, *, dashed: bool = False) -> Iterable[Line]:
+    """Draw from a cell to one in the next column: level beside the cells, bending between the columns."""
+    y0, y1 = first.middle, second.middle
+    if y0 == y1:
+        yield Line(((first.x + first.cell.width, y0), (second.x, y1)), colour, dashed)
+        return
+    if first.x + first.cell.width < first.right:
+        yield Line(((first.x + first.cell.width, y0), (first.right, y0)), colour, dashed)
+    yield Line(((first.right, y0), (second.left, y1)), colour, dashed, curved=True)
+    if second.left < second.x:
+        yield Line(((second.left, y1), (second.x, y1)), colour, dashed)
 
 
 def _outgoing(
-    columns: list[list[_Cell]], at: dict[str, tuple[float, float]]
-) -> list[tuple[str, float, float]]:
-    """Return where each line to a link is when it has passed the last column of its set."""
-    found = []
+    columns: list[list[_Cell]], spots: dict[str, _Spot]
+) -> Iterable[tuple[str, list[Line], tuple[float, float]]]:
+    """Yield, for each line from a part to a link: the link, its way to the last column, where that ends."""
     for column in columns:
         for cell in column:
             for link in cell.node.links if cell.node else ():
-                last = f"{link}\n{cell.key}\n{len(columns) - 1}"
-                x, y = at.get(last, at[cell.key])
-                own = at[cell.key][1] + 0.5 * cell.height
-                found.append((link, x + (0 if last in at else cell.width), y + 3 if last in at else own))
-    return found
+                way: list[Line] = []
+                spot = spots[cell.key]
+                for later in columns:
+                    for passing in later:
+                        if passing.link == link and passing.after == spot.cell.key:
+                            way += _way(spot, spots[passing.key], FAINT, dashed=True)
+                            spot = spots[passing.key]
+                yield link, way, (spot.x + spot.cell.width, spot.middle)
 
 
 # ---- marks ----
 
 
-def _drawn(cell: _Cell, node: Node, x: float, y: float, colours: dict[str, str]) -> Iterable[Mark]:
+def _drawn(spot: _Spot, colours: dict[str, str]) -> Iterable[Mark]:
+    cell, node = spot.cell, spot.cell.node
+    if node is None:
+        return
+    x, y = spot.x, spot.middle - cell.height / 2
     if node.role == "joint":
         yield Dot(x + 4, y + 4, 3)
         return

@@ -429,17 +429,14 @@ class _Reader:
 
         def references(role: str, word: str, place: Place) -> Collection[str] | None:
             section = f"{role}s"
-            if word and root.get(section) is None:
-                example = f"{section}: {{{brief(word)}: " + (
-                    "1 ms}" if role == "clock" else "{clock: network}}"
-                )
-                what = f"the topology has no {section} section"
-                self.mistakes.add("E201", root.place, what, hint=example)
+            node = root.get(section)
+            if word and node is None:
+                example = "clocks: {haptic: 1 ms}" if role == "clock" else "links: {lan: {clock: network}}"
+                self.mistakes.add("E201", root.place, f"the topology has no {section} section", hint=example)
                 return None
             known = self.clocks if role == "clock" else links
-            node = root.get(section)
-            named = isinstance(node, Mapping) and node.get(word) is not None
-            return None if word not in known and named else known  # a faulty clock or link was reported there
+            reported = word not in known and not (isinstance(node, Mapping) and node.get(word) is None)
+            return None if reported else known
 
         return Scope(
             dimension=self._dimension,
@@ -448,6 +445,7 @@ class _Reader:
             parts={name: body.component for name, body in self.bodies.items()},
             counts={name: body.count for name, body in self.bodies.items() if body.count is not None},
             faulty=self.faulty,
+            whole="this topology",
         )
 
     def _read_part(self, name: str, entry: _Body, root: Mapping) -> list[Part]:

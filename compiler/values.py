@@ -152,7 +152,7 @@ def read_binding(
             None,
             _expression(text, text_place(node), what, dimension, unit, known, names_known),
             dimension,
-            node.place,
+            text_place(node),
         )
     except ApcError as error:
         mistakes.take(error)
@@ -215,7 +215,7 @@ def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | Non
         if is_quantity(text):
             found = parse_quantity(text, node.place)
             return Binding(found.value, None, found.unit.dimension, node.place)
-        return Binding(None, parse_expression(text, text_place(node)), DIMENSIONLESS, node.place)
+        return Binding(None, parse_expression(text, text_place(node)), DIMENSIONLESS, text_place(node))
     except ApcError as error:
         mistakes.take(error)
         return None

@@ -15,7 +15,7 @@ import pytest
 from apc.__main__ import run
 from tests.topologies import AVERAGE, MESH
 
-COMMANDS = ("new", "check", "compile", "analyze")
+COMMANDS = ("new", "check", "compile", "show", "analyze", "schema")
 
 
 class Ran(NamedTuple):

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.compiler.library import Library, Number, Option, Reference, option_test
+from apc.compiler.component import Number, Option, Reference, option_test
+from apc.compiler.library import Library
 from apc.compiler.units import format_dimension
 from tests.topologies import ROOT, library, told
 

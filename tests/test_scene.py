@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from apc.compiler.scene import LARGEST_COUNT
+from apc.compiler.groups import LARGEST_COUNT
 from tests.topologies import AVERAGE, MESH, ONE_MASS, replaced, scene, told
 
 GROUPS = replaced(

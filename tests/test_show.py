@@ -124,6 +124,19 @@ def test_a_line_of_the_peer_runs_beside_every_box(name: str) -> None:
                 )
 
 
+def test_every_link_is_reached_from_every_part_that_hears_over_it() -> None:
+    picture = place(diagram(MANY))
+    lines = [mark for mark in picture.marks if isinstance(mark, Line) and mark.dashed and not mark.arrows]
+    boxes = [mark for mark in picture.marks if isinstance(mark, Box)]
+    parts = {(box.x + box.width, box.y + box.height / 2) for box in boxes}
+    border = next(box.x + box.width for box in boxes if box.fill == "none")
+    ends = [point for line in lines for point in (line.points[0], line.points[-1])]
+    loose = {point for point in ends if ends.count(point) == 1}
+    assert len(loose & parts) == 2, "near and far"
+    assert len([x for x, _ in loose - parts if x == border]) == 2
+    assert len(loose) == 4, "no way is broken off between"
+
+
 def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
     document = ET.fromstring(draw_svg(diagram(AVERAGE)))
     words = [element.text for element in document.iter("{http://www.w3.org/2000/svg}text")]
@@ -233,7 +246,7 @@ def test_the_document_holds_what_the_text_tells() -> None:
 def test_what_costs_a_pair_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "scene.yaml"
     text = replaced(AVERAGE, ("topology: three-users-average", "topology: furthest\nlibrary: ."))
-    text = replaced(text, ("type: AveragePosition, object: cube,", "type: Furthest, object: cube,"))
+    text = replaced(text, ("type: AveragePosition", "type: Furthest"), ("1 ms, link", "0 s, link"))
     path.write_text(text, encoding="utf-8")
     (tmp_path / "furthest.yaml").write_text(FURTHEST, encoding="utf-8")
     assert "over lan; one evaluation a pair of peers" in " ".join(apc.show(path).split())
@@ -251,10 +264,10 @@ component: Furthest
 about: Pulls by tanh of each distance.
 connectors: {object: Flange}
 sends: {x: sample(object.x)}
-parameters: {stiffness: {unit: N/m}, reach: {unit: m, default: 1}, clock: clock, link: link}
+parameters: {stiffness: {unit: N/m}, reach: {unit: m, default: 1}, delay: {unit: s}, clock: clock, link: link}
 equations:
   - f = stiffness*sum(reach*tanh((sample(object.x) - others.x)/reach))
-  - object.f = hold(f)
+  - object.f = hold(f, delay)
 """
 
 

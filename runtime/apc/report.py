@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -17,6 +18,7 @@ from rich.table import Table
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis import Analysis
 from apc.runtime.needs import Needs
+from apc.runtime.selfcheck import skipped
 from apc.runtime.spectrum import Mode
 
 WIDTH = 80
@@ -52,13 +54,23 @@ def compile_report(system: CompiledSystem, needs: Needs, target: Path, differenc
     )
     lines = [
         f"{system.name} → {target}",
-        _wrapped(str(needs)),
+        _wrapped(str(replace(needs, pairs=()))),  # they follow, with their reason
         f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
-        f"  self-check: one frame event by event and lifted differ by {difference:.0e}",
+        _wrapped(f"self-check: {_self_check(system, difference)}"),
     ]
     lines += [_wrapped(line) for line in _pairwise(system)]
     lines += [_wrapped(f"left out: {name}, as {reason}") for name, reason in system.dropped]
     return "\n".join(lines)
+
+
+def _self_check(system: CompiledSystem, difference: float) -> str:
+    left_out = skipped(system)
+    compared = f"one frame event by event and lifted differ by {difference:.0e}"
+    if not left_out:
+        return compared
+    if len(left_out) == len(system.kinds):
+        return "no frame is compared, as nothing here is linear"
+    return f"{compared} (not {' and '.join(left_out)}, which is not linear)"
 
 
 def _pairwise(system: CompiledSystem) -> Iterator[str]:

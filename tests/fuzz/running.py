@@ -307,6 +307,8 @@ def _fault_in(mistake: Mistake, files: dict[str, bytes]) -> str:
     data = files.get(place.file, files.get(place.file.removeprefix("./")))
     if place.line and data is not None:
         lines = re.split(rb"\r\n|\n|\r", data)
+        if place.line == len(lines) + 1 and place.column == 1:  # the end of the file
+            return ""
         if place.line > len(lines):
             return "a line that isn't there"
         if not 1 <= place.column <= len(lines[place.line - 1]) + 2:
