@@ -274,13 +274,19 @@ def _read_connect(
 
 
 def read_type(
-    key: Scalar, body: Mapping, default: str | None, library: Definitions, mistakes: Mistakes
+    key: Scalar,
+    body: Mapping,
+    default: str | None,
+    library: Definitions,
+    mistakes: Mistakes,
+    *,
+    example: str = "Mass",
 ) -> Component | None:
     """Return the component that a part's entry is of; `default` serves when the entry has no type."""
     node = body.get("type")
-    name = default if node is None else read_text(node, "type", mistakes, hint="type: Mass")
+    name = default if node is None else read_text(node, "type", mistakes, hint=f"type: {example}")
     if node is None and name is None:
-        mistakes.add("E201", key.place, f"{key.text} has no type", hint="type: SampledSpringDamper")
+        mistakes.add("E201", key.place, f"{key.text} has no type", hint=f"type: {example}")
     if name is None:
         return None
     return _found(name, node.place if node is not None else key.place, library, mistakes)
@@ -370,6 +376,12 @@ class _Names:
             if isinstance(node, Name) and node.parts not in self.dimensions:
                 wrong = True
                 shown = ".".join(node.parts)
+                if node.parts[0] == OTHERS:
+                    what = f"{self.component.name} sends nothing called {brief('.'.join(node.parts[1:]))}"
+                    mistakes.add(
+                        "E303", place_in(place, text, node.start), what, hint="sends: {x: sample(object.x)}"
+                    )
+                    continue
                 known = sorted(".".join(parts) for parts in self.dimensions)
                 what = f"{self.component.name} has no {brief(shown)}"
                 add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)

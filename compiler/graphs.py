@@ -167,7 +167,7 @@ class _ArcReader:
             ):
                 return self.starts[found["group"]] + int(found["number"]) - 1
         first = next(iter(self.counts), "user")
-        expected = f"a number from 1 to {self.peers}, or a name such as {first}[1]"
+        expected = f"a number from 1 to {self.peers}, or a name in quotes such as \"{first}[1]\""
         self.mistakes.add("E213", node.place, "a peer", expected=expected, got=form(node))
         return None
 

@@ -15,7 +15,7 @@ from apc.compiler.component import Component, Entry, Number, Option, Reference
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.reading import add_unknown, brief, check_keys, read_text
 from apc.compiler.source import Mapping as MappingNode
-from apc.compiler.source import Node
+from apc.compiler.source import Node, Scalar
 from apc.compiler.units import Dimension
 from apc.compiler.values import Binding, read_binding
 
@@ -119,7 +119,7 @@ def read_entry(
     ]
     targets = [(part, its) for _, part, its in connections if part != GROUND]
     if len(targets) > 1 and len(set(targets)) == 1:
-        mistakes.add("E210", place, f"{name} joins {targets[0][0]} to itself", hint="two different parts")
+        mistakes.add("E210", place, f"{name} joins {targets[0][0]} to itself")
     return Entry(
         tuple(values), tuple(options), tuple(references), tuple(described), tuple(starts), tuple(connections)
     )
@@ -217,7 +217,13 @@ class _EntryReader:
         node = self.body.get(connector)
         if node is None:
             if not free:
-                hint = f"{connector}: {next(iter(self.scope.parts), 'device')}"
+                taken = {self.name, *(n.text for _, n in self.body.entries if isinstance(n, Scalar))}
+                fitting = [
+                    part
+                    for part, component in self.scope.parts.items()
+                    if part not in taken and any(type_.name == type_name for _, type_ in component.connectors)
+                ]
+                hint = f"{connector}: {next(iter(fitting), GROUND)}"
                 what = f"{self.name} does not say what its {connector} is joined to"
                 self.mistakes.add("E210", self.place, what, hint=hint)
             return None
@@ -276,7 +282,7 @@ class _EntryReader:
         if self.count is None or self.count != last - first + 1:
             mine = "one part" if self.count is None else f"an array of {self.count}"
             what = f"{self.name} is {mine} and {other}[{first}:{last}] has {last - first + 1} elements"
-            self.mistakes.add("E210", node.place, what, hint=f"{connector}: {other}[1]")
+            self.mistakes.add("E210", node.place, what, hint=f'{connector}: "{other}[1]"')
             return None
         return f"{other}[{first + self.index - 1}]"
 

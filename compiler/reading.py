@@ -29,7 +29,7 @@ def form(node: Node) -> str:
 
 def brief(text: str) -> str:
     """Return a text short enough for one line of a message."""
-    flat = " ".join(text.split())
+    flat = "".join(c if c.isprintable() else "�" for c in " ".join(text.split()))
     return flat if len(flat) <= 60 else flat[:57] + "..."
 
 
@@ -74,9 +74,10 @@ def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: 
     meant: dict[str, tuple[Scalar, Node]] = {key.text: (key, node) for key, node in mapping.entries}
     for key, node in mapping.entries:
         if key.text not in allowed:
-            add_unknown(
-                "E202", key.place, f"{what} has no key {brief(key.text)}", key.text, allowed, mistakes
-            )
+            told = f"{what} has no key {brief(key.text)}"
+            if key.text[:1].isdigit():  # 0,1 kg reads as 0 and a key
+                told += " (a comma ends a value: decimals want a point)"
+            add_unknown("E202", key.place, told, key.text, allowed, mistakes)
             close = nearest(key.text, allowed)
             if close and close not in meant:
                 meant[close] = (Scalar(close, close, key.plain, key.place), node)

@@ -182,9 +182,8 @@ def _decode(data: bytes, file: str) -> str:
     except UnicodeDecodeError as error:
         # With a mark in front, Python counts from behind it.
         start = error.start + (len(data) - len(error.object))
-        before = data[:start]
-        line = before.count(b"\n") + 1
-        column = len(before[before.rfind(b"\n") + 1 :].decode("utf-8-sig", "replace")) + 1
+        before = re.split(rb"\r\n|\n|\r", data[:start])
+        line, column = len(before), len(before[-1].decode("utf-8-sig", "replace")) + 1
         got = f"byte 0x{data[start]:02x} at offset {start}"
         raise ApcError(Mistake("E106", Place(file, line, column), "a YAML file", "UTF-8 text", got)) from None
 
@@ -445,6 +444,8 @@ _PROBLEMS: tuple[tuple[str, str, str], ...] = (
         "a ': ' cannot stand here: the line above ends wrongly, or the text needs quotes",
         "key: 'text: with a colon'",
     ),
+    ("<document start>", "this line belongs to nothing above it: its indent or a closing bracket is wrong", ""),
+    ("node content", "a value or a closing bracket is missing here", ""),
     ("could not find expected ':'", "this line is neither 'key: value' nor '- item'", "key: value"),
     ("expected ',' or '}'", "this { is never closed, or a comma is missing behind it", ""),
     ("expected ',' or ']'", "this [ is never closed, or a comma is missing behind it", ""),

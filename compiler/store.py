@@ -29,7 +29,7 @@ import casadi
 import numpy as np
 
 from apc.compiler.cache import DAMAGE, FORMAT, LARGEST, MEMBER
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 
 # CasADi's reader can crash on text that isn't its own, so every member is checked against its digest first.
@@ -78,8 +78,9 @@ def save(system: CompiledSystem, path: Path) -> None:
 def load(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if the file is missing, damaged or of another version."""
     try:
-        if path.is_dir():
-            raise ApcError(Mistake("E602", Place(str(path)), "is a folder, not a compiled model"))
+        if path.exists() and not path.is_file():  # a named pipe that nobody writes to would block for ever
+            kind = "a folder" if path.is_dir() else "no ordinary file"
+            raise ApcError(Mistake("E602", Place(str(path)), f"is {kind}, not a compiled model"))
         with zipfile.ZipFile(path) as archive:
             if sum(info.file_size for info in archive.infolist()) > LARGEST:
                 raise _damaged(path, f"it unpacks to more than {LARGEST >> 20} MiB")
@@ -103,7 +104,66 @@ def load(path: Path) -> CompiledSystem:
     except DAMAGE as error:
         raise _damaged(path, FOREIGN) from error
     assert isinstance(system, CompiledSystem)
+    if not _is_consistent(system):
+        raise _damaged(path, FOREIGN)
     return system
+
+
+def _is_consistent(system: CompiledSystem) -> bool:
+    """Return whether every name and row that one part of a model gives exists in the other."""
+    timings = {timing.name for timing in system.timings}
+    clocks = {clock.name for clock in system.clocks}
+    links = {link.name for link in system.links}
+    parameters = {parameter.name for parameter in system.parameters}
+    groups = {group.name for group in system.groups}
+    named = [timing for clock in system.clocks for timing in (clock.period, clock.phase)]
+    named += [link.delay for link in system.links]
+    named += [pair.delay for link in system.links for pair in link.delays]
+    return (
+        bool(system.groups)
+        and timings.issuperset(named)
+        and all(link.clock in clocks for link in system.links)
+        and all({pair.sender, pair.receiver} <= groups for link in system.links for pair in link.delays)
+        and all(0 <= group.kind < len(system.kinds) and group.count > 0 for group in system.groups)
+        and all(len(column.values) == group.count for group in system.groups for column in group.columns)
+        and all(_is_kind_consistent(kind, timings, clocks, links, parameters) for kind in system.kinds)
+    )
+
+
+def _is_kind_consistent(
+    kind: Kind, timings: set[str], clocks: set[str], links: set[str], parameters: set[str]
+) -> bool:
+    """Return the same for one kind; its functions must have the sizes its names ask for."""
+    partitions = {partition.clock: partition for partition in kind.clocks}
+    sends = {sending.link: sending for sending in kind.sends}
+    n_x, n_u, n_p = len(kind.states), len(kind.holds), len(kind.parameters)
+    receives = [receive for partition in kind.clocks for receive in partition.receives]
+    return (
+        parameters.issuperset(kind.parameters)
+        and parameters.issuperset(state.start for state in kind.states)
+        and partitions.keys() <= clocks
+        and sends.keys() <= links
+        and all(hold.delay in timings and hold.clock in partitions for hold in kind.holds)
+        and all(0 <= hold.output < len(partitions[hold.clock].outputs) for hold in kind.holds)
+        and all(receive.link in links for receive in receives)
+        and _sizes(kind.derivative) == ([n_x, n_u, n_p, 1], [n_x])
+        and all(
+            _sizes(partition.tick)
+            == (
+                [n_x, n_u, len(partition.memories), len(partition.receives), n_p, 1],
+                [len(partition.outputs)],
+            )
+            for partition in kind.clocks
+        )
+        and all(
+            _sizes(sending.send) == ([n_x, n_u, n_p, 1], [len(sending.channels)]) for sending in kind.sends
+        )
+    )
+
+
+def _sizes(function: Any) -> tuple[list[int], list[int]]:
+    inputs = [int(function.numel_in(i)) for i in range(function.n_in())]
+    return inputs, [int(function.numel_out(i)) for i in range(function.n_out())]
 
 
 def _damaged(path: Path, why: str) -> ApcError:

@@ -31,7 +31,7 @@ from apc.compiler.expression import Expr, Name
 from apc.compiler.flatten import FlatEquation
 from apc.compiler.index import Jet, Jets, reduce_index, report_no_derivative
 from apc.compiler.scene import Scene
-from apc.compiler.symbolic import NoDerivativeError, no_derivative, symbol, to_sympy
+from apc.compiler.symbolic import NoDerivativeError, is_no_number, no_derivative, symbol, to_sympy
 from apc.compiler.units import format_dimension
 
 __all__ = [
@@ -229,10 +229,15 @@ def _value(
     mistakes: Mistakes,
 ) -> sympy.Expr | None:
     try:
-        return to_sympy(expression, differentiate)
+        value = to_sympy(expression, differentiate)
     except NoDerivativeError as missing:
         report_no_derivative(Residual(sympy.S.Zero, equation), missing, mistakes)
         return None
+    if is_no_number(value):
+        what = f"`{equation.text}` ({equation.origin}) holds a constant that is no number, such as 1/0 or sqrt(-1)"
+        mistakes.add("E512", equation.place, what)
+        return None
+    return value
 
 
 def _probes(reads: Sequence[FlatEquation], values: Sequence[sympy.Expr], jets: Jets) -> dict[str, Residual]:

@@ -8,6 +8,7 @@ Does not: know clocks or crossings, or which symbols move (see `index`).
 from __future__ import annotations
 
 import random
+import sys
 from collections.abc import Callable, Set
 from math import prod
 
@@ -104,6 +105,16 @@ def _binary(operator: str, left: sympy.Expr, right: sympy.Expr) -> sympy.Expr:
         case "/":
             return left / right
     return left**right
+
+
+def is_no_number(expression: sympy.Expr) -> bool:
+    """Return whether an expression holds a constant such as 1/0, sqrt(-1) or 1e300^2, which no float can be."""
+    if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
+        return True
+    largest = sympy.Integer(int(sys.float_info.max))
+    if any(abs(number) > largest for number in expression.atoms(sympy.Rational)):
+        return True
+    return any(power.is_number and power.is_real is False for power in expression.atoms(sympy.Pow))
 
 
 class NoDerivativeError(Exception):

@@ -339,11 +339,12 @@ def _channels_of(site: SiteJacobians) -> list[tuple[tuple[int, ...], ...]]:
 
 def rational_floats(site: LinearSite) -> LinearSite:
     """Return the site with every float as the rational it is."""
-    exact = [
-        np.array([[Fraction(v) for v in row] for row in m], dtype=object).reshape(m.shape)
-        for m in _matrices(site)
-    ]
-    return _assemble(site.kind, site.affine, exact)
+    channels = [tick.channels for tick in site.ticks]
+    exact = []
+    for matrix in _matrices(site):
+        rows = [[Fraction(value) for value in row] for row in matrix]
+        exact.append(np.array(rows, dtype=object).reshape(matrix.shape))
+    return _assemble(site.kind, site.affine, exact, channels)
 
 
 def magnitudes(site: LinearSite) -> LinearSite:

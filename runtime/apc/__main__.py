@@ -5,11 +5,15 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import tempfile
 import traceback
 from pathlib import Path
+
+# Every file a command reads or writes has its own message; these can only come from the terminal or a pipe.
+OUTPUT_ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG)
 
 
 def main() -> None:
@@ -26,6 +30,7 @@ def run(arguments: list[str]) -> int:
 
     try:
         apc.main(arguments, prog_name="apc", standalone_mode=False)
+        sys.stdout.flush()
     except ApcError as error:
         for mistake in error.mistakes:
             click.echo(str(mistake), err=True)
@@ -39,12 +44,29 @@ def run(arguments: list[str]) -> int:
     except SystemExit:
         # click's answer to a broken pipe, and to nothing else here: whoever read our output has gone.
         return 0
+    except OSError as error:
+        if error.errno not in OUTPUT_ERRORS:
+            return _bug(arguments)
+        _silence_stdout()
+        click.echo(f"apc: the output can't be written: {error.strerror}", err=True)
+        return 1
     except Exception:
-        click.echo(
-            f"apc: this is a bug of apc, not of your input; a report is in {_report(arguments)}", err=True
-        )
-        return 3
+        return _bug(arguments)
     return 0
+
+
+def _silence_stdout() -> None:
+    """Let the flush at exit go nowhere: what could not be written once can't be written twice."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _bug(arguments: list[str]) -> int:
+    """Say where the report of a bug of ours is."""
+    import click
+
+    where = _report(arguments)
+    click.echo(f"apc: this is a bug of apc, not of your input; a report is in {where}", err=True)
+    return 3
 
 
 def _report(arguments: list[str]) -> str:

@@ -69,7 +69,7 @@ def _self_check(system: CompiledSystem, difference: float) -> str:
     if not left_out:
         return compared
     if len(left_out) == len(system.kinds):
-        return "no frame is compared, as nothing here is linear"
+        return "no frame is compared, as no peer here is linear"
     return f"{compared} (not {' and '.join(left_out)}, which is not linear)"
 
 

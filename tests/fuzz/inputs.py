@@ -47,6 +47,7 @@ COMPONENTS = {
     for folder in ("contacts", "coordination", "devices", "hands", "mechanics", "network")
     for name, text in _read(folder).items()
 }
+TITLES = {text.partition("component: ")[2].split()[0]: text for text in COMPONENTS.values() if "component: " in text}
 TABLES = {"users.csv": (MODELS / "scenes" / "users.csv").read_text(encoding="utf-8")}
 PUSH = "time [s],force [N]\n0,0\n1,2\n2,-1\n"
 
@@ -225,9 +226,14 @@ _Loader.add_constructor(
 )
 
 
+_trees: dict[str, Tree] = {}  # of the texts that come again and again
+
+
 def tree_of(text: str) -> Tree:
     """Return a YAML text as a tree that can be changed."""
-    return yaml.load(text, Loader=_Loader)
+    if text not in _trees:
+        _trees[text] = yaml.load(text, Loader=_Loader)
+    return _copied(_trees[text])
 
 
 def _spots(tree: Tree) -> list[tuple[Any, int]]:
@@ -404,7 +410,8 @@ def _numbers(rng: random.Random) -> dict[str, bytes]:
 def _component(rng: random.Random) -> dict[str, bytes]:
     """Shadow a component of the library by a changed one of the same name, in a folder of the scene's own."""
     scene = tree_of(_scene(rng))
-    used = [text for text in COMPONENTS.values() if re.search(rf"\b{_title(text)}\b", str(scene))]
+    shown = str(scene)
+    used = [text for name, text in TITLES.items() if name in shown]
     text = rng.choice(used or list(COMPONENTS.values()))
     if rng.random() < 0.3:
         text = _mangled(text, rng)
@@ -422,15 +429,10 @@ def _component(rng: random.Random) -> dict[str, bytes]:
     return {TOPOLOGY: _encoded(written(scene)), "parts/own.yaml": _encoded(text)}
 
 
-def _title(text: str) -> str:
-    found = re.search(r"^component: (\w+)", text, re.MULTILINE)
-    return found[1] if found else "Mass"
-
-
 def _change_equation(tree: Tree, rng: random.Random) -> None:
     """Replace an equation, or a name or number in one."""
     for key, value in tree:
-        if key == "equations" and isinstance(value, list) and value:
+        if key == "equations" and value and type(value) is list:
             i = rng.randrange(len(value))
             how = rng.randrange(5)
             if how == 0:

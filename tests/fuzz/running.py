@@ -26,7 +26,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from apc.compiler import pipeline
 from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.library import Library
 from apc.compiler.pipeline import run_stages
 from tests.fuzz.inputs import SENTINEL, TOPOLOGY, Input, make_input
 
@@ -76,12 +78,12 @@ def run_all(
     while following < count:
         for index, key, told in _worker(seed, following, min(count, following + BATCH)):
             following = index + 1
-            given = nth_input(seed, index)
-            outcomes[f"{given.sort}: {key if key in ('compiled', 'refused') else 'FAILED'}"] += 1
-            if key not in ("compiled", "refused"):
+            fine = key in ("compiled", "refused")
+            outcomes[f"{told}: {key}" if fine else f"{nth_input(seed, index).sort}: FAILED"] += 1
+            if not fine:
                 often[key] += 1
                 if key not in failures:
-                    failures[key] = Failure(key, told, index, given)
+                    failures[key] = Failure(key, told, index, nth_input(seed, index))
             if time.monotonic() - shown > 10:
                 shown = time.monotonic()
                 progress(f"{following} inputs, {len(failures)} different failures")
@@ -93,8 +95,23 @@ def nth_input(seed: int, index: int) -> Input:
     return make_input(random.Random(f"{seed}/{index}"))
 
 
+class _WarmLibrary(Library):
+    """A library that has read the built-in components already, as long as no folder shadows one."""
+
+    builtin = Library()
+
+    def __init__(self, folders: tuple[Path, ...] = ()) -> None:
+        super().__init__(folders)
+        if not folders:
+            self._components = dict(self.builtin._components)
+            self._connectors = dict(self.builtin._connectors)
+
+
 def _warm_up() -> None:
     """Load everything once, so that no input pays for it and processes share it."""
+    for name in _WarmLibrary.builtin.component_names:
+        _WarmLibrary.builtin.component(name)
+    pipeline.Library = _WarmLibrary  # type: ignore[misc] # for the fuzzer's own processes
     importlib.import_module("numpy.ma")  # NumPy loads it when it first meets some arrays, and compiles text
     for scene in ("three-users-average", "finger", "users-table"):
         run_stages(
@@ -103,10 +120,18 @@ def _warm_up() -> None:
 
 
 def _worker(seed: int, start: int, stop: int) -> Iterator[tuple[int, str, str]]:
-    """Yield (index, outcome, text) of inputs run in a process of their own; ends early if that had to be killed."""
-    yield from _watched(
-        lambda tell: [tell(i, *_judged(nth_input(seed, i))) for i in range(start, stop)], start, stop
-    )
+    """Yield (index, outcome, text) of inputs run in a process of their own; ends early if that is killed.
+
+    The text of an input that compiled or was refused is its sort.
+    """
+
+    def work(tell: Callable[[int, str, str], None]) -> None:
+        for index in range(start, stop):
+            given = nth_input(seed, index)
+            key, told = _judged(given)
+            tell(index, key, told or given.sort)
+
+    return _watched(work, start, stop)
 
 
 def once(given: Input) -> tuple[str, str]:
