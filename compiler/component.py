@@ -176,6 +176,9 @@ class Component:
         return own or any(inner.component.hears_others for inner in self.inner)
 
 
+Settable = Number | Option | Reference | Variable  # what a group of peers can set for itself
+
+
 def option_test(node: Expr, options: dict[str, Option]) -> tuple[Option, str] | None:
     """Return the option and the word that a comparison such as `delays == all` is about."""
     if (

@@ -102,6 +102,10 @@ class Definitions(Protocol):
     """Where a definition finds the others it names."""
 
     @property
+    def component_names(self) -> tuple[str, ...]:
+        """The names of the components that can be asked for."""
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Everything that can be asked for."""
 
@@ -169,18 +173,21 @@ def _read_declarations(root: Mapping, library: Definitions, mistakes: Mistakes) 
 
 
 def _base(node: Node | None, library: Definitions, mistakes: Mistakes) -> Component | None:
-    text = read_text(node, "extends", mistakes, hint="extends: Mass")
-    return None if node is None or text is None else _found(text, node.place, library, mistakes)
+    hint = "extends: Mass"
+    text = read_text(node, "extends", mistakes, hint=hint)
+    return None if node is None or text is None else _found(text, node.place, library, mistakes, hint)
 
 
-def _found(name: str, place: Place, library: Definitions, mistakes: Mistakes) -> Component | None:
+def _found(name: str, place: Place, library: Definitions, mistakes: Mistakes, hint: str) -> Component | None:
     try:
         component = library.component(name)
     except ApcError as error:
         mistakes.take(error)
         return None
-    if component is None:
-        known = [known for known in library.names if known != name]  # a connector type is no component
+    if component is None and name in library.names:
+        mistakes.add("E206", place, f"{name} is a connector type, not a component", hint=hint)
+    elif component is None:
+        known = library.component_names
         add_unknown("E206", place, f"there is no component {brief(name)}", name, known, mistakes)
     return component
 
@@ -289,7 +296,8 @@ def read_type(
         mistakes.add("E201", key.place, f"{key.text} has no type", hint=f"type: {example}")
     if name is None:
         return None
-    return _found(name, node.place if node is not None else key.place, library, mistakes)
+    place = node.place if node is not None else key.place
+    return _found(name, place, library, mistakes, f"type: {example}")
 
 
 class _Names:

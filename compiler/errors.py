@@ -69,7 +69,9 @@ class Mistake:
             text += f", got {self.got}" if self.expected else f" {self.got}"
         if not text.endswith((".", "?", "!")):
             text += "."
-        return f"{text} Write: {self.hint}" if self.hint else text
+        if self.hint:
+            text += f" Write: {self.hint}"
+        return "".join(c if c.isprintable() else " " for c in text)  # one line, whatever was got
 
 
 class ApcError(Exception):

@@ -12,13 +12,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.component import OTHERS, Component, Option, Reference, option_test
+from apc.compiler.component import OTHERS, Component, Option, Reference, Send, option_test
 from apc.compiler.component import Number as NumberParameter
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.expression import (
     Binary,
     Call,
     Conditional,
+    Equation,
     Expr,
     Name,
     Number,
@@ -28,6 +29,7 @@ from apc.compiler.expression import (
 )
 from apc.compiler.parts import GROUND
 from apc.compiler.scene import Part, PeerGroup, Scene
+from apc.compiler.source import place_in
 from apc.compiler.units import Dimension
 from apc.compiler.values import Value
 
@@ -211,8 +213,8 @@ class _Instance:
 
     def equations(self) -> Iterator[FlatEquation]:
         for equation in self.component.equations:
-            left = self._qualified(equation.left, equation.place, self.clock)
-            right = self._qualified(equation.right, equation.place, self.clock)
+            left = self._qualified(equation.left, equation, self.clock)
+            right = self._qualified(equation.right, equation, self.clock)
             yield FlatEquation(left, right, self.part.name, self.clock, equation.place)
 
     def sends(self) -> Iterator[FlatSend]:
@@ -221,35 +223,35 @@ class _Instance:
                 what = f"{self.component.name} sends {send.name} but has no parameter that names one link"
                 self.mistakes.add("E504", send.place, what, hint="parameters: {link: link}")
                 continue
-            expression = self._qualified(send.expression, send.place, self.link)
+            expression = self._qualified(send.expression, send, self.link)
             yield FlatSend(self._whole(send.name), self.link, expression, send.dimension, send.place)
 
     def _whole(self, *parts: str) -> str:
         return ".".join((self.part.name, *parts))
 
-    def _qualified(self, expression: Expr, place: Place, clock: str | None) -> Expr:
+    def _qualified(self, expression: Expr, where: Equation | Send, clock: str | None) -> Expr:
         def replace(node: Expr) -> Expr | None:
             if isinstance(node, Conditional):
-                return self._decided(node, place, clock)
+                return self._decided(node, where, clock)
             if isinstance(node, Call) and node.function == "sample":
-                return self._sample(node, place, clock)
+                return self._sample(node, where, clock)
             if isinstance(node, Name):
                 return self._name(node)
             return None
 
         return transform(expression, replace)
 
-    def _decided(self, node: Conditional, place: Place, clock: str | None) -> Expr | None:
+    def _decided(self, node: Conditional, where: Equation | Send, clock: str | None) -> Expr | None:
         test = option_test(node.condition, self.options)
         if test is None:
             return None
         option, word = test
         equal = self.chosen[option.name] == word
         holds = equal == (getattr(node.condition, "operator", "==") == "==")
-        return self._qualified(node.then if holds else node.otherwise, place, clock)
+        return self._qualified(node.then if holds else node.otherwise, where, clock)
 
-    def _sample(self, node: Call, place: Place, clock: str | None) -> Expr:
-        argument = self._qualified(node.arguments[0], place, clock)
+    def _sample(self, node: Call, where: Equation | Send, clock: str | None) -> Expr:
+        argument = self._qualified(node.arguments[0], where, clock)
         if len(node.arguments) == 2:
             named = node.arguments[1]
             if isinstance(named, Name) and named.parts[0] in self.clocks:
@@ -257,13 +259,14 @@ class _Instance:
             else:
                 self.mistakes.add(
                     "E504",
-                    place,
+                    place_in(where.place, where.text, named.start),
                     "the second argument of sample",
                     expected="a parameter of this component that is a clock",
                     got=format_expression(named),
                 )
         if clock is None:
             what = f"{self.component.name} samples but has no parameter that names one clock"
+            place = place_in(where.place, where.text, node.start)
             self.mistakes.add("E504", place, what, hint="parameters: {clock: clock}")
             clock = "?"
         return Call("sample", (argument, Name((clock,))))

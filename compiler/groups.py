@@ -11,12 +11,11 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.component import Number, Option, Reference, Variable
+from apc.compiler.component import Number, Option, Reference, Settable, Variable
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.reading import (
     add_unknown,
@@ -33,9 +32,6 @@ from apc.compiler.source import Node, Scalar, Sequence
 from apc.compiler.tables import Column, Table, read_table
 from apc.compiler.units import format_dimension
 from apc.compiler.values import Value
-
-if TYPE_CHECKING:
-    from apc.compiler.scene import Settable
 
 LARGEST_COUNT = 10**9
 

@@ -34,8 +34,9 @@ class Scope:
     `dimension` and `names` are the names an expression may use; `references` gives the names of a role, or
     None when the section that would hold them is missing or faulty and was reported; `parts` are the
     components of the parts that can be joined, `counts` how many of an array there are; `faulty` names parts
-    that can't be read and were reported; `whole` is what the entry stands in, in words; `outer` is the
-    component around it, if there is one.
+    that can't be read and were reported; `complete` is False when a whole section of parts is missing or
+    faulty and was reported; `whole` is what the entry stands in, in words; `outer` is the component around
+    it, if there is one.
     """
 
     dimension: Callable[[tuple[str, ...]], Dimension | None]
@@ -45,6 +46,7 @@ class Scope:
     counts: Mapping[str, int]
     faulty: Collection[str]
     whole: str
+    complete: bool = True
     outer: Component | None = None
 
 
@@ -209,7 +211,11 @@ class _EntryReader:
         known_names = self.scope.references(parameter.role, word, node.place)
         if known_names is None or word in known_names:
             return word
-        what = f"{self.name} names {parameter.role} {brief(word)}, which isn't in {parameter.role}s"
+        within = self.scope.outer
+        missing = (
+            f"isn't in {parameter.role}s" if within is None else f"is no {parameter.role} of {within.name}"
+        )
+        what = f"{self.name} names {parameter.role} {brief(word)}, which {missing}"
         add_unknown("E206", node.place, what, word, list(known_names), self.mistakes)
         return None
 
@@ -248,9 +254,11 @@ class _EntryReader:
 
     def _target(self, found: re.Match[str], connector: str, node: Node) -> str | None:
         other = found["part"]
-        if other in self.scope.faulty or not self.scope.parts:
-            return None  # reported where it is, or as a missing section
+        if other in self.scope.faulty:
+            return None  # reported where it is
         if other not in self.scope.parts:
+            if not self.scope.complete:
+                return None  # it would be in the section that was reported
             what = (
                 f"{self.name} joins its {connector} to {brief(other)}, which is no part of {self.scope.whole}"
             )

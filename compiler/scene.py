@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
-from apc.compiler.component import Component, Number, Option, Reference, Variable
+from apc.compiler.component import Component, Number, Option, Reference, Settable
 from apc.compiler.definitions import RESERVED, read_type
 from apc.compiler.dimensions import SECOND
 from apc.compiler.errors import ApcError, Mistakes, Place
@@ -70,6 +70,7 @@ EXAMPLES = {
     "couplers": "contact: {type: SampledSpringDamper}",
     "hands": "hand: {type: ConstantForce}",
 }
+TYPE_EXAMPLES = {"couplers": "SampledSpringDamper", "hands": "ConstantForce"}
 PART_KEYS = ("at", "shared", "count")
 
 
@@ -353,7 +354,10 @@ class _Reader:
             name = read_name(key, "a clock", self.mistakes)
             if name is None:
                 continue
-            if name in RESERVED or name in self.parameters or name in self.groups:
+            if name in RESERVED:
+                self.mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
+                continue
+            if name in self.parameters or name in self.groups:
                 self.mistakes.add("E205", key.place, f"the name {name} is used twice in this topology")
                 continue
             phase: Value | None = Value(Fraction(0), SECOND, None, value.place)
@@ -400,7 +404,14 @@ class _Reader:
             if name in RESERVED:
                 self.mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
                 continue
-            component = read_type(key, body, DEFAULT_TYPES.get(section), self.library, self.mistakes)
+            component = read_type(
+                key,
+                body,
+                DEFAULT_TYPES.get(section),
+                self.library,
+                self.mistakes,
+                example=TYPE_EXAMPLES.get(section, "Mass"),
+            )
             if component is not None:
                 self.bodies[name] = _Body(
                     section, body, component, key.place, self._count(name, section, body)
@@ -446,6 +457,11 @@ class _Reader:
             counts={name: body.count for name, body in self.bodies.items() if body.count is not None},
             faulty=self.faulty,
             whole="this topology",
+            complete=all(
+                isinstance(node, Mapping)
+                for section in SECTIONS
+                if (node := root.get(section)) is not None or section == "masses"
+            ),
         )
 
     def _read_part(self, name: str, entry: _Body, root: Mapping) -> list[Part]:
@@ -480,7 +496,7 @@ class _Reader:
                 self._settled_all(read.values, entry.component),
                 read.options,
                 read.references,
-                self._tables(entry.component, read.described),
+                self._tables(name, entry, read.described),
                 self._settled_all(read.starts, None),
                 read.connections,
                 shared,
@@ -570,19 +586,19 @@ class _Reader:
             found += self._with_inner(instance)
         return found
 
-    def _tables(self, component: Component, described: Collection[tuple[str, Node]]) -> tuple[TimeTable, ...]:
+    def _tables(
+        self, name: str, entry: _Body, described: Collection[tuple[str, Node]]
+    ) -> tuple[TimeTable, ...]:
         nodes = dict(described)
         found = []
-        for parameter in component.parameters:
+        for parameter in entry.component.parameters:
             if not (isinstance(parameter, Reference) and parameter.role == "table"):
                 continue
             node = nodes.get(parameter.name)
             text = read_text(node, parameter.name, self.mistakes, hint=f"{parameter.name}: force.csv")
             if node is None:
                 hint = f"{parameter.name}: force.csv"
-                self.mistakes.add(
-                    "E201", component.place, f"{component.name} needs its {parameter.name}", hint=hint
-                )
+                self.mistakes.add("E201", entry.place, f"{name} has no {parameter.name}", hint=hint)
             elif text is not None:
                 table = self._time_table(parameter, node, text)
                 if table is not None:
@@ -756,9 +772,6 @@ class _Reader:
             self.mistakes.add("E207", span.place, what, expected="its lower end first", got=got)
             return None
         return Axis(name.text, low.number, high.number)
-
-
-Settable = Number | Option | Reference | Variable
 
 
 def _settable(parts: Collection[Part]) -> dict[str, list[tuple[str, Settable]]]:

@@ -444,7 +444,11 @@ _PROBLEMS: tuple[tuple[str, str, str], ...] = (
         "a ': ' cannot stand here: the line above ends wrongly, or the text needs quotes",
         "key: 'text: with a colon'",
     ),
-    ("<document start>", "this line belongs to nothing above it: its indent or a closing bracket is wrong", ""),
+    (
+        "<document start>",
+        "this line belongs to nothing above it: its indent or a closing bracket is wrong",
+        "",
+    ),
     ("node content", "a value or a closing bracket is missing here", ""),
     ("could not find expected ':'", "this line is neither 'key: value' nor '- item'", "key: value"),
     ("expected ',' or '}'", "this { is never closed, or a comma is missing behind it", ""),

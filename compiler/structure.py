@@ -234,8 +234,8 @@ def _value(
         report_no_derivative(Residual(sympy.S.Zero, equation), missing, mistakes)
         return None
     if is_no_number(value):
-        what = f"`{equation.text}` ({equation.origin}) holds a constant that is no number, such as 1/0 or sqrt(-1)"
-        mistakes.add("E512", equation.place, what)
+        what = f"`{equation.text}` ({equation.origin}) holds a constant that is no number"
+        mistakes.add("E512", equation.place, f"{what}, such as 1/0 or sqrt(-1)")
         return None
     return value
 

@@ -108,7 +108,7 @@ def _binary(operator: str, left: sympy.Expr, right: sympy.Expr) -> sympy.Expr:
 
 
 def is_no_number(expression: sympy.Expr) -> bool:
-    """Return whether an expression holds a constant such as 1/0, sqrt(-1) or 1e300^2, which no float can be."""
+    """Return whether an expression holds a constant that no float can be: 1/0, sqrt(-1), 1e300^2."""
     if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
         return True
     largest = sympy.Integer(int(sys.float_info.max))

@@ -26,7 +26,15 @@ from apc.compiler.expression import (
 )
 from apc.compiler.reading import add_unknown, brief, read_text
 from apc.compiler.source import Node, Scalar, place_in
-from apc.compiler.units import DIMENSIONLESS, Dimension, format_dimension, format_si, parse_quantity, quantity
+from apc.compiler.units import (
+    DIMENSIONLESS,
+    Dimension,
+    format_dimension,
+    format_si,
+    parse_quantity,
+    parse_unit,
+    quantity,
+)
 
 PEERS = ("peers",)
 
@@ -146,6 +154,7 @@ def read_binding(
         return Binding(named[text], None, dimension, node.place)
     try:
         if is_quantity(text):
+            _refuse_mixture(text, node.place, what, names_known)
             number = quantity(text, node.place, what=what, unit=unit).value
             return Binding(number, None, dimension, node.place)
         return Binding(
@@ -161,6 +170,23 @@ def read_binding(
         return None
 
 
+def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
+    """Raise ApcError for a quantity with a unit that goes on as an expression, as 500 N/m/(peers - 1)."""
+    for word in re.finditer(r"[A-Za-z]\w*", text):
+        before = text[: word.start()].rstrip(" (")
+        if word.group() in names_known and before[-1:] in ("*", "/", "+", "-"):
+            number, rest = before[:-1].strip(), text[len(before) - 1 :].strip()
+            try:
+                parse_unit(word.group(), place)
+            except ApcError:
+                pass
+            else:
+                return
+            hint = f"{what}: total{rest}, with parameters: {{total: {number}}}"
+            expected = "a number with its unit, or an expression without units"
+            raise ApcError(Mistake("E204", place, what, expected, brief(text), hint))
+
+
 def _expression(
     text: str,
     place: Place,
@@ -174,7 +200,8 @@ def _expression(
     check_names(tree, text, place, what, known, names_known)
     found = dimension_of(tree, lambda name: known(name.parts), text, place)
     if found not in (None, ANY, dimension):
-        got = f"{brief(text)}, which is in {format_dimension(found or dimension)}"
+        its = "has no unit" if found == DIMENSIONLESS else f"is in {format_dimension(found or dimension)}"
+        got = f"{brief(text)}, which {its}"
         raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: 1 {unit}"))
     return tree
 

@@ -66,6 +66,12 @@ class Analysis:
     linearized: bool
     notes: tuple[str, ...]
 
+    def __str__(self) -> str:
+        """Return the verdict in words, the numbers, and the modes as a table."""
+        from apc.runtime.report import analysis_report  # it needs this module
+
+        return analysis_report(self)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the analysis as plain data, ready for JSON."""
         return {

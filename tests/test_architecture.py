@@ -15,16 +15,31 @@ from tests.topologies import AVERAGE, ROOT
 
 # Every module, earliest first: each may import only those before it.
 ORDER = (
-    *("apc.compiler.errors", "apc.compiler.source", "apc.compiler.expression", "apc.compiler.units"),
-    *("apc.compiler.dimensions", "apc.compiler.reading", "apc.compiler.library", "apc.compiler.scene"),
-    *("apc.compiler.flatten", "apc.compiler.clocks", "apc.compiler.symbolic", "apc.compiler.structure"),
-    *("apc.compiler.compiled", "apc.compiler.functions", "apc.compiler.pipeline", "apc.compiler.listing"),
-    "apc.compiler.store",
-    *("apc.runtime.threads", "apc.runtime.parameters", "apc.runtime.exact", "apc.runtime.linearize"),
-    *("apc.runtime.schedule", "apc.runtime.lift", "apc.runtime.modes", "apc.runtime.rigid"),
-    *("apc.runtime.spectrum", "apc.runtime.selfcheck", "apc.runtime.analysis", "apc.runtime.needs"),
-    *("apc.inputs", "apc.api", "apc.report", "apc.cli", "apc.__main__"),
+    # what the others are written in, and what is handed over
+    *("apc.compiler.errors", "apc.compiler.compiled", "apc.compiler.cache"),
+    # text
+    *("apc.compiler.source", "apc.compiler.reading", "apc.compiler.expression", "apc.compiler.units"),
+    *("apc.compiler.dimensions", "apc.compiler.values", "apc.compiler.tables"),
+    # components and scenes
+    *("apc.compiler.component", "apc.compiler.parts", "apc.compiler.definitions", "apc.compiler.library"),
+    *("apc.compiler.graphs", "apc.compiler.groups", "apc.compiler.scene"),
+    # equations
+    *("apc.compiler.flatten", "apc.compiler.clocks", "apc.compiler.symbolic", "apc.compiler.blocks"),
+    *("apc.compiler.index", "apc.compiler.structure", "apc.compiler.exchange", "apc.compiler.functions"),
+    *("apc.compiler.pipeline", "apc.compiler.store"),
+    # what is shown of them
+    *("apc.compiler.schema", "apc.compiler.listing", "apc.compiler.diagram", "apc.compiler.picture"),
+    # one peer over a frame
+    *("apc.runtime.threads", "apc.runtime.exact", "apc.runtime.parameters", "apc.runtime.discretize"),
+    *("apc.runtime.exchange", "apc.runtime.linearize", "apc.runtime.schedule", "apc.runtime.lift"),
+    # all peers, and what their motion tells
+    *("apc.runtime.peers", "apc.runtime.modes", "apc.runtime.rigid", "apc.runtime.spectrum"),
+    *("apc.runtime.selfcheck", "apc.runtime.analysis", "apc.runtime.needs", "apc.runtime.report"),
+    # what a person calls
+    *("apc.inputs", "apc.contents", "apc.api", "apc.cli", "apc.__main__"),
 )
+# A result prints itself: it asks for the report, which knows it, when it is printed and not before.
+BACKWARDS = {("apc.runtime.analysis", "apc.runtime.report")}
 PACKAGES = {"compiler": "apc.compiler", "runtime": "apc.runtime", "runtime/apc": "apc"}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "sympify", "parse_expr", "lambdify", "S"}
 FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "sympy.parsing"}
@@ -58,7 +73,7 @@ def test_every_module_has_its_place_in_the_order() -> None:
 
 @pytest.mark.parametrize("module", ORDER)
 def test_a_module_imports_only_what_comes_before_it(module: str) -> None:
-    allowed = set(ORDER[: ORDER.index(module)])
+    allowed = set(ORDER[: ORDER.index(module)]) | {late for early, late in BACKWARDS if early == module}
     assert imports(modules()[module]) <= allowed
 
 

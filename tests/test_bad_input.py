@@ -72,6 +72,11 @@ CASES = {
         without("masses"),
         "scene.yaml:1:1: E201 the topology has no masses section. Write: masses: {device: {mass: 0.1 kg}}",
     ),
+    "masses that are a list": (
+        without("masses") + "masses: [device, cube]\n",
+        "scene.yaml:15:9: E203 masses wants a mapping of keys to values, got a list. "
+        "Write: masses: {device: {mass: 0.1 kg}}",
+    ),
     "missing clocks": (
         without("clocks"),
         "scene.yaml:1:1: E201 the topology has no clocks section. Write: clocks: {haptic: 1 ms}",
@@ -249,8 +254,8 @@ CASES = {
         "scene.yaml:13:70: E326 a power of a power needs parentheses. Write: (x^2)^3",
     ),
     "a tower in parentheses": (
-        stiffness("(((9^64)^64)^64)^64"),
-        "scene.yaml:13:67: E331 (9^64)^64 is too large for a number.",
+        stiffness("kt*(((9^64)^64)^64)^64").replace("clocks:", "parameters: {kt: 1 N/m}\nclocks:"),
+        "scene.yaml:14:70: E331 (9^64)^64 is too large for a number.",
     ),
     "a dunder name": (
         stiffness("__import__"),
@@ -266,7 +271,7 @@ CASES = {
     ),
     "an attribute": (
         stiffness("peers.real"),
-        "scene.yaml:13:66: E206 stiffness names peers.real, which is no parameter of this topology; "
+        "scene.yaml:13:66: E206 stiffness names peers.real, which is no parameter here; "
         "the nearest is peers. Write: peers",
     ),
     "a call": (stiffness("\"open('x')\""), "scene.yaml:13:67: E325 there is no function open."),

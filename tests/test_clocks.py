@@ -15,7 +15,7 @@ PART = """\
 component: Part
 connectors: {{flange: Flange}}
 parameters: {{clock: clock, k: {{unit: N/m, default: 1}}}}
-variables: {{s: {{unit: m}}, w: {{unit: m}}}}
+variables: {{s: {{unit: m, start: 0}}, w: {{unit: m}}}}
 equations:
   - {first}
   - {second}
@@ -120,26 +120,73 @@ def test_a_clocked_variable_needs_hold_to_act(tmp_path: Path) -> None:
 def test_what_is_continuous_already_cannot_be_held(tmp_path: Path) -> None:
     (line,) = told_of(tmp_path, "s = flange.x", "w = s", "flange.f = k*hold(w)")
     assert line == (
-        "part0.yaml:8:5: E505 hold(hand.w, 0) of hand holds hand.w, which is continuous already. "
-        "Write: hand.w"
+        "part0.yaml:8:5: E505 hold(hand.w, 0) holds hand.w, which is continuous already. Write: hand.w"
     )
 
 
-def test_the_others_are_heard_one_value_at_a_time(tmp_path: Path) -> None:
-    text = (
-        "component: Follower\nconnectors: {flange: Flange}\nsends: {x: sample(flange.x)}\n"
-        "parameters: {clock: clock, link: link, k: {unit: N/m}}\n"
-        "equations: [f = k*mean(2*others.x), flange.f = hold(f)]\n"
-    )
-    scene = (
-        ONE_MASS.replace("count: 1", "count: 2")
-        + "clocks: {tick: 1 ms}\nlinks: {lan: {clock: tick}}\n"
-        + "couplers: {all: {type: Follower, flange: device, k: 1 N/m, clock: tick, link: lan}}\n"
-    )
-    (line,) = told(clocked, scene, library(tmp_path, text))
+def test_the_value_of_the_tick_before_the_first_must_be_said(tmp_path: Path) -> None:
+    (line,) = told_of(tmp_path, "s = sample(flange.x)", "w = previous(w) + s", "flange.f = k*hold(w)")
+    assert line.startswith("part0.yaml:7:5: E507 previous(hand.w) needs a start value of hand.w.")
+
+
+FOLLOWER = """\
+component: Follower
+connectors: {{flange: Flange}}
+sends: {{x: sample(flange.x)}}
+parameters: {{clock: clock, link: link, k: {{unit: N/m}}}}
+equations: ['f = {force}', flange.f = hold(f)]
+"""
+TWO = (
+    ONE_MASS.replace("count: 1", "count: 2")
+    + "clocks: {tick: 1 ms}\nlinks: {lan: {clock: tick}}\n"
+    + "couplers: {all: {type: Follower, flange: device, k: 1 N/m, clock: tick, link: lan}}\n"
+)
+
+
+def following(folder: Path, force: str) -> tuple[ClockedKind, str]:
+    """Return a kind whose clocked force is `force`, and what became of it."""
+    (kind,) = clocked(TWO, library(folder, FOLLOWER.format(force=force))).kinds
+    return kind, format_expression(kind.partitions[1].equations[0].right)
+
+
+@pytest.mark.parametrize(
+    ("force", "expected"),
+    [
+        ("k*mean(2*others.x)", "all.k*(2*mean(others.all.x))"),
+        (
+            "mean(k*(sample(flange.x) - others.x))",
+            "sample(all.flange.x, tick)*all.k + -1*all.k*mean(others.all.x)",
+        ),
+        (
+            "sum(k*(sample(flange.x) - others.x))",
+            "count(lan)*(sample(all.flange.x, tick)*all.k) + -1*all.k*sum(others.all.x)",
+        ),
+        ("k*sample(flange.x)*count(others)", "all.k*sample(all.flange.x, tick)*count(lan)"),
+    ],
+)
+def test_a_linear_reduction_of_the_others_is_one_of_what_they_send(
+    tmp_path: Path, force: str, expected: str
+) -> None:
+    kind, found = following(tmp_path, force)
+    assert found == expected
+    for receive in kind.receives:
+        assert (receive.send, receive.link, receive.clock, receive.edge) == ("all.x", "lan", "tick", None)
+
+
+def test_a_reduction_that_is_not_linear_is_taken_over_each_pair(tmp_path: Path) -> None:
+    kind, found = following(tmp_path, "k*sum(max(others.x - sample(flange.x), 0))")
+    (receive,) = kind.receives
+    assert found == f"all.k*{receive.symbol}"
+    assert (receive.operator, receive.link) == ("sum", "lan")
+    assert receive.edge is not None
+    assert format_expression(receive.edge) == "max(others.all.x - sample(all.flange.x, tick), 0)"
+
+
+def test_a_value_of_the_others_is_no_value_of_ones_own(tmp_path: Path) -> None:
+    (line,) = told(clocked, TWO, library(tmp_path, FOLLOWER.format(force="k*others.x")))
     assert line.rpartition("/")[2] == (
-        "part0.yaml:5:13: E506 mean(2*others.all.x) of all wants one value that the others send, "
-        "such as others.x."
+        "part0.yaml:5:14: E506 others.x of all is a value of each other peer, and one is due here. "
+        "Write: mean(others.x), or sum, max, min"
     )
 
 

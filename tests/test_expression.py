@@ -262,13 +262,18 @@ def _numbers() -> st.SearchStrategy[Expr]:
             inner.map(Negate),
             st.builds(Binary, st.sampled_from("+-*/"), inner, inner),
             st.builds(lambda base, exponent: Binary("^", base, Number(exponent)), inner, exponents),
-            st.builds(
-                lambda name, argument: Call(name, (argument,)), st.sampled_from(sorted(FUNCTIONS)), inner
-            ),
+            st.sampled_from(sorted(FUNCTIONS)).flatmap(lambda name: _call(name, inner)),
             st.builds(Conditional, condition, inner, inner),
         )
 
     return st.recursive(leaves, grow, max_leaves=12)
+
+
+def _call(name: str, argument: st.SearchStrategy[Expr]) -> st.SearchStrategy[Expr]:
+    """Calls with as many arguments as the function takes, three at most."""
+    fewest, most = FUNCTIONS[name]
+    arguments = st.lists(argument, min_size=fewest, max_size=min(most, 3))
+    return arguments.map(lambda found: Call(name, tuple(found)))
 
 
 @settings(max_examples=200, deadline=None)

@@ -66,7 +66,8 @@ def test_an_option_is_decided() -> None:
 def test_samples_and_others_carry_their_clock_and_part() -> None:
     lines = equations(only(MESH), "coordination")
     assert lines[0] == (
-        "coordination.own = (peers - 1)*(coordination.stiffness*sample(coordination.object.x, haptic)"
+        "coordination.own = count(others.coordination)"
+        "*(coordination.stiffness*sample(coordination.object.x, haptic)"
         " + coordination.damping*sample(der(coordination.object.x), haptic))"
     )
     assert lines[1] == (

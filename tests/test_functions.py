@@ -127,7 +127,7 @@ def test_a_value_of_the_tick_before_is_a_memory(tmp_path: Path) -> None:
     own = library(
         tmp_path,
         "component: Filter\nconnectors: {flange: Flange}\n"
-        "parameters: {clock: clock, k: {unit: N/m}}\nvariables: {s: {unit: m}}\n"
+        "parameters: {clock: clock, k: {unit: N/m}}\nvariables: {s: {unit: m, start: 2 mm}}\n"
         "equations: [s = 0.5*previous(s) + sample(flange.x), flange.f = k*hold(s)]\n",
     )
     text = ONE_MASS + (
@@ -166,12 +166,28 @@ def test_every_function_of_the_language_has_its_meaning(tmp_path: Path) -> None:
         assert got == pytest.approx(-expected / 2, rel=1e-14), a
 
 
-def test_a_delay_is_the_same_for_all_peers() -> None:
-    text = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {contact.delay: 2 ms}}"))
-    assert told(compiled, text) == [
-        "scene.yaml:7:41: E211 contact.delay is the same for all peers: a group can't set it. "
-        "Write: delay: … where contact is described"
+def test_a_group_may_have_a_delay_of_its_own() -> None:
+    groups = "one: {count: 1, set: {contact.delay: 2 ms}}\n  two: {count: 2}"
+    system = compiled(replaced(AVERAGE, ("user: {count: 3}", groups)))
+    one, two = system.groups
+    assert one.kind != two.kind, "each has a schedule of its own"
+    delays = [{hold.name: hold.delay for hold in system.kinds[group.kind].holds} for group in (one, two)]
+    assert delays == [
+        {"contact.f": "one.contact.delay", "coordination.f": "coordination.delay"},
+        {"contact.f": "contact.delay", "coordination.f": "coordination.delay"},
     ]
+    timings = {timing.name: timing.value for timing in system.timings}
+    assert timings["one.contact.delay"] == Fraction(2, 1000)
+    assert timings["contact.delay"] == Fraction(1, 1000)
+
+
+def test_a_delay_is_the_same_for_all_peers_of_a_group() -> None:
+    text = replaced(AVERAGE, ("{count: 3}", "{set: {contact.delay: [1 ms, 2 ms, 2 ms]}}"))
+    (line,) = told(compiled, text)
+    assert line == (
+        "scene.yaml:7:9: E211 contact.delay can't differ from peer to peer within a group. "
+        "Write: a group of its own for each delay"
+    )
 
 
 def test_groups_of_one_kind_share_its_functions() -> None:

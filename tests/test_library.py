@@ -7,16 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from apc.compiler.errors import ApcError
 from apc.compiler.component import Number, Option, Reference, option_test
+from apc.compiler.errors import ApcError
 from apc.compiler.library import Library
 from apc.compiler.units import format_dimension
 from tests.topologies import ROOT, library, told
 
-BUILT_IN = (
-    *("AveragePosition", "ConstantForce", "Flange", "FullMesh", "Link"),
-    *("Mass", "SampledSpringDamper"),
-)
+FILES = [path for path in sorted((ROOT / "models").rglob("*.yaml")) if path.parent.name != "scenes"]
 BALL = """\
 component: Ball
 connectors: {flange: Flange}
@@ -38,18 +35,24 @@ def ball(tmp_path: Path, old: str, new: str) -> list[str]:
 
 def test_every_built_in_definition_reads_and_balances() -> None:
     built_in = Library()
-    assert built_in.names == BUILT_IN
+    assert len(built_in.names) == len(FILES) >= 35
     for name in built_in.component_names:
         component = built_in.component(name)
         assert component is not None
         assert component.name == name
         assert component.about
-    assert set(BUILT_IN) - set(built_in.component_names) == {"Flange"}
+    (flange,) = set(built_in.names) - set(built_in.component_names)
+    connector = built_in.connector(flange)
+    assert connector is not None
+    assert connector.name == flange == "Flange"
 
 
-def test_a_file_is_named_after_its_component_in_kebab_case() -> None:
-    stems = {path.stem for path in (ROOT / "models").rglob("*.yaml") if path.parent.name != "scenes"}
-    assert {"".join(word.capitalize() for word in stem.split("-")) for stem in stems} == set(BUILT_IN)
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_file_is_named_after_what_it_defines_in_kebab_case(path: Path) -> None:
+    name = "".join(word.capitalize() for word in path.stem.split("-"))
+    assert name in Library().names
+    titles = {f"component: {name}", f"connector: {name}"}
+    assert titles & set(path.read_text(encoding="utf-8").splitlines())
 
 
 def test_every_number_has_a_unit_and_a_description() -> None:

@@ -526,7 +526,11 @@ def test_a_table_is_handed_on_to_a_part_inside(tmp_path: Path) -> None:
     ("old", "new", "sentence"),
     [
         ("push: {table: N}", "push: {table: mm}", "E204 force wants N, got mm."),
-        ("force: push", "force: pull", "E206 hand names table pull, which isn't there; there are: push."),
+        (
+            "force: push",
+            "force: pull",
+            "E206 hand names table pull, which is no table of Tabled; there are: push.",
+        ),
     ],
 )
 def test_a_table_handed_on_must_be_there_and_of_the_same_unit(

@@ -157,7 +157,6 @@ def test_full_mesh_is_the_average_with_n_minus_one_times_the_gains(peers: int, d
     mesh = analyse("VC", gains(k_t, b_t, 1500, 2), peers=peers, delays=delays)
     average = analyse("AP", gains(k_t * (peers - 1), b_t * (peers - 1), 1500, 2), peers=peers, delays=delays)
     assert abs(mesh.spectral_radius - average.spectral_radius) < 1e-12
-    assert [mode.multiplicity for mode in mesh.modes] == [mode.multiplicity for mode in average.modes]
     same_multiset(mesh, average, 1e-12)
 
 

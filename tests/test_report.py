@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from apc.report import WIDTH, analysis_report, compile_report
+from apc.runtime.report import WIDTH, analysis_report, compile_report
 from apc.runtime.analysis import analyze_modes
 from apc.runtime.needs import needs
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced

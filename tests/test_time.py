@@ -132,7 +132,7 @@ def after(peers: list[Peer], names: tuple[str, ...]) -> list[float]:
 
 
 def frame_map(delay: Fraction, late: Fraction, phase: Fraction, first: Fraction, delays: str) -> ClosedSystem:
-    return dense(lifted_groups(system(delay, late, phase, first, delays)))
+    return dense(*lifted_groups(system(delay, late, phase, first, delays)))
 
 
 ZERO = Fraction(0)
@@ -174,10 +174,13 @@ def test_one_compiled_frame_is_the_convention_event_by_event(
 
 def heard_at(late: Fraction) -> list[int]:
     """Return, for each force tick of a frame, how many frames old the packet is that it sees."""
-    (group,) = lifted_groups(system(ZERO, late, ZERO, ZERO, "all"))
+    (group,), _ = lifted_groups(system(ZERO, late, ZERO, ZERO, "all"))
     schedule = group.schedule
     ticks = [event for event in schedule.events if hasattr(event, "heard")]
-    return [schedule.heard[tick.heard[0]].lag for tick in ticks]
+    # The first thing heard is x, by one packet: the other peers hear and are heard alike.
+    rows = [tick.heard[0] for tick in ticks]
+    assert all(len(row) == 1 for row in rows)
+    return [schedule.heard[row[0]].lag for row in rows]
 
 
 def test_a_tick_at_exactly_the_time_of_arrival_sees_the_packet() -> None:

@@ -148,7 +148,7 @@ def _compile(path: Path, target: Path, *, timings: bool) -> None:
     """Compile, check, save and report; with `timings`, how long each of it took."""
     from apc.compiler.pipeline import each_stage
     from apc.compiler.store import save
-    from apc.report import compile_report, timings_report
+    from apc.runtime.report import compile_report, timings_report
     from apc.runtime.needs import needs
     from apc.runtime.selfcheck import check_frame
 
@@ -267,7 +267,7 @@ def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: b
     if as_json:
         _print_json(result.to_dict())
     else:
-        from apc.report import analysis_report
+        from apc.runtime.report import analysis_report
 
         click.echo(analysis_report(result))
 

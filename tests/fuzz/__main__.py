@@ -40,7 +40,8 @@ def main() -> int:
         for name, data in small.files:
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(data)
-        text = f"{failure.key}\nseed {options.seed}, input {failure.index}, {often[failure.key]} times\n\n{told or failure.told}\n"
+        came = f"seed {options.seed}, input {failure.index}, {often[failure.key]} times"
+        text = f"{failure.key}\n{came}\n\n{told or failure.told}\n"
         (folder / "told.txt").write_text(text, encoding="utf-8")
         print(f"\n{folder}: {text}")
     wrong = bool(failures)

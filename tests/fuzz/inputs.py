@@ -1,3 +1,4 @@
+# ruff: noqa: E501 -- lists of hostile texts, and texts built in one line, read best as they are
 """Hostile inputs: bytes, YAML, expressions, units, components and tables that nobody should write.
 
 Takes: a seeded generator. Gives: `Input`, `make_input`.
@@ -47,7 +48,9 @@ COMPONENTS = {
     for folder in ("contacts", "coordination", "devices", "hands", "mechanics", "network")
     for name, text in _read(folder).items()
 }
-TITLES = {text.partition("component: ")[2].split()[0]: text for text in COMPONENTS.values() if "component: " in text}
+TITLES = {
+    text.partition("component: ")[2].split()[0]: text for text in COMPONENTS.values() if "component: " in text
+}
 TABLES = {"users.csv": (MODELS / "scenes" / "users.csv").read_text(encoding="utf-8")}
 PUSH = "time [s],force [N]\n0,0\n1,2\n2,-1\n"
 

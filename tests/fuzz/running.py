@@ -4,8 +4,8 @@ Takes: inputs. Gives: `Failure`, `run_all`, `shrunk`.
 Guarantees: one input can't bring the run down, whether it crashes, hangs or eats memory.
 Does not: make inputs.
 
-An input may compile, or be refused with `ApcError` whose mistakes each have a code, a sentence of one line and
-a place that exists, in the order of the file, none twice. Anything else is a failure.
+An input may compile, or be refused with `ApcError` whose mistakes each have a code, a sentence of one line
+and a place that exists, in the order of the file, none twice. Anything else is a failure.
 """
 
 from __future__ import annotations
@@ -234,6 +234,7 @@ def _judged(given: Input) -> tuple[str, str]:
             finally:
                 _listening = False
                 signal.setitimer(signal.ITIMER_REAL, 0)
+                took = time.monotonic() - started
         except ApcError as error:
             fault = _fault_of(error, dict(given.files))
             outcome = fault or ("refused", "")
@@ -241,7 +242,6 @@ def _judged(given: Input) -> tuple[str, str]:
             outcome = _key_of(error), "".join(traceback.format_exception(error, limit=-12))[-4000:]
         finally:
             os.chdir(before)
-        took = time.monotonic() - started
         if took > SECONDS and "takes more" not in outcome[0]:
             outcome = f"takes more than {SECONDS:g} s", f"{took:.1f} s"
         if (folder / SENTINEL).exists() or _foreign:
@@ -270,13 +270,10 @@ def _key_of(error: BaseException) -> str:
     ours = [frame for frame in frames if "/compiler/" in frame.filename]
     where = f"{Path(ours[-1].filename).name}:{ours[-1].name}" if ours else "?"
     if isinstance(error, TooLongError):
-        stage = next(
-            (f.name for f in ours if Path(f.filename).name == "pipeline.py" and f.name != "run_stages"), ""
-        )
         outer = next(
             (f"{Path(f.filename).name}:{f.name}" for f in ours if Path(f.filename).name != "pipeline.py"), ""
         )
-        return f"takes more than {SECONDS:g} s in {outer}{stage and ''}"
+        return f"takes more than {SECONDS:g} s in {outer}"
     return f"{type(error).__name__} in {where}:{ours[-1].lineno if ours else 0}"
 
 
@@ -289,8 +286,9 @@ def _fault_of(error: ApcError, files: dict[str, bytes]) -> tuple[str, str] | Non
     mistakes = error.mistakes
     if len(set(mistakes)) < len(mistakes) or len({str(m) for m in mistakes}) < len(mistakes):
         return f"told twice: {_twice(mistakes)}", told
+    texts = {name: re.split(rb"\r\n|\n|\r", data) for name, data in files.items()}
     for mistake in mistakes:
-        fault = _fault_in(mistake, files)
+        fault = _fault_in(mistake, texts)
         if fault:
             return f"{fault}: {mistake.code} {_shape(mistake.sentence)}", told
     by_file: dict[str, list[Mistake]] = {}
@@ -313,7 +311,7 @@ def _shape(sentence: str) -> str:
     return " ".join(re.sub(r"[^a-z ,']+", "_", sentence).split()[:5])
 
 
-def _fault_in(mistake: Mistake, files: dict[str, bytes]) -> str:
+def _fault_in(mistake: Mistake, texts: dict[str, list[bytes]]) -> str:
     sentence, place = mistake.sentence, mistake.place
     if not re.fullmatch(r"E\d{3}", mistake.code):
         return "no code"
@@ -329,15 +327,17 @@ def _fault_in(mistake: Mistake, files: dict[str, bytes]) -> str:
         return "no file"
     if not place.line and not WHOLE_FILE.match(mistake.code):
         return "no line"
-    data = files.get(place.file, files.get(place.file.removeprefix("./")))
-    if place.line and data is not None:
-        lines = re.split(rb"\r\n|\n|\r", data)
-        if place.line == len(lines) + 1 and place.column == 1:  # the end of the file
-            return ""
-        if place.line > len(lines):
-            return "a line that isn't there"
-        if not 1 <= place.column <= len(lines[place.line - 1]) + 2:
-            return "a column that isn't there"
+    lines = texts.get(place.file.removeprefix("./"))
+    if not place.line or lines is None:
+        return ""
+    if place.line == len(lines) + 1 and place.column == 1:  # the end of the file
+        return ""
+    if place.line > len(lines):
+        return "a line that isn't there"
+    line = lines[place.line - 1]
+    quoted = place.file.endswith(".csv") and b'"' in line  # a cell's column is counted without its quotes
+    if not quoted and not 1 <= place.column <= len(line) + 2:
+        return "a column that isn't there"
     return ""
 
 
