@@ -129,6 +129,7 @@ def read_settings(
     settable: Mapping[str, list[tuple[str, Settable]]],
     clocks: Collection[str],
     read_number: Callable[[Node, str, Settable], Value | None],
+    reported: Callable[[str], bool],
     mistakes: Mistakes,
 ) -> Settings:
     """Read what a group sets.
@@ -143,6 +144,8 @@ def read_settings(
         The clocks of the scene.
     read_number
         Reads a value for what is set.
+    reported
+        Whether a name that can't be set is of a part whose own fault was reported.
     mistakes
         Where faults go.
     """
@@ -152,6 +155,8 @@ def read_settings(
     section = read_mapping(group.body.get("set"), "set", mistakes, hint="set: {device.mass: 0.2 kg}")
     for key, node in entries(section):
         items = settable.get(key.text)
+        if items is None and reported(key.text):
+            continue
         if items is None:
             what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
             add_unknown("E206", key.place, what, key.text, list(settable), mistakes)
@@ -168,7 +173,7 @@ def read_settings(
             elif (value := read_number(node, key.text, item)) is not None:
                 values.append((whole, value))
     for column_ in group.table.columns if group.table is not None else ():
-        for whole, item in _items_of(column_, settable, mistakes):
+        for whole, item in _items_of(column_, settable, reported, mistakes):
             if whole in columns or whole in dict(values):
                 mistakes.add("E702", column_.place, f"{whole} is given by set and by the table")
             columns[whole] = column_.numbers
@@ -207,11 +212,14 @@ def _listed(
 
 
 def _items_of(
-    column: Column, settable: Mapping[str, list[tuple[str, Settable]]], mistakes: Mistakes
+    column: Column,
+    settable: Mapping[str, list[tuple[str, Settable]]],
+    reported: Callable[[str], bool],
+    mistakes: Mistakes,
 ) -> list[tuple[str, Number | Variable]]:
     items = settable.get(column.name)
     numbers = [(whole, i) for whole, i in items or () if isinstance(i, Number | Variable)]
-    if not numbers:
+    if not numbers and not reported(column.name):
         known = [name for name, found in settable.items() if isinstance(found[0][1], Number | Variable)]
         what = f"a heading names {brief(column.name)}, which is no number of a part"
         add_unknown("E702", column.place, what, column.name, known, mistakes)

@@ -9,6 +9,7 @@ Does not: look into a component's equations.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -243,6 +244,7 @@ class _Reader:
         self.groups: dict[str, GroupBody] = {}
         self.faulty: set[str] = set()  # parts that are there but can't be read: reported once, there
         self.faulty_names: set[str] = set()  # parameters without a value, likewise
+        self.complete = True  # False when a section of parts is missing or faulty
         self.texts: dict[str, str] = {}
 
     @property
@@ -263,7 +265,10 @@ class _Reader:
         self._read_parameters(root.get("parameters"))
         self._read_clocks(root.get("clocks"))
         for section in SECTIONS:
-            self._read_section(section, root.get(section))
+            node = root.get(section)
+            self._read_section(section, node)
+            required = section == "masses"
+            self.complete &= isinstance(node, Mapping) or (node is None and not required)
         parts = [part for name, body in self.bodies.items() for part in self._read_part(name, body, root)]
         links = tuple(self._link(part) for part in parts if part.section == "links" and "." not in part.name)
         settable = _settable(parts)
@@ -435,6 +440,11 @@ class _Reader:
         self.mistakes.add("E208", node.place, f"the count of {name}", expected=expected, got=form(node))
         return None
 
+    def _is_reported(self, name: str) -> bool:
+        """Return whether `part.parameter` is of a part that is missing for a fault that was reported."""
+        part = re.split(r"[.\[]", name)[0]
+        return part in self.faulty or (not self.complete and part not in self.bodies)
+
     def _scope(self, root: Mapping) -> Scope:
         links = [name for name, body in self.bodies.items() if body.section == "links"]
 
@@ -457,11 +467,7 @@ class _Reader:
             counts={name: body.count for name, body in self.bodies.items() if body.count is not None},
             faulty=self.faulty,
             whole="this topology",
-            complete=all(
-                isinstance(node, Mapping)
-                for section in SECTIONS
-                if (node := root.get(section)) is not None or section == "masses"
-            ),
+            complete=self.complete,
         )
 
     def _read_part(self, name: str, entry: _Body, root: Mapping) -> list[Part]:
@@ -688,7 +694,9 @@ class _Reader:
         return SceneLink(part.name, clock, values["delay"], graph, tuple(delays), part.place)
 
     def _group(self, group: GroupBody, settable: dict[str, list[tuple[str, Settable]]]) -> PeerGroup:
-        settings = read_settings(group, settable, self.clocks, self._binding_of, self.mistakes)
+        settings = read_settings(
+            group, settable, self.clocks, self._binding_of, self._is_reported, self.mistakes
+        )
         return PeerGroup(
             group.name, group.count, settings.values, settings.words, settings.columns, group.body.place
         )
@@ -759,7 +767,7 @@ class _Reader:
             return None
         items = settable.get(name.text)
         if not items or not isinstance(items[0][1], Number):
-            if name.text.partition(".")[0] not in self.faulty:
+            if not self._is_reported(name.text):
                 what = f"{key} names {brief(name.text)}, which is no parameter of a part"
                 known = [known for known, found in settable.items() if isinstance(found[0][1], Number)]
                 add_unknown("E206", name.place, what, name.text, known, self.mistakes)

@@ -11,17 +11,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import matrix_balance, schur, solve_sylvester
 
 from apc.runtime.discretize import UNIT
 from apc.runtime.modes import ClosedSystem
+from apc.runtime.pseudospectrum import (
+    PRODUCT_ROUNDINGS,
+    balance,
+    cluster_radius,
+    norms,
+    pseudospectral_radius,
+)
 from apc.runtime.rigid import RigidModes, find_rigid_modes
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+Matrix = NDArray[Any]  # float64 or complex128
 
 STABLE = "stable"
 STABLE_TRANSLATING = "stable up to a common translation"
@@ -33,24 +41,20 @@ UNDECIDED = "undecided: |ρ−1| below the error bound"
 DEADBEAT = 1e-12
 
 # Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
-# cluster at zero, the queues running empty; they are bounded together, so that they spoil no other's bound.
+# cluster at zero, the queues running empty; the first split between large and small is here.
 SMALL = 1e-2
 
-# A radius less certain than this is worth more work: other limits between large and small, this many.
+# A radius less certain than this is worth more work: other splits, this many.
 WIDE = 1e-8
-SPLITS_TRIED = 6
+SPLITS_TRIED = 8
 
-# Above so many states, the vectors of small eigenvalues come from the Schur form: a singular value
-# decomposition for each of them costs n⁴.
-MOST_SINGULAR = 128
+# Eigenvalues nearer to one another than this, relatively, are enclosed together: their own vectors are hardly
+# two.
+CLOSE = 1e-6
 
-# Powers of a block of small eigenvalues that bound its resolvent: a queue of that many packets is empty by
-# then.
-RESOLVENT_POWERS = 32
-
-# Backward error of LAPACK's reduction to Schur form and of the few orthogonal products here, in units of
-# n·UNIT·‖matrix‖_F: 'a modest constant' (LAPACK Users' Guide, 3rd ed., section 4.8); measured below 1.
-SCHUR_ROUNDINGS = 10
+# Backward error of LAPACK's eigenvalues of a small block, in units of n·UNIT·‖block‖_F: 'a modest constant'
+# (LAPACK Users' Guide, 3rd ed., section 4.8); measured below 1.
+EIGEN_ROUNDINGS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +80,9 @@ class Mode:
 class Spectrum:
     """All modes but the rigid ones, the largest first, and what follows from them.
 
-    `spectral_radius` is per frame; `stable` is None when the verdict is undecided.
+    `spectral_radius` is per frame; `stable` is None when the verdict is undecided. The error bounds the
+    radius from both sides, the verdict needs one: where hardly anything bounds it from below, a system can be
+    stable by less than its error.
     """
 
     modes: tuple[Mode, ...]
@@ -115,18 +121,18 @@ def solve_spectrum(systems: Sequence[ClosedSystem]) -> Spectrum:
         low, high = max(low, least), max(high, most)
         rigid += system.multiplicity * free.directions.shape[1]
         drifts += system.multiplicity * free.drifts
-    found.sort(key=lambda mode: (-mode.magnitude, mode.shape, mode.eigenvalue.real, mode.eigenvalue.imag))
+    found.sort(key=lambda mode: (-mode.magnitude, mode.shape, mode.eigenvalue.real, -mode.eigenvalue.imag))
     radius = found[0].magnitude if found else 0.0
     error = max(high - radius, radius - low, 0.0)
-    verdict, stable = _judge(radius, error, rigid, drifts)
+    verdict, stable = _judge(low, high, rigid, drifts)
     return Spectrum(tuple(found), radius, error, rigid, drifts, verdict, stable)
 
 
-def _judge(radius: float, error: float, rigid: int, drifts: int) -> tuple[str, bool | None]:
-    """Return the verdict and whether it means stable; one NaN decides nothing."""
-    if radius - error > 1:
+def _judge(low: float, high: float, rigid: int, drifts: int) -> tuple[str, bool | None]:
+    """Return the verdict and whether it means stable, from the bounds on the radius; NaN decides nothing."""
+    if low > 1:
         return UNSTABLE, False
-    if not radius + error < 1:
+    if not high < 1:
         return UNDECIDED, None
     if drifts:
         return DRIFTS, False
@@ -134,41 +140,76 @@ def _judge(radius: float, error: float, rigid: int, drifts: int) -> tuple[str, b
 
 
 def _solve(system: ClosedSystem, free: RigidModes) -> tuple[list[Mode], float, float]:
-    """Return the modes of one system and bounds from below and above on its spectral radius."""
+    """Return the modes of one system and bounds from below and above on its spectral radius.
+
+    With the rigid motions V = [V_p; V_r], p as many places as there are motions, and W = V_r V_p⁻¹, the
+    relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr: that map has all other eigenvalues.
+    """
     n = len(system.names)
-    # Balancing scales by powers of two: it changes no digit.
-    _, (scale, _) = matrix_balance(system.matrix, permute=False, separate=True)
-    matrix = system.matrix / scale[:, None] * scale
-    error = system.error / scale[:, None] * scale
     count = free.basis.shape[1]
     if count == n:
         return [], 0.0, 0.0
-    # Q = [Q1 Q2], Q1 spanning the rigid motions: Qᵀ M Q = [J C; 0 H], and H holds all the others.
-    known = free.basis / scale[:, None]
-    known = known / np.linalg.norm(known, axis=0)
-    basis, _ = np.linalg.qr(known, mode="complete")
-    rigid, rest = basis[:, :count], basis[:, count:]
-    reduced = rest.T @ matrix @ rest
-    reduced_error = np.abs(rest.T) @ error @ np.abs(rest)
-    # The directions are rounded; the closer they are to one another, the more that turns their span.
-    turned = float(np.linalg.cond(known)) if count else 1.0
-    reduced_error += SCHUR_ROUNDINGS * n * UNIT * turned * float(np.linalg.norm(matrix))
+    matrix, error = system.matrix, system.error
+    held = _pivots(free.basis.T)
+    rest = np.setdiff1d(np.arange(n), held)
+    weights, weights_error = _relative(free.basis[held], free.basis[rest])
+    reduced = matrix[np.ix_(rest, rest)] - weights @ matrix[np.ix_(held, rest)]
+    size = np.abs(matrix) + error
+    reduced_error = error[np.ix_(rest, rest)] + weights_error @ size[np.ix_(held, rest)]
+    reduced_error += np.abs(weights) @ error[np.ix_(held, rest)]
+    rounded = np.abs(weights) @ size[np.ix_(held, rest)]
+    reduced_error += (PRODUCT_ROUNDINGS * (count + 2) * UNIT) * (rounded + np.abs(reduced) * (count > 0))
 
     values, right, left, errors, low, high = _eigen(reduced, reduced_error)
-    # Back to the whole state: the right vectors get their rigid part, the left ones have none.
-    corner, coupling = rigid.T @ matrix @ rigid, rigid.T @ matrix @ rest
+    # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
+    corner = matrix[np.ix_(held, held)] + matrix[np.ix_(held, rest)] @ weights
     modes = []
     for value, x, y, bound in zip(values, right.T, left, errors, strict=True):
-        whole = rest @ x
+        vector, covector = np.zeros(n, dtype=np.complex128), np.zeros(n, dtype=np.complex128)
+        vector[rest], covector[rest] = x, y
         if count:
-            whole = (
-                whole + rigid @ np.linalg.lstsq(value * np.eye(count) - corner, coupling @ x, rcond=None)[0]
-            )
-        shares = np.abs(whole * (rest @ y))
+            driven = matrix[np.ix_(held, rest)] @ x
+            vector[held] = np.linalg.lstsq(value * np.eye(count) - corner, driven, rcond=None)[0]
+            vector[rest] += weights @ vector[held]
+            covector[held] = -(y @ weights)
+        shares = np.abs(vector * covector)
         total = shares.sum()
-        shares = shares / total if total > 0 else np.abs(whole) / np.abs(whole).sum()
-        modes.append(_mode(system, complex(value), whole * scale, shares, float(bound)))
+        shares = shares / total if total > 0 else np.abs(vector) / np.abs(vector).sum()
+        modes.append(_mode(system, complex(value), vector, shares, float(bound)))
     return modes, low, high
+
+
+def _pivots(rows: Matrix) -> NDArray[np.intp]:
+    """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
+    left = np.array(rows)
+    places: list[int] = []
+    for _ in range(len(rows)):
+        scaled = np.abs(left) / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        line, place = divmod(int(np.argmax(scaled)), rows.shape[1])
+        places.append(place)
+        if left[line, place] != 0:
+            pivot = left[line] / left[line, place]
+            left = left - left[:, [place]] * pivot
+            left[line] = 0.0
+    return np.array(sorted(places), dtype=np.intp)
+
+
+def _relative(held: Floats, rest: Floats) -> tuple[Floats, Floats]:
+    """Return W = V_r V_p⁻¹ and a bound on its error, entry by entry; V itself is rounded once.
+
+    W − W* = (V_r − W V_p + a rounding of either) V_p*⁻¹ up to sign.
+    """
+    count = len(held)
+    inverse = np.linalg.inv(held)
+    weights = rest @ inverse
+    charge = PRODUCT_ROUNDINGS * (count + 2) * UNIT
+    left = np.abs(rest - weights @ held) + charge * (np.abs(rest) + np.abs(weights) @ np.abs(held))
+    size = np.abs(inverse)
+    wrong = np.abs(np.eye(count) - inverse @ held) + 2 * charge * (size @ np.abs(held))
+    assert count == 0 or float(wrong.sum(axis=1).max()) < 0.5, "rigid motions too alike to tell apart"
+    # V_p*⁻¹ = (I − F)⁻¹ Y, and |(I − F)⁻¹| ≤ I + |F| + …, at most doubling the largest.
+    size = size + 2 * wrong.sum(axis=1, keepdims=True) * size.max(axis=0, initial=0.0)
+    return weights, left @ size
 
 
 def _mode(system: ClosedSystem, value: complex, vector: Complexes, shares: Floats, error: float) -> Mode:
@@ -213,209 +254,187 @@ def _angle(system: ClosedSystem, value: complex, vector: Complexes, shares: Floa
 
 @dataclass(frozen=True, slots=True)
 class _Enclosure:
-    """Eigenvalue estimates and the discs that hold the true ones, as many as there are discs.
+    """Bounds on the spectral radius, and how far each estimate can be from a true eigenvalue."""
 
-    `right` has the vectors as columns, `inverse` as rows; both are sound for the first `large` only.
-    """
-
-    values: Complexes
-    centres: Complexes
-    radii: Floats
-    right: Complexes
-    inverse: Complexes
-    large: int
-
-    @property
-    def width(self) -> float:
-        """How uncertain the spectral radius is."""
-        low, high, _ = _clusters(self)
-        return high - low
+    low: float
+    high: float
+    errors: Floats
 
 
-def _eigen(matrix: Floats, error: Floats) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
+def _eigen(matrix: Matrix, error: Floats) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
     """Compute eigenvalues, right vectors (columns), left vectors (rows), errors, and the radius's bounds.
 
     The eigenvalues are split by magnitude, large from small, see `_enclose`. A chain of packets or forces
     that nobody answers is a Jordan block at zero, scattered by rounding over a ring that may reach far out:
     when the first split leaves the radius uncertain, the widest gaps between magnitudes are tried as well.
+    What any split proves holds.
     """
-    found = _enclose(matrix, error, SMALL)
-    if not found.width <= WIDE:
-        sizes = np.sort(np.abs(found.values))
-        sizes = sizes[sizes > SMALL]
-        gaps = np.argsort(sizes[:-1] / sizes[1:], kind="stable")[:SPLITS_TRIED]
-        limits = [float(np.sqrt(sizes[gap] * sizes[gap + 1])) for gap in gaps]
-        tried = [found, *(_enclose(matrix, error, limit) for limit in limits)]
-        found = min(tried, key=lambda one: one.width)
-    low, high, errors = _clusters(found)
-    # A real matrix: an eigenvalue alone in a disc across the real axis has no conjugate, so it is real.
-    alone = errors == found.radii
-    values = found.values.copy()
-    real = alone & (np.abs(values.imag) <= found.radii)
-    values[real] = values[real].real
-    right, left = _plain_vectors(matrix, found, values)
-    return values, right, left, errors, low, high
+    n = len(matrix)
+    scale = balance(np.abs(matrix) + error)
+    matrix, error = matrix / scale[:, None] * scale, error / scale[:, None] * scale
+    values, right = (part.astype(np.complex128) for part in np.linalg.eig(matrix))
+    order = np.lexsort((-values.imag, values.real, -np.abs(values)))
+    values, right = values[order], right[:, order]
+    left = _left_vectors(matrix, values)
+    sizes = np.abs(values)
+
+    # Splits between k and k + 1: conjugates stay together.
+    ratios = np.append(sizes[1:], 0.0) / np.maximum(sizes, np.finfo(np.float64).tiny)
+    first = int((sizes >= SMALL).sum())
+    counts = [int(k) + 1 for k in np.argsort(ratios[:-1], kind="stable") if ratios[k] < 1 - CLOSE]
+    others = [count for count in counts if count != first and sizes[count - 1] > SMALL]
+    tried = [_enclose(matrix, error, values, right, left, first)]
+    for count in (*others[:SPLITS_TRIED], 0):
+        if min(one.high for one in tried) - max(one.low for one in tried) <= WIDE:
+            break
+        tried.append(_enclose(matrix, error, values, right, left, count))
+    low, high = max(one.low for one in tried), min(one.high for one in tried)
+    # No estimate is farther from its eigenvalue than both are from zero.
+    errors = np.minimum(np.min([one.errors for one in tried], axis=0), sizes + high)
+    if n:
+        low = min(low, high)
+    return values, right * scale[:, None], left / scale, errors, low, high
 
 
-def _enclose(matrix: Floats, error: Floats, limit: float) -> _Enclosure:
-    """Enclose the eigenvalues of a matrix that is known up to `error`, entry by entry.
+def _left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
+    """Return left eigenvectors as rows in the order of the values: those of Mᵀ, each to its nearest value."""
+    n = len(matrix)
+    found, vectors = np.linalg.eig(matrix.T)
+    distances = np.abs(values[:, None] - found[None, :])
+    left = np.empty((n, n), dtype=np.complex128)
+    for i in range(n):
+        nearest = int(np.argmin(distances[i]))
+        left[i] = vectors[:, nearest]
+        distances[:, nearest] = np.inf
+    return left
+
+
+def _enclose(
+    matrix: Matrix, error: Floats, values: Complexes, right: Complexes, left: Complexes, large: int
+) -> _Enclosure:
+    """Enclose the eigenvalues of a matrix known up to `error` entry by entry, the `large` first sharply.
 
     Notes
     -----
-    Schur form with the eigenvalues below `limit` last, T = [T₁ R; 0 T₂]; a Sylvester equation frees T₁ of R,
-    and the eigenvectors V of T₁ diagonalize it. With X the transformation and E the error of the matrix,
-    X⁻¹(M + E)X = diag(Λ, T₂) + G, |G| ≤ |X⁻¹| (|residual| + |E| |X|). Every eigenvalue then lies in one of
-    the discs of Gershgorin about Λ, of radius Σ_j |G_ij|, or where ‖(λ − T₂)⁻¹‖ ‖G₂‖ ≥ 1 (Feingold and
-    Varga, Block diagonally dominant matrices, 1962), which is inside a disc about 0, see `_resolvent_radius`.
-    Discs that touch hold together as many eigenvalues as there are of them.
-
-    Where the eigenvectors fail (a defective matrix), Elsner's bound holds for the matrix as a whole:
-    |λ − λ̂| ≤ (‖M‖ + ‖M + E‖)^(1−1/n) ‖E‖^(1/n) (Stewart and Sun, Matrix Perturbation Theory, IV.1.3).
+    X = [X₁ X₂]: X₁ the right vectors of the large ones, X₂ annihilated by their left vectors. Then
+    X⁻¹(M + E)X = diag(T₁, …, T_k, T) + G, |G| ≤ |X⁻¹| (|residual| + |E| |X|), one block T_c a cluster of
+    large eigenvalues that are nearly equal, and T for all that are small. Every eigenvalue z then has
+    ‖(z − T_c)⁻¹‖ Σ_b ‖G_cb‖ ≥ 1 for some block c (Feingold and Varga, Block diagonally dominant matrices,
+    1962): it is in a disc of `cluster_radius` about an eigenvalue of T_c, or within `pseudospectral_radius`
+    of T about zero. Discs that touch hold together as many eigenvalues as there are of them.
     """
     n = len(matrix)
-    triangle, unitary, large = _sorted_schur(matrix, limit)
-    values = np.diag(triangle).copy()
-    upper, lower = triangle[:large, :large], triangle[large:, large:]
-    right = np.zeros((n, n), dtype=np.complex128)
-    right[large:, large:] = np.eye(n - large)
+    worst = _Enclosure(0.0, np.inf, np.full(n, np.inf))
+    clusters = _close(values[:large])
+    basis: Matrix = np.zeros((n, n), dtype=np.complex128)
+    free = np.arange(n)
+    for cluster in clusters:
+        span = right[:, cluster]
+        basis[:, cluster] = np.linalg.qr(span)[0] if len(cluster) > 1 else span
     if large:
-        right[:large, :large] = _triangular_vectors(upper)
-        if large < n:
-            right[:large, large:] = solve_sylvester(upper, -lower, -triangle[:large, large:])
-    right = unitary @ right
-    right /= np.linalg.norm(right, axis=0)
-    spread = float(np.linalg.norm(error)) + SCHUR_ROUNDINGS * n * UNIT * float(np.linalg.norm(matrix))
-    crude = np.full(n, (2 * float(np.linalg.norm(matrix)) + spread) ** (1 - 1 / n) * spread ** (1 / n))
+        rows = left[:large].copy()
+        for cluster in clusters:
+            if len(cluster) > 1:
+                rows[cluster] = np.linalg.qr(rows[cluster].T)[0].T
+        held = _pivots(rows)
+        free = np.setdiff1d(free, held)
+        try:
+            basis[np.ix_(held, np.arange(large, n))] = -np.linalg.solve(rows[:, held], rows[:, free])
+        except np.linalg.LinAlgError:
+            return worst
+    basis[free, np.arange(large, n)] = 1.0
+    if not basis.imag.any():
+        basis = basis.real
     try:
-        inverse = np.linalg.inv(right).astype(np.complex128)
+        inverse = np.linalg.inv(basis)
     except np.linalg.LinAlgError:
-        inverse = np.full((n, n), np.nan + 0j)
-    whole = _Enclosure(values, values, crude, right, inverse, large if np.isfinite(inverse).all() else 0)
-    if not np.isfinite(inverse).all():
-        return whole
+        return worst
+    blocks = [*clusters, np.arange(large, n)] if large < n else clusters
 
-    # The block diagonal form as it came out, and all that it leaves; the rounding of the products is
-    # included.
-    form = np.diag(values).astype(np.complex128)
-    form[large:, large:] = inverse[large:] @ (matrix @ right[:, large:])
-    doubt = np.abs(matrix @ right - right @ form) + error @ np.abs(right)
-    doubt += 4 * (n + 2) * UNIT * (np.abs(matrix) @ np.abs(right) + np.abs(right) @ np.abs(form))
-    weight = np.abs(inverse)
+    # The block diagonal form as it came out, and all that it leaves; the products' roundings are included.
+    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    moved = matrix @ basis
+    product = inverse @ moved
+    form = np.zeros_like(product)
+    for block in blocks:
+        form[np.ix_(block, block)] = product[np.ix_(block, block)]
+    real = np.isrealobj(matrix)
+    if real:  # the large ones are whole conjugate pairs, so what is left is real
+        form[large:, large:] = form[large:, large:].real
+    size, weight = np.abs(basis), np.abs(inverse)
+    doubt = np.abs(moved - basis @ form) + error @ size
+    doubt += charge * (np.abs(matrix) @ size + size @ np.abs(form))
     # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
-    wrong = np.abs(np.eye(n) - inverse @ right) + 4 * n * UNIT * (weight @ np.abs(right))
-    defect = float(wrong.sum(axis=1).max())
+    wrong = (np.abs(np.eye(n) - inverse @ basis) + charge * (weight @ size)).sum(axis=1)
+    defect = float(wrong.max(initial=0.0))
     if not defect < 0.5:
-        return whole
-    rows = (weight @ doubt).sum(axis=1)
-    # A row of (I − F)⁻¹ Z = Z + F (I − F)⁻¹ Z: its own, and F's own row over the largest of (I − F)⁻¹ Z.
-    rows = rows + wrong.sum(axis=1) / (1 - defect) * float(rows.max())
-    centres, radii = values.copy(), rows
-    centres[large:] = 0.0
-    radii[large:] = _resolvent_radius(form[large:, large:], float(np.linalg.norm(rows[large:])))
-    if not np.isfinite(radii).all():
-        return whole
-    sharp = _Enclosure(values, centres, radii, right, inverse, large)
-    return sharp if sharp.width <= whole.width else whole
+        return worst
+    left_over = weight @ doubt * (1 + charge)
+    left_over += wrong[:, None] / (1 - defect) * left_over.max(axis=0, initial=0.0)
+    if not np.isfinite(left_over).all():
+        return worst
+
+    # Σ_b ‖G_cb‖ in the Frobenius norm; relative to the largest entry, so that no square is lost.
+    member = np.zeros((n, len(blocks)))
+    for place, block in enumerate(blocks):
+        member[block, place] = 1.0
+    peak = float(left_over.max(initial=0.0))
+    squares = np.square(left_over / peak) if peak > 0 else left_over
+    sizes = peak * (1 + charge) * (np.sqrt(member.T @ squares @ member) + 1e-150)
+    if large < n:
+        sizes[-1, -1] = norms(left_over[large:, large:])  # often much less: many entries, few in a row
+    totals = sizes.sum(axis=1)
+
+    centres, radii = np.zeros(n, dtype=np.complex128), np.zeros(n)
+    for block, total in zip(blocks, totals, strict=True):
+        own = form[np.ix_(block, block)]
+        if block[0] >= large:
+            radii[block] = pseudospectral_radius(own.real if real else own, float(total))
+        else:
+            centres[block], radii[block] = _block_discs(own, float(total))
+    return _discs(values, centres, radii)
 
 
-def _resolvent_radius(block: Complexes, error: float) -> float:
-    """Return ρ such that no matrix within `error` (in the 2-norm) of the block has an eigenvalue beyond ρ.
-
-    For |λ| > ρ the Neumann series of the resolvent, grouped by K powers, gives
-    ‖(λ − T)⁻¹‖ ≤ Σ_{k<K} ‖T^k‖ ρ^(−k−1) / (1 − ‖T^K‖ ρ^(−K)); while that is less than 1/error, λ is no
-    eigenvalue.
-    """
-    n = len(block)
-    if not n:
-        return 0.0
-    size = float(np.linalg.norm(block))
-    powers, norms, rounding = np.eye(n, dtype=np.complex128), [1.0], 0.0
-    for _ in range(RESOLVENT_POWERS):
-        rounding = rounding * size + 4 * n * UNIT * size * float(np.linalg.norm(powers))
-        powers = powers @ block
-        norms.append(min(float(np.linalg.norm(powers)) + rounding, norms[-1] * size))
-    largest = size + error  # no eigenvalue is larger than the norm
-    if largest == 0.0:
-        return 0.0
-    # The bound falls with ρ: on a grid of eighths of octaves, the smallest ρ that still passes.
-    radii = largest * 2.0 ** (-np.arange(512) / 8)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        terms = np.array(norms)[None, :] / radii[:, None] ** np.arange(RESOLVENT_POWERS + 1)
-        sums = np.cumsum(terms, axis=1)[:, :-1] / radii[:, None]
-        passing = (terms[:, 1:] < 1) & (sums * error < 1 - terms[:, 1:])
-    return float(min(largest, radii[passing.any(axis=1)].min(initial=largest)))
+def _block_discs(block: Matrix, error: float) -> tuple[Complexes, float]:
+    """Return the centres and the radius of discs that hold the eigenvalues of a block known up to `error`."""
+    if len(block) == 1:
+        return block[0].astype(np.complex128), error
+    own = np.linalg.eigvals(block).astype(np.complex128)
+    norm = float(np.linalg.norm(block))
+    rounding = EIGEN_ROUNDINGS * len(block) * UNIT
+    departure = norm**2 - float((np.abs(own) ** 2).sum())
+    departure = np.sqrt(max(departure, 0.0) + 4 * rounding * norm**2)
+    return own, cluster_radius(len(block), float(departure), error + rounding * norm)
 
 
-def _sorted_schur(matrix: Floats, limit: float) -> tuple[Complexes, Complexes, int]:
-    """Return the complex Schur form with the eigenvalues below a limit last, its basis, and how many are not.
-
-    The sort fails when rounding carries an eigenvalue across the limit; then there is no split.
-    """
-    try:
-        triangle, unitary, large = schur(matrix, output="complex", sort=lambda z: abs(z) >= limit)
-    except np.linalg.LinAlgError:
-        triangle, unitary = schur(matrix, output="complex")
-        large = len(matrix)
-    return triangle, unitary, int(large)
+def _close(values: Complexes) -> list[NDArray[np.intp]]:
+    """Return the places of eigenvalues that are nearly equal, chain by chain."""
+    near = np.abs(values[:, None] - values[None, :]) <= CLOSE * np.abs(values)[:, None]
+    label = _connected(near)
+    return [np.flatnonzero(label == one) for one in np.unique(label)]
 
 
-def _triangular_vectors(triangle: Complexes) -> Complexes:
-    """Return the eigenvectors of a triangular matrix as columns, in the order of its diagonal.
-
-    A repeated diagonal entry is moved by a rounding, so that a defective matrix gives vectors that are nearly
-    parallel instead of a division by zero; what that costs shows in the residual.
-    """
-    n = len(triangle)
-    tiny = max(UNIT * float(np.linalg.norm(triangle)), np.finfo(np.float64).tiny)
-    vectors = np.eye(n, dtype=np.complex128)
-    for k in range(n):
-        for i in range(k - 1, -1, -1):
-            gap = triangle[k, k] - triangle[i, i]
-            if abs(gap) < tiny:
-                gap = complex(tiny)
-            vectors[i, k] = triangle[i, i + 1 : k + 1] @ vectors[i + 1 : k + 1, k] / gap
-        vectors[:, k] /= np.linalg.norm(vectors[:, k])
-    return vectors
+def _connected(touching: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return for each place the least place that it hangs together with."""
+    n = len(touching)
+    touching = touching | touching.T
+    label = np.arange(n)
+    while True:
+        spread = np.where(touching, label[None, :], n).min(axis=1, initial=n)
+        if np.array_equal(spread, label):
+            return label
+        label = spread
 
 
-def _clusters(found: _Enclosure) -> tuple[float, float, Floats]:
+def _discs(values: Complexes, centres: Complexes, radii: Floats) -> _Enclosure:
     """Return bounds on the spectral radius and, for each estimate, how far its eigenvalue can be.
 
     k discs that hang together hold k eigenvalues, nobody knows which in which: each estimate is then off by
     at most the distance to the far side of any of them.
     """
-    centres, radii = found.centres, found.radii
-    n = len(centres)
-    touching = np.abs(centres[:, None] - centres[None, :]) <= radii[:, None] + radii[None, :]
-    cluster = np.arange(n)
-    for _ in range(n):
-        spread = np.array([cluster[touching[i]].min() for i in range(n)])
-        if np.array_equal(spread, cluster):
-            break
-        cluster = spread
-    reach = np.abs(found.values[:, None] - centres[None, :]) + radii[None, :]
-    errors = np.where(cluster[:, None] == cluster[None, :], reach, 0.0).max(axis=1)
+    label = _connected(np.abs(centres[:, None] - centres[None, :]) <= radii[:, None] + radii[None, :])
+    reach = np.abs(values[:, None] - centres[None, :]) + radii[None, :]
+    errors = np.where(label[:, None] == label[None, :], reach, 0.0).max(axis=1)
     inner = np.abs(centres) - radii
-    low = max(0.0, *(float(inner[cluster == one].min()) for one in np.unique(cluster)))
-    return low, float((np.abs(centres) + radii).max()), errors
-
-
-def _plain_vectors(matrix: Floats, found: _Enclosure, values: Complexes) -> tuple[Complexes, Complexes]:
-    """Return right vectors (columns) and left vectors (rows) in the order of the values.
-
-    The large ones are columns of X and rows of its inverse. Of a small or defective one the vectors are
-    singular vectors of M − λ: some vector that is right to rounding, where no full set exists; in a large
-    matrix vectors of the Schur form, which are as good as the eigenvalue is apart from others.
-    """
-    n = len(matrix)
-    right, left = found.right.copy(), found.inverse.copy()
-    if n > MOST_SINGULAR:
-        # Their part of the Schur form, still triangular; a vector's own size serves for its left one.
-        block = np.triu(found.inverse[found.large :] @ matrix @ found.right[:, found.large :])
-        right[:, found.large :] = found.right[:, found.large :] @ _triangular_vectors(block)
-        left[found.large :] = right[:, found.large :].conj().T
-        return right, left
-    for i in range(found.large, n):
-        rows, _, columns = np.linalg.svd(matrix - values[i] * np.eye(n))
-        right[:, i], left[i] = columns[-1].conj(), rows[:, -1].conj()
-    return right, left
+    low = max(0.0, *(float(inner[label == one].min()) for one in np.unique(label)))
+    return _Enclosure(low, float((np.abs(centres) + radii).max()), errors)
