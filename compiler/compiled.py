@@ -227,7 +227,9 @@ class CompiledSystem:
         """Return what the model holds, a line a kind of peer."""
         lines = [f"{self.name}: {self.about}" if self.about else self.name]
         for index, kind in enumerate(self.kinds):
-            groups = ", ".join(f"{group.count} × {group.name}" for group in self.groups if group.kind == index)
+            groups = ", ".join(
+                f"{group.count} × {group.name}" for group in self.groups if group.kind == index
+            )
             states = ", ".join(state.name for state in kind.states)
             lines.append(f"  {groups}: {len(kind.states)} states ({states})")
         return "\n".join(lines)

@@ -37,10 +37,13 @@ from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.expression import (
     FUNCTIONS,
     KEYWORDS,
+    Call,
     Compare,
     Equation,
     Expr,
     Name,
+    format_expression,
+    names,
     parse_equation,
     parse_expression,
     transform,
@@ -351,6 +354,7 @@ class _Names:
             left, right = self._decided(equation.left), self._decided(equation.right)
             for side in (left, right):
                 unknown |= self._check_names(side, equation.text, equation.place, mistakes)
+                unknown |= self._check_reductions(side, equation.text, equation.place, mistakes)
             if not unknown:
                 try:
                     check_equation(
@@ -359,6 +363,24 @@ class _Names:
                     )
                 except ApcError as error:
                     mistakes.take(error)
+
+    def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
+        """Record a reduction that doesn't run over the other peers."""
+        wrong = False
+        for node in walk(expression):
+            if not isinstance(node, Call) or any(name.parts[0] == OTHERS for name in names(node)):
+                continue
+            if node.function in ("mean", "sum", "count"):
+                what, expected = f"{node.function} runs over the other peers and", "others.x in it"
+            elif node.function in ("max", "min") and len(node.arguments) == 1:
+                what, expected = node.function, "two values, or one of the other peers"
+            else:
+                continue
+            wrong = True
+            hint = "count(others)" if node.function == "count" else f"{node.function}(others.x)"
+            where, got = place_in(place, text, node.start), format_expression(node)
+            mistakes.add("E506", where, what, expected=expected, got=got, hint=hint)
+        return wrong
 
     def _decided(self, expression: Expr) -> Expr:
         """Return the expression with each test of an option replaced by a true statement.

@@ -8,7 +8,8 @@ Does not: put a number in the place of a parameter, or look at clocks beyond nam
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -320,10 +321,16 @@ def _connections(parts: list[Part], mistakes: Mistakes) -> Iterator[FlatEquation
         if grounded:
             continue
         for variable in type_.flows:
-            total: Expr = _whole_name(joined[0], variable.name)
-            for node in joined[1:]:
-                total = Binary("+", total, _whole_name(node, variable.name))
+            total = _sum([_whole_name(node, variable.name) for node in joined])
             yield FlatEquation(total, Number(Fraction(0)), "connection", None, place)
+
+
+def _sum(terms: Sequence[Expr]) -> Expr:
+    """Return a sum as a tree of little depth, so that a thousand parts may meet at one flange."""
+    if len(terms) <= 3:
+        return functools.reduce(lambda total, term: Binary("+", total, term), terms)
+    half = len(terms) // 2
+    return Binary("+", _sum(terms[:half]), _sum(terms[half:]))
 
 
 def _whole_name(node: Node, variable: str) -> Name:

@@ -167,7 +167,7 @@ class _ArcReader:
             ):
                 return self.starts[found["group"]] + int(found["number"]) - 1
         first = next(iter(self.counts), "user")
-        expected = f"a number from 1 to {self.peers}, or a name in quotes such as \"{first}[1]\""
+        expected = f'a number from 1 to {self.peers}, or a name in quotes such as "{first}[1]"'
         self.mistakes.add("E213", node.place, "a peer", expected=expected, got=form(node))
         return None
 
@@ -199,7 +199,7 @@ class _ArcReader:
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
             place = table.columns[0].place
-            where = type(place)(place.file, row + 2, 1)
+            where = type(place)(place.file, table.lines[row], 1)
             expected = f"two different peers from 1 to {self.peers}, and a weight that isn't 0"
             self.mistakes.add("E213", where, f"a pair of {what}", expected=expected)
             return []

@@ -129,7 +129,7 @@ def read_settings(
     settable: Mapping[str, list[tuple[str, Settable]]],
     clocks: Collection[str],
     read_number: Callable[[Node, str, Settable], Value | None],
-    reported: Callable[[str], bool],
+    explained: Callable[[str, Place], bool],
     mistakes: Mistakes,
 ) -> Settings:
     """Read what a group sets.
@@ -144,8 +144,8 @@ def read_settings(
         The clocks of the scene.
     read_number
         Reads a value for what is set.
-    reported
-        Whether a name that can't be set is of a part whose own fault was reported.
+    explained
+        Says of a name that can't be set, and its place, whether a better message than ours was given.
     mistakes
         Where faults go.
     """
@@ -155,7 +155,7 @@ def read_settings(
     section = read_mapping(group.body.get("set"), "set", mistakes, hint="set: {device.mass: 0.2 kg}")
     for key, node in entries(section):
         items = settable.get(key.text)
-        if items is None and reported(key.text):
+        if items is None and explained(key.text, key.place):
             continue
         if items is None:
             what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
@@ -173,11 +173,11 @@ def read_settings(
             elif (value := read_number(node, key.text, item)) is not None:
                 values.append((whole, value))
     for column_ in group.table.columns if group.table is not None else ():
-        for whole, item in _items_of(column_, settable, reported, mistakes):
+        for whole, item in _items_of(column_, settable, explained, mistakes):
             if whole in columns or whole in dict(values):
                 mistakes.add("E702", column_.place, f"{whole} is given by set and by the table")
             columns[whole] = column_.numbers
-            _check_column(column_, item, mistakes)
+            _check_column(column_, group.table.lines if group.table is not None else (), item, mistakes)
     return Settings(tuple(values), tuple(words), tuple(columns.items()))
 
 
@@ -214,19 +214,21 @@ def _listed(
 def _items_of(
     column: Column,
     settable: Mapping[str, list[tuple[str, Settable]]],
-    reported: Callable[[str], bool],
+    explained: Callable[[str, Place], bool],
     mistakes: Mistakes,
 ) -> list[tuple[str, Number | Variable]]:
     items = settable.get(column.name)
     numbers = [(whole, i) for whole, i in items or () if isinstance(i, Number | Variable)]
-    if not numbers and not reported(column.name):
+    if not numbers and not explained(column.name, column.place):
         known = [name for name, found in settable.items() if isinstance(found[0][1], Number | Variable)]
         what = f"a heading names {brief(column.name)}, which is no number of a part"
         add_unknown("E702", column.place, what, column.name, known, mistakes)
     return numbers
 
 
-def _check_column(column: Column, item: Number | Variable, mistakes: Mistakes) -> None:
+def _check_column(
+    column: Column, lines: tuple[int, ...], item: Number | Variable, mistakes: Mistakes
+) -> None:
     """Check a column's unit, and each of its numbers against the parameter's bounds."""
     if column.unit.dimension != item.unit.dimension:
         expected = format_dimension(item.unit.dimension)
@@ -245,6 +247,6 @@ def _check_column(column: Column, item: Number | Variable, mistakes: Mistakes) -
     outside = (numbers < low) | (numbers > high) | (bounds.open_minimum & (numbers == low))
     for row in np.flatnonzero(outside)[:5]:
         number = Fraction(float(numbers[row]))
-        place = Place(column.place.file, int(row) + 2, column.place.column)
+        place = Place(column.place.file, lines[int(row)], 1)
         got = f"{float(number / bounds.scale):.12g} {bounds.unit}"
         mistakes.add("E207", place, column.name, expected=bounds.fault(number), got=got)

@@ -445,6 +445,21 @@ class _Reader:
         part = re.split(r"[.\[]", name)[0]
         return part in self.faulty or (not self.complete and part not in self.bodies)
 
+    def _is_of_link(self, name: str) -> bool:
+        body = self.bodies.get(name.partition(".")[0])
+        return body is not None and body.section == "links"
+
+    def _is_explained(self, name: str, place: Place) -> bool:
+        """Return whether it was said why a group can't set `part.parameter`; of a link's, say it here."""
+        if not self._is_of_link(name):
+            return self._is_reported(name)
+        link, _, parameter = name.partition(".")
+        sender, receiver = next(iter(self.groups)), list(self.groups)[-1]
+        hint = f"{link}: {{delays: {{{sender}: {{{receiver}: 12 ms}}}}}}" if parameter == "delay" else ""
+        what = f"{name} is of a link, the same for all peers: a group can't set it"
+        self.mistakes.add("E211", place, what, hint=hint)
+        return True
+
     def _scope(self, root: Mapping) -> Scope:
         links = [name for name, body in self.bodies.items() if body.section == "links"]
 
@@ -689,14 +704,17 @@ class _Reader:
                 self.mistakes.add("E207", value.place, "a delay", expected="0 s or more", got=str(value))
             elif value is not None:
                 delays.append(PairDelay(sender, receiver, value))
-        if clock is None or "delay" not in values:
+        if "clock" not in roles or part.component.parameter("delay") is None:
+            what = f"{part.name} is a {part.component.name}, which is no link: it has no clock and delay"
+            self.mistakes.add("E210", part.place, what, hint="type: Link")
             return None
+        if clock is None or "delay" not in values:
+            return None  # reported where it is
         return SceneLink(part.name, clock, values["delay"], graph, tuple(delays), part.place)
 
     def _group(self, group: GroupBody, settable: dict[str, list[tuple[str, Settable]]]) -> PeerGroup:
-        settings = read_settings(
-            group, settable, self.clocks, self._binding_of, self._is_reported, self.mistakes
-        )
+        own = {name: items for name, items in settable.items() if not self._is_of_link(name)}
+        settings = read_settings(group, own, self.clocks, self._binding_of, self._is_explained, self.mistakes)
         return PeerGroup(
             group.name, group.count, settings.values, settings.words, settings.columns, group.body.place
         )

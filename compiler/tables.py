@@ -38,10 +38,11 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A CSV file, whole. `digest` is the SHA-256 of its bytes."""
+    """A CSV file, whole. `lines` are the lines its rows stand in, `digest` the SHA-256 of its bytes."""
 
     file: str
     columns: tuple[Column, ...]
+    lines: tuple[int, ...]
     digest: str
 
     @property
@@ -83,7 +84,7 @@ def read_table(path: Path, named_at: Place) -> Table:
             )
         names = [_heading(heading, file, headings[:i], mistakes) for i, heading in enumerate(headings)]
         mistakes.raise_if_any()
-        rows = _rows(reader, len(headings), file, mistakes)
+        rows, lines = _rows(reader, len(headings), file, mistakes)
     except csv.Error as error:
         raise ApcError(Mistake("E703", Place(file, reader.line_num or 1, 1), f"is no CSV: {error}")) from None
     mistakes.raise_if_any()
@@ -94,7 +95,7 @@ def read_table(path: Path, named_at: Place) -> Table:
         Column(name, unit, numbers[:, i] * float(unit.scale), place)
         for i, (name, unit, place) in enumerate(names)
     )
-    return Table(file, columns, hashlib.sha256(data).hexdigest())
+    return Table(file, columns, tuple(lines), hashlib.sha256(data).hexdigest())
 
 
 def _bytes(path: Path, named_at: Place) -> bytes:
@@ -137,8 +138,9 @@ def _heading(text: str, file: str, before: list[str], mistakes: Mistakes) -> tup
     return name, unit, place
 
 
-def _rows(reader: object, width: int, file: str, mistakes: Mistakes) -> list[list[float]]:
+def _rows(reader: object, width: int, file: str, mistakes: Mistakes) -> tuple[list[list[float]], list[int]]:
     rows: list[list[float]] = []
+    lines: list[int] = []
     found = 0
     for cells in reader:  # type: ignore[attr-defined] # csv's reader type has no public name
         if not cells or not any(cell.strip() for cell in cells):
@@ -153,6 +155,7 @@ def _rows(reader: object, width: int, file: str, mistakes: Mistakes) -> list[lis
                 row = [float(cell) for cell in cells]
                 if all(map(math.isfinite, row)):
                     rows.append(row)
+                    lines.append(line)
                     continue
             except ValueError:
                 pass
@@ -160,7 +163,7 @@ def _rows(reader: object, width: int, file: str, mistakes: Mistakes) -> list[lis
             found += 1
         if found >= MOST_MISTAKES:
             break
-    return rows
+    return rows, lines
 
 
 def _add_bad_cells(cells: list[str], file: str, line: int, mistakes: Mistakes) -> None:

@@ -41,6 +41,10 @@ LOGARITHMS = 1e-5
 SWEEPS = 12
 
 
+# A norm below it can't be scaled to 1 within the range of floats.
+SMALLEST = 2.0**-1000
+
+
 def norms(stack: Matrix) -> Floats:
     """Return upper bounds on the 2-norms of matrices (…, n, m): the least of Frobenius and √(‖·‖₁‖·‖∞)."""
     size = np.abs(stack)
@@ -155,7 +159,7 @@ def _powers(matrix: Matrix) -> tuple[Floats, Floats]:
         shift = 0.0  # the power is 2^shift times what is kept of it, near 1 so that nothing is lost
         for _ in range(SQUARINGS):
             power_size = float(norms(power))
-            if not 0 < power_size < np.inf:
+            if not SMALLEST < power_size < np.inf:  # nothing of it is left to square
                 break
             step = -float(np.round(np.log2(power_size)))
             power, power_size, power_off = power * 2.0**step, power_size * 2.0**step, power_off * 2.0**step

@@ -33,8 +33,9 @@ ORDER = (
     *("apc.runtime.threads", "apc.runtime.exact", "apc.runtime.parameters", "apc.runtime.discretize"),
     *("apc.runtime.exchange", "apc.runtime.linearize", "apc.runtime.schedule", "apc.runtime.lift"),
     # all peers, and what their motion tells
-    *("apc.runtime.peers", "apc.runtime.modes", "apc.runtime.rigid", "apc.runtime.spectrum"),
-    *("apc.runtime.selfcheck", "apc.runtime.analysis", "apc.runtime.needs", "apc.runtime.report"),
+    *("apc.runtime.peers", "apc.runtime.modes", "apc.runtime.rigid", "apc.runtime.pseudospectrum"),
+    *("apc.runtime.spectrum", "apc.runtime.selfcheck", "apc.runtime.analysis", "apc.runtime.needs"),
+    "apc.runtime.report",
     # what a person calls
     *("apc.inputs", "apc.contents", "apc.api", "apc.cli", "apc.__main__"),
 )

@@ -265,6 +265,28 @@ def test_a_mistake_is_told_once_at_its_place(old: str, new: str, message: str) -
     assert line.startswith(message)
 
 
+def test_what_is_set_of_a_part_that_cannot_be_read_is_no_second_mistake() -> None:
+    lines = messages(
+        ("{count: 3}", "{count: 3, set: {device.mass: 1 kg}}"), ("0.1 kg,", "0.1 kg, type: Mas,")
+    )
+    assert lines == ["9:32: E206 there is no component Mas; the nearest is Mass. Write: Mass"]
+
+
+def test_a_group_cannot_set_what_is_of_a_link() -> None:
+    groups = "  left: {count: 1, set: {lan.delay: 2 ms}}\n  right: {count: 2, set: {lan.clock: haptic}}"
+    assert messages(("  user: {count: 3}", groups)) == [
+        "7:26: E211 lan.delay is of a link, the same for all peers: a group can't set it. "
+        "Write: lan: {delays: {left: {right: 12 ms}}}",
+        "8:27: E211 lan.clock is of a link, the same for all peers: a group can't set it.",
+    ]
+    delays = ("delay: 8 ms}", "delay: 8 ms, delays: {left: {right: 12 ms}}}")
+    (link,) = scene(
+        replaced(AVERAGE, ("  user: {count: 3}", "  left: {count: 1}\n  right: {count: 2}"), delays)
+    ).links
+    ((sender, receiver, delay),) = [(d.sender, d.receiver, d.delay.number) for d in link.delays]
+    assert (sender, receiver, delay) == ("left", "right", Fraction(12, 1000))
+
+
 def test_at_names_groups() -> None:
     assert messages(("a: device,", "a: device, at: [usr],")) == [
         "12:61: E206 contact is at usr, which is no group of peers; the nearest is user. Write: user"
