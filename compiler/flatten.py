@@ -327,7 +327,7 @@ def _connections(parts: list[Part], mistakes: Mistakes) -> Iterator[FlatEquation
 
 def _sum(terms: Sequence[Expr]) -> Expr:
     """Return a sum as a tree of little depth, so that a thousand parts may meet at one flange."""
-    if len(terms) <= 3:
+    if len(terms) <= 16:  # few read best as they are written, one after the other
         return functools.reduce(lambda total, term: Binary("+", total, term), terms)
     half = len(terms) // 2
     return Binary("+", _sum(terms[:half]), _sum(terms[half:]))

@@ -103,7 +103,8 @@ def test_a_linear_loop_is_solved(tmp_path: Path) -> None:
 def test_an_equation_too_many_here_and_one_too_few_there_names_both(tmp_path: Path) -> None:
     assert told_of(tmp_path, "p = 1*k*flange.x", "p = k*flange.x") == [
         "part0.yaml:7:5: E502 the continuous equations can't be solved: 3 equations hold only 2 unknowns "
-        "(device.x, hand.p): `device.mass*der(device.v) = device.flange.f - device.damping*device.v` (device), "
+        "(device.x, hand.p): "
+        "`device.mass*der(device.v) = device.flange.f - device.damping*device.v` (device), "
         "`hand.p = 1*hand.k*hand.flange.x` (hand), `hand.p = hand.k*hand.flange.x` (hand); "
         "and 1 unknown (hand.q) has no equation."
     ]

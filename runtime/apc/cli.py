@@ -148,8 +148,8 @@ def _compile(path: Path, target: Path, *, timings: bool) -> None:
     """Compile, check, save and report; with `timings`, how long each of it took."""
     from apc.compiler.pipeline import each_stage
     from apc.compiler.store import save
-    from apc.runtime.report import compile_report, timings_report
     from apc.runtime.needs import needs
+    from apc.runtime.report import compile_report, timings_report
     from apc.runtime.selfcheck import check_frame
 
     taken: list[tuple[str, float]] = []
