@@ -30,9 +30,10 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.component import OTHERS
 from apc.compiler.exchange import Timings, all_parameters, compiled_groups, used_clocks, used_links
-from apc.compiler.scene import Scene, TimeTable
+from apc.compiler.scene import Scene
 from apc.compiler.structure import SortedKind, SortedSystem
 from apc.compiler.symbolic import derivative_symbol, no_derivative, symbol, to_sympy
+from apc.compiler.tables import TimeTable
 from apc.compiler.units import format_dimension
 
 Definition: TypeAlias = sympy.Expr | ImplicitBlock

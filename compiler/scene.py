@@ -15,9 +15,6 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from apc.compiler.compiled import Graph
 from apc.compiler.component import Component, Number, Option, Reference, Settable
 from apc.compiler.definitions import RESERVED, read_type
@@ -38,7 +35,8 @@ from apc.compiler.reading import (
     read_text,
 )
 from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source
-from apc.compiler.tables import read_table
+from apc.compiler.studies import Axis, Experiment, read_experiment, read_region
+from apc.compiler.tables import TimeTable, read_time_table
 from apc.compiler.units import DIMENSIONLESS, Dimension
 from apc.compiler.values import (
     PEERS,
@@ -82,15 +80,6 @@ class SceneClock:
     name: str
     period: Value
     phase: Value
-
-
-@dataclass(frozen=True, slots=True)
-class TimeTable:
-    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI."""
-
-    name: str
-    times: NDArray[np.float64]
-    numbers: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,15 +140,6 @@ class PeerGroup:
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
-    """A range of a parameter, in SI, for a study."""
-
-    parameter: str
-    low: Fraction
-    high: Fraction
-
-
-@dataclass(frozen=True, slots=True)
 class Scene:
     """A topology, whole. `texts` are the digests of the files it names."""
 
@@ -170,8 +150,7 @@ class Scene:
     groups: tuple[PeerGroup, ...]
     parts: tuple[Part, ...]
     links: tuple[SceneLink, ...]
-    duration: Fraction | None
-    seed: int
+    experiment: Experiment
     region: tuple[Axis, ...]
     texts: tuple[tuple[str, str], ...]
     place: Place
@@ -273,8 +252,9 @@ class _Reader:
         links = tuple(self._link(part) for part in parts if part.section == "links" and "." not in part.name)
         settable = _settable(parts)
         groups = tuple(self._group(group, settable) for group in self.groups.values())
-        duration, seed = self._read_experiment(root.get("experiment"))
-        region = self._read_studies(root.get("studies"), settable)
+        experiment = read_experiment(root.get("experiment"), self._time, mistakes)
+        studies = root.get("studies")
+        region = read_region(studies, settable, self._is_reported, self._binding_of, mistakes)
         return Scene(
             title,
             about,
@@ -283,8 +263,7 @@ class _Reader:
             groups,
             tuple(part for part in parts if part.section != "links"),
             tuple(link for link in links if link is not None),
-            duration,
-            seed,
+            experiment,
             region,
             tuple(sorted(self.texts.items())),
             root.place,
@@ -621,36 +600,15 @@ class _Reader:
                 hint = f"{parameter.name}: force.csv"
                 self.mistakes.add("E201", entry.place, f"{name} has no {parameter.name}", hint=hint)
             elif text is not None:
-                table = self._time_table(parameter, node, text)
-                if table is not None:
-                    found.append(table)
+                assert parameter.unit is not None
+                try:
+                    table = read_time_table(self.folder / text, parameter.name, parameter.unit, node.place)
+                except ApcError as error:
+                    self.mistakes.take(error)
+                    continue
+                self.texts[text] = table.digest
+                found.append(table)
         return tuple(found)
-
-    def _time_table(self, parameter: Reference, node: Node, text: str) -> TimeTable | None:
-        try:
-            table = read_table(self.folder / text, node.place)
-        except ApcError as error:
-            self.mistakes.take(error)
-            return None
-        self.texts[text] = table.digest
-        unit = parameter.unit
-        assert unit is not None
-        if len(table.columns) != 2 or table.columns[0].unit.dimension != SECOND:
-            what = "a table over time"
-            expected = f"two columns, time [s] and {parameter.name} [{unit.text}]"
-            self.mistakes.add("E702", table.columns[0].place, what, expected=expected)
-            return None
-        times, numbers = table.columns
-        if numbers.unit.dimension != unit.dimension:
-            got = numbers.unit.text
-            self.mistakes.add("E702", numbers.place, numbers.name, expected=unit.text, got=got)
-            return None
-        if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
-            self.mistakes.add(
-                "E703", times.place, "a table over time", expected="two or more rows of rising time"
-            )
-            return None
-        return TimeTable(parameter.name, times.numbers, numbers.numbers)
 
     def _shared(self, name: str, component: Component, node: Node | None) -> bool:
         if node is None:
@@ -732,72 +690,6 @@ class _Reader:
         if value is not None and isinstance(item, Number):
             item.bounds.check(value, what, self.mistakes)
         return value
-
-    def _read_experiment(self, node: Node | None) -> tuple[Fraction | None, int]:
-        section = read_mapping(node, "experiment", self.mistakes, hint="experiment: {duration: 3 s}")
-        if section is None:
-            return None, 0
-        section = check_keys(section, ("duration", "seed"), "experiment", self.mistakes)
-        duration = self._time(section.get("duration"), "duration")
-        if duration is not None and duration.number <= 0:
-            got = str(duration)
-            self.mistakes.add("E207", duration.place, "duration", expected="more than 0 s", got=got)
-        seed = section.get("seed")
-        number = 0
-        if isinstance(seed, Scalar) and isinstance(seed.value, int) and 0 <= seed.value < 2**63:
-            number = int(seed.value)
-        elif seed is not None:
-            self.mistakes.add(
-                "E203", seed.place, "seed", expected="a whole number, 0 or more", got=form(seed)
-            )
-        return (duration.number if duration is not None else None), number
-
-    def _read_studies(
-        self, node: Node | None, settable: dict[str, list[tuple[str, Settable]]]
-    ) -> tuple[Axis, ...]:
-        section = read_mapping(node, "studies", self.mistakes, hint="studies: {region: {x: …, y: …}}")
-        if section is None:
-            return ()
-        section = check_keys(section, ("region",), "studies", self.mistakes)
-        region = read_mapping(section.get("region"), "region", self.mistakes, hint="region: {x: …, y: …}")
-        if region is None:
-            return ()
-        region = check_keys(region, ("x", "y"), "region", self.mistakes)
-        axes = (self._axis(key, region.get(key), settable) for key in ("x", "y"))
-        return tuple(axis for axis in axes if axis is not None)
-
-    def _axis(
-        self, key: str, node: Node | None, settable: dict[str, list[tuple[str, Settable]]]
-    ) -> Axis | None:
-        hint = f"{key}: {{contact.stiffness: [0 N/m, 5000 N/m]}}"
-        body = read_mapping(node, key, self.mistakes, hint=hint)
-        if body is None:
-            return None
-        if len(body.entries) != 1:
-            self.mistakes.add("E203", body.place, key, expected="one parameter and its range", hint=hint)
-            return None
-        name, span = body.entries[0]
-        if not (isinstance(span, Sequence) and len(span.items) == 2):
-            got = form(span)
-            self.mistakes.add(
-                "E203", span.place, name.text, expected="a list of two values", got=got, hint=hint
-            )
-            return None
-        items = settable.get(name.text)
-        if not items or not isinstance(items[0][1], Number):
-            if not self._is_reported(name.text):
-                what = f"{key} names {brief(name.text)}, which is no parameter of a part"
-                known = [known for known, found in settable.items() if isinstance(found[0][1], Number)]
-                add_unknown("E206", name.place, what, name.text, known, self.mistakes)
-            return None
-        low, high = (self._binding_of(item, name.text, items[0][1]) for item in span.items)
-        if low is None or high is None:
-            return None
-        if low.number >= high.number:
-            what, got = f"the range of {name.text}", f"{low} to {high}"
-            self.mistakes.add("E207", span.place, what, expected="its lower end first", got=got)
-            return None
-        return Axis(name.text, low.number, high.number)
 
 
 def _settable(parts: Collection[Part]) -> dict[str, list[tuple[str, Settable]]]:

@@ -1,6 +1,6 @@
 """Tables in CSV files: columns with their units in the headings.
 
-Takes: a path. Gives: `Table`, in SI.
+Takes: a path. Gives: `Table` and `TimeTable`, in SI.
 Guarantees: every cell is a finite number, or a mistake names its file, line and column.
 Does not: know what a column means.
 """
@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.dimensions import SECOND
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.reading import brief
 from apc.compiler.units import NO_UNIT, Unit, parse_unit
@@ -49,6 +50,50 @@ class Table:
     def rows(self) -> int:
         """The number of rows below the headings."""
         return len(self.columns[0].numbers) if self.columns else 0
+
+
+@dataclass(frozen=True, slots=True)
+class TimeTable:
+    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI.
+
+    `digest` is the SHA-256 of the file's bytes.
+    """
+
+    name: str
+    times: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+    digest: str
+
+
+def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeTable:
+    """Read a quantity over time: two columns, time and the quantity, and two or more rows of rising time.
+
+    Parameters
+    ----------
+    path
+        The CSV file.
+    name, unit
+        What the quantity is called, and a unit of its dimension.
+    named_at
+        Where the topology names the file.
+
+    Raises
+    ------
+    ApcError
+        As `read_table`, and when the columns or times are not as they must be.
+    """
+    table = read_table(path, named_at)
+    first = table.columns[0]
+    if len(table.columns) != 2 or first.unit.dimension != SECOND:
+        expected = f"two columns, time [s] and {name} [{unit.text}]"
+        raise ApcError(Mistake("E702", first.place, "a table over time", expected))
+    times, numbers = table.columns
+    if numbers.unit.dimension != unit.dimension:
+        raise ApcError(Mistake("E702", numbers.place, numbers.name, unit.text, numbers.unit.text))
+    if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
+        expected = "two or more rows of rising time"
+        raise ApcError(Mistake("E703", times.place, "a table over time", expected))
+    return TimeTable(name, times.numbers, numbers.numbers, table.digest)
 
 
 def read_table(path: Path, named_at: Place) -> Table:

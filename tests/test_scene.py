@@ -7,6 +7,7 @@ from fractions import Fraction
 import pytest
 
 from apc.compiler.groups import LARGEST_COUNT
+from apc.compiler.studies import Experiment
 from tests.topologies import AVERAGE, MESH, ONE_MASS, replaced, scene, told
 
 GROUPS = replaced(
@@ -114,8 +115,8 @@ def test_start_values_stand_with_their_part() -> None:
 
 def test_an_experiment_has_a_duration_and_a_seed() -> None:
     found = scene(ONE_MASS + "experiment: {duration: 3 s, seed: 7}\n")
-    assert (found.duration, found.seed) == (3, 7)
-    assert (scene(ONE_MASS).duration, scene(ONE_MASS).seed) == (None, 0)
+    assert (found.experiment.duration, found.experiment.seed) == (3, 7)
+    assert scene(ONE_MASS).experiment == Experiment(None, 0)
 
 
 def test_all_mistakes_of_a_file_come_together_in_its_order() -> None:

@@ -64,7 +64,7 @@ def test_the_experiment_settles_for_the_average_and_shakes_for_the_mesh(name: st
 
 def test_the_experiment_starts_without_contact_and_with_balanced_hands() -> None:
     scene = scene_of("experiment-average")
-    assert scene.duration == 3
+    assert scene.experiment.duration == 3
     values = [
         (group.count, {name: float(value.number) for name, value in group.values}) for group in scene.groups
     ]
