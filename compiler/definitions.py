@@ -595,7 +595,7 @@ def _option(name: str, body: Mapping, mistakes: Mistakes) -> Option | None:
     body = check_keys(body, ("options", "default", "about"), f"parameter {name}", mistakes)
     options = body.get("options")
     assert isinstance(options, Sequence)
-    words = tuple(item.text for item in options.items if isinstance(item, Scalar))
+    words = tuple(text for item in options.items if (text := read_text(item, "an option", mistakes)))
     default = read_text(body.get("default"), "default", mistakes)
     node = body.get("default")
     if default is not None and node is not None and default not in words:
@@ -606,7 +606,7 @@ def _option(name: str, body: Mapping, mistakes: Mistakes) -> Option | None:
 
 
 def _table(name: str, body: Mapping, mistakes: Mistakes) -> Reference | None:
-    """Read `{table: N}`: a file of numbers over time, in newtons."""
+    """Read `{table: N}`: a file of numbers over time, in a unit of the same dimension."""
     body = check_keys(body, ("table", "about"), f"parameter {name}", mistakes)
     node = body.get("table")
     text = read_text(node, "table", mistakes, hint="table: N")

@@ -165,7 +165,7 @@ class _KindBuilder:
         reached = self.reached
         holds = [hold for s, hold in self.known_holds.items() if s in reached]
         self.dropped += [
-            (hold.variable, "nobody reads this force")
+            (hold.variable, "nobody reads this held value")
             for s, hold in self.known_holds.items()
             if s not in reached
         ]

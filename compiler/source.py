@@ -57,10 +57,6 @@ class Mapping:
         """Return the node of a key, or None when the key is not there."""
         return next((node for scalar, node in self.entries if scalar.text == key), None)
 
-    def key_place(self, key: str) -> Place:
-        """Return where a key stands; the mapping's own place when it is not there."""
-        return next((scalar.place for scalar, _ in self.entries if scalar.text == key), self.place)
-
     def keys(self) -> tuple[str, ...]:
         """Return the keys in the order of the text."""
         return tuple(scalar.text for scalar, _ in self.entries)

@@ -36,7 +36,6 @@ SMOOTH: dict[str, Callable[[sympy.Expr], sympy.Expr]] = {
     "cos": sympy.cos,
     "tanh": sympy.tanh,
 }
-OPAQUE = ("min", "max", "abs", "sign", "floor")
 COMPARISONS = {
     "<": "less",
     "<=": "less_or_equal",

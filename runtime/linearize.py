@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import PEERS, ClockPartition, Kind, Receive
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.exact import evaluate_exact
 
 Matrix = NDArray[Any]
@@ -118,8 +119,28 @@ class SiteJacobians:
         return bool(self.function.is_a("SXFunction"))
 
 
+def _refuse_loop_with_edges(kind: Kind) -> None:
+    """Refuse what neither the scalar walk nor the implicit function theorem covers yet."""
+    functions = [kind.derivative, *(one.tick for one in kind.clocks), *(one.send for one in kind.sends)]
+    receives = [receive for partition in kind.clocks for receive in partition.receives]
+    edges = [receive.edge for receive in receives if receive.edge is not None]
+    if edges and not all(function.is_a("SXFunction") for function in (*functions, *edges)):
+        what = (
+            "has a nonlinear loop and a reduction that looks at each sender by itself; "
+            "together they can't be linearized"
+        )
+        raise ApcError(Mistake("E807", Place(kind.name), what))
+
+
 def jacobians(kind: Kind) -> SiteJacobians:
-    """Build a kind's Jacobian functions; do it once and keep the result, `linearize` is then cheap."""
+    """Build a kind's Jacobian functions; do it once and keep the result, `linearize` is then cheap.
+
+    Raises
+    ------
+    ApcError
+        E807 a nonlinear loop in a kind that also looks at each sender by itself.
+    """
+    _refuse_loop_with_edges(kind)
     # A kind with a nonlinear loop has MX functions; their Jacobians come by the implicit function theorem.
     plain = kind.derivative.is_a("SXFunction")
     symbol: Any = casadi.SX.sym if plain else casadi.MX.sym

@@ -87,7 +87,7 @@ def parse_override(system: CompiledSystem, text: str, place: Place = _PLACE) -> 
     Raises
     ------
     ApcError
-        E501 not of that form, E502 no such parameter, E503 the number of peers is not a parameter to set;
+        E621 not of that form, E622 no such parameter, E623 the number of peers is not a parameter to set;
         and those of `units.quantity`: the unit has to fit.
     """
     # Imported here: reading a unit brings in pint, which an analysis without overrides never needs.
@@ -97,7 +97,7 @@ def parse_override(system: CompiledSystem, text: str, place: Place = _PLACE) -> 
     name, value = name.strip(), value.strip()
     if not (equals and name and value):
         form = "contact.stiffness=800 N/m"
-        raise ApcError(Mistake("E501", place, "an override", "NAME=VALUE", text[:80], form))
+        raise ApcError(Mistake("E621", place, "an override", "NAME=VALUE", text[:80], form))
     known, group = find(system, name, place)
     unit = _unit_of(system, known)
     found = quantity(
@@ -112,7 +112,7 @@ def find(system: CompiledSystem, name: str, place: Place = _PLACE) -> tuple[str,
     Raises
     ------
     ApcError
-        E502 no such parameter, E503 the number of peers.
+        E622 no such parameter, E623 the number of peers.
     """
     known = {parameter.name for parameter in system.parameters} | {timing.name for timing in system.timings}
     groups = {group.name for group in system.groups}
@@ -125,11 +125,11 @@ def find(system: CompiledSystem, name: str, place: Place = _PLACE) -> tuple[str,
         name, group = rest, first
     if name == PEERS:
         raise ApcError(
-            Mistake("E503", place, "peers is the number of peers: change a count and compile again")
+            Mistake("E623", place, "peers is the number of peers: change a count and compile again")
         )
     if name not in known:
         near = nearest(name, sorted(known - {PEERS}))
-        raise ApcError(Mistake("E502", place, f"{name[:80]} is no parameter of {system.name}", hint=near))
+        raise ApcError(Mistake("E622", place, f"{name[:80]} is no parameter of {system.name}", hint=near))
     return name, group
 
 
@@ -139,7 +139,7 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     Raises
     ------
     ApcError
-        E504 a value beyond the parameter's bounds, E505 a time that can't be.
+        E624 a value beyond the parameter's bounds, E625 a time that can't be.
     """
     if not overrides:
         return system
@@ -380,12 +380,17 @@ def _check(system: CompiledSystem) -> None:
     for timing in system.timings:
         if timing.name in periods and timing.value <= 0:
             mistakes.add(
-                "E505", _PLACE, timing.name, expected="a time above 0 s", got=f"{float(timing.value)} s"
+                "E625", _PLACE, timing.name, expected="a time above 0 s", got=f"{float(timing.value)} s"
             )
         elif timing.value < 0:
             mistakes.add(
-                "E505", _PLACE, timing.name, expected="a time of 0 s or more", got=f"{float(timing.value)} s"
+                "E625", _PLACE, timing.name, expected="a time of 0 s or more", got=f"{float(timing.value)} s"
             )
+    seconds = {timing.name: timing.value for timing in system.timings}
+    for clock in system.clocks:
+        if not seconds[clock.phase] < seconds[clock.period] and seconds[clock.period] > 0:
+            got = f"{float(seconds[clock.phase])} s"
+            mistakes.add("E625", _PLACE, clock.phase, expected="less than the clock's period", got=got)
     mistakes.raise_if_any()
 
 
@@ -395,7 +400,7 @@ def _check_bounds(parameter: Parameter, name: str, mistakes: Mistakes) -> None:
     low, high, value = parameter.minimum, parameter.maximum, parameter.value
 
     def out(expected: str, number: float) -> None:
-        mistakes.add("E504", _PLACE, name, expected=f"{expected} {number:g}{unit}", got=f"{value:g}{unit}")
+        mistakes.add("E624", _PLACE, name, expected=f"{expected} {number:g}{unit}", got=f"{value:g}{unit}")
 
     if low is not None and parameter.open_minimum and value <= low:
         out("more than", low)

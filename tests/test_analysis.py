@@ -76,11 +76,9 @@ def test_a_mean_over_nobody_is_refused_and_a_sum_over_nobody_is_nothing() -> Non
 
 
 def test_a_million_peers_cost_what_three_do() -> None:
-    few, many = paper(peers=3), paper(peers=1_000_000)
-    analyze_modes(few)
-    started = time.perf_counter()
-    assert analyze_modes(many).peers == 1_000_000
-    assert time.perf_counter() - started < 2.0  # measured 0.02 s
+    few, many = analyze_modes(paper(peers=3)), analyze_modes(paper(peers=1_000_000))
+    assert many.peers == 1_000_000
+    assert (len(many.modes), many.states_per_peer) == (len(few.modes), few.states_per_peer)
 
 
 def test_the_dense_method_says_so() -> None:

@@ -81,19 +81,19 @@ def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
     [
         (
             {"coordination.stifness": "1 N/m"},
-            "override: E502 coordination.stifness is no parameter of three-users-average. "
+            "override: E622 coordination.stifness is no parameter of three-users-average. "
             "Write: coordination.stiffness",
         ),
-        ({"device.mass": "0 kg"}, "override: E504 device.mass wants more than 0 kg, got 0 kg."),
+        ({"device.mass": "0 kg"}, "override: E624 device.mass wants more than 0 kg, got 0 kg."),
         (
             {"device.mass": "1"},
             "override: E204 device.mass wants kg, got 1 (no unit). Write: device.mass: 1 kg",
         ),
         (
             {"peers": "4"},
-            "override: E503 peers is the number of peers: change a count and compile again.",
+            "override: E623 peers is the number of peers: change a count and compile again.",
         ),
-        ({"haptic.period": "0 s"}, "override: E505 haptic.period wants a time above 0 s, got 0.0 s."),
+        ({"haptic.period": "0 s"}, "override: E625 haptic.period wants a time above 0 s, got 0.0 s."),
     ],
 )
 def test_a_setting_that_cannot_be_is_told(

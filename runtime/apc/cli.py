@@ -256,9 +256,10 @@ def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: b
     dies out. A motion of all peers together, which nothing hinders, is left
     out of it and named.
     """
+    from apc.inputs import find_input, load_or_compile
     from apc.runtime.analysis import analyze_dense, analyze_modes
 
-    system = _model(Path(file) if file else None)
+    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
     if settings:
         from apc.runtime.parameters import apply, parse_override
 
@@ -270,26 +271,6 @@ def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: b
         from apc.runtime.report import analysis_report
 
         click.echo(analysis_report(result))
-
-
-def _model(path: Path | None) -> CompiledSystem:
-    """Return the compiled model of a file; a topology is compiled in memory unless its model is fresh."""
-    from apc.inputs import compiled_already, find_input, load_fresh
-
-    path = find_input(compiled_too=True) if path is None else path
-    if path.suffix == ".apc":
-        return load_fresh(path)
-    beside = path.with_suffix(".apc")
-    if path.is_file() and compiled_already(path):
-        from apc.compiler.store import load
-
-        try:
-            return load(beside)
-        except ApcError:
-            pass  # it is only a saving of time; the topology itself decides
-    from apc.compiler.pipeline import compile_topology
-
-    return compile_topology(path)
 
 
 def _print_json(document: dict[str, Any]) -> None:

@@ -82,6 +82,34 @@ def is_fresh(system: CompiledSystem, path: Path) -> bool:
     return not _changed(Record(system.origin.topology, system.origin.texts), path)
 
 
+def load_or_compile(path: Path) -> CompiledSystem:
+    """Return the compiled model of a file.
+
+    A compiled model is read. A topology is compiled in memory and checks itself, unless the model beside it
+    is what compiling it now would give.
+
+    Raises
+    ------
+    ApcError
+        The file is at fault.
+    """
+    from apc.compiler.store import load
+
+    if path.suffix == ".apc":
+        return load_fresh(path)
+    if path.is_file() and compiled_already(path):
+        try:
+            return load(path.with_suffix(".apc"))
+        except ApcError:
+            pass  # it is only a saving of time; the topology itself decides
+    from apc.compiler.pipeline import compile_topology
+    from apc.runtime.selfcheck import check_frame
+
+    system = compile_topology(path)
+    check_frame(system)
+    return system
+
+
 def compiled_already(topology: Path) -> bool:
     """Return whether the compiled model beside a topology is what compiling it now would give."""
     record = read_record(topology.with_suffix(".apc"))
