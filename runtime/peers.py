@@ -10,7 +10,8 @@ Does not: close the loop between them (see `modes`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -42,6 +43,32 @@ from apc.runtime.schedule import Schedule, Way
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """Peers by number, in runs that follow one another: a billion equal peers take no memory."""
+
+    ranges: tuple[range, ...]
+
+    def __len__(self) -> int:
+        return sum(len(one) for one in self.ranges)
+
+    def __iter__(self) -> Iterator[int]:
+        return itertools.chain.from_iterable(self.ranges)
+
+    def __getitem__(self, place: int | slice) -> Any:
+        if isinstance(place, slice):
+            return list(itertools.islice(self, place.start, place.stop, place.step))
+        return next(itertools.islice(self, place, None))
+
+    def shifted(self, by: int) -> Runs:
+        """Return the peers counted from another start."""
+        return Runs(tuple(range(one.start + by, one.stop + by) for one in self.ranges))
+
+
+# Some peers of a group, or of the scene, by number.
+Peers = Integers | Runs
+
 # More different peers than this are refused where each has to be looked at with each other: the slopes of
 # edge functions and the start values of what is heard cost their square.
 MOST_DIFFERENT = 400
@@ -72,7 +99,7 @@ class PeerGroup:
     site: LinearSite
     schedule: Schedule
     lifted: LiftedSite
-    peers: Integers
+    peers: Peers
     role: int
     place: int
     listening: Listening | None
@@ -143,7 +170,7 @@ def _by_matrices(
 ) -> tuple[PeerGroup, ...]:
     """Group peers of equal matrices, whatever their start values and constant forces."""
     rows: dict[_Key, tuple[int, Floats, Floats]] = {}
-    members: dict[_Key, list[tuple[int, Integers]]] = {}
+    members: dict[_Key, list[tuple[int, Peers]]] = {}
     for place, group in enumerate(system.groups):
         parameters = numbers.parameters[place]
         keys: list[_Key] = []
@@ -170,11 +197,11 @@ def _by_matrices(
 _Key = tuple[int, int, bytes]
 
 
-def _split(keys: Sequence[_Key], row_of: Integers) -> list[tuple[_Key, Integers]]:
+def _split(keys: Sequence[_Key], row_of: Integers) -> list[tuple[_Key, Peers]]:
     """Return, for each different key, the peers (counted in their group) whose row has it."""
     different = list(dict.fromkeys(keys))
     if len(different) == 1:
-        return [(different[0], np.arange(len(row_of)))]
+        return [(different[0], Runs((range(len(row_of)),)))]
     number = {key: place for place, key in enumerate(different)}
     of_peer = np.array([number[key] for key in keys])[row_of]
     order = np.argsort(of_peer, kind="stable")
@@ -208,7 +235,7 @@ def too_large(exchange: Exchange, what: str, states: int) -> ApcError:
 
 def _group(
     place: int,
-    parts: Sequence[tuple[int, Integers]],
+    parts: Sequence[tuple[int, Peers]],
     vector: Floats,
     built: SiteJacobians,
     site: LinearSite,
@@ -229,7 +256,7 @@ def _group(
         names.append(name)
     if len(names) > MOST_NAMED:
         names = [*names[:MOST_NAMED], "…"]
-    peers = np.concatenate([peers + exchange.starts[group] for group, peers in parts])
+    peers = _joined([_shifted(peers, int(exchange.starts[group])) for group, peers in parts])
     return PeerGroup(
         name="+".join(names),
         count=len(peers),
@@ -261,7 +288,7 @@ def _by_start(
     """Group peers that start alike among others that start alike, and linearize them there."""
     links = {way.link for way in used_ways(schedules)}
     complete = all(exchange.is_complete(link) for link in links)
-    members: dict[tuple[Any, ...], list[tuple[int, Integers]]] = {}
+    members: dict[tuple[Any, ...], list[tuple[int, Peers]]] = {}
     for place, group in enumerate(system.groups):
         role, vectors = exchange.role(place), numbers.parameters[place]
         keys = [(group.kind, role, (vector + 0.0).tobytes()) for vector in vectors]
@@ -283,7 +310,7 @@ def _by_start(
     # Peers apart in the graph are one group if they turned out alike, and weigh all others alike.
     merged: dict[tuple[Any, ...], int] = {}
     alike = all(len(listed) == 1 for _, gains in listened for listed in gains.values())
-    joined: dict[int, list[tuple[int, Integers]]] = {}
+    joined: dict[int, list[tuple[int, Peers]]] = {}
     for g, (listening, gains) in enumerate(listened):
         own = parts[g][0][0]
         same = (
@@ -310,12 +337,25 @@ def _by_start(
     )
 
 
-def _together(parts: Sequence[tuple[int, Integers]]) -> list[tuple[int, Integers]]:
+def _together(parts: Sequence[tuple[int, Peers]]) -> list[tuple[int, Peers]]:
     """Join the parts of each group of the scene."""
-    found: dict[int, list[Integers]] = {}
+    found: dict[int, list[Peers]] = {}
     for group, peers in parts:
         found.setdefault(group, []).append(peers)
-    return [(group, np.sort(np.concatenate(listed))) for group, listed in found.items()]
+    return [(group, _joined(listed)) for group, listed in found.items()]
+
+
+def _shifted(peers: Peers, by: int) -> Peers:
+    """Return peers counted from another start."""
+    return peers.shifted(by) if isinstance(peers, Runs) else peers + by
+
+
+def _joined(listed: Sequence[Peers]) -> Peers:
+    """Return peers together, in order."""
+    runs = [one for one in listed if isinstance(one, Runs)]
+    if len(runs) == len(listed):
+        return Runs(tuple(sorted((run for one in runs for run in one.ranges), key=lambda run: run.start)))
+    return np.sort(np.concatenate([np.fromiter(one, np.int64, len(one)) for one in listed]))
 
 
 class _Sites:
@@ -328,7 +368,7 @@ class _Sites:
         schedules: Sequence[Schedule],
         numbers: Numbers,
         exchange: Exchange,
-        parts: Sequence[Sequence[tuple[int, Integers]]],
+        parts: Sequence[Sequence[tuple[int, Peers]]],
     ) -> None:
         self.exchange = exchange
         self.counts = [sum(len(peers) for _, peers in part) for part in parts]

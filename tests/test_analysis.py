@@ -81,6 +81,18 @@ def test_a_million_peers_cost_what_three_do() -> None:
     assert (len(many.modes), many.states_per_peer) == (len(few.modes), few.states_per_peer)
 
 
+def test_a_billion_peers_in_groups_that_alternate_take_no_memory_a_peer() -> None:
+    # As an array of peers each of these groups would take gigabytes.
+    crowds = (
+        ("left", 400_000_000, {"contact.stiffness": 900.0}),
+        ("mid", 600_000_000, {}),
+        ("right", 3, {"contact.stiffness": 900.0}),
+    )
+    found = analyze_modes(grouped(paper(kc=1000.0), *crowds))
+    assert found.peers == 1_000_000_003
+    assert sum(mode.multiplicity for mode in found.modes) > 10**9
+
+
 def test_the_dense_method_says_so() -> None:
     found = analyze_dense(paper(peers=2))
     assert found.method == "dense"
