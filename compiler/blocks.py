@@ -20,7 +20,7 @@ import sympy
 
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.flatten import FlatEquation
-from apc.compiler.symbolic import LinearForm, ZeroTest, linear_form, symbol
+from apc.compiler.symbolic import NOTHING_VANISHES, LinearForm, Vanishing, ZeroTest, linear_form, symbol
 
 Assignment = tuple[str, sympy.Expr]
 # An entry of an eliminated block with more nodes than this gets a name of its own: substituted into one
@@ -83,6 +83,7 @@ def solve_blocks(
     mistakes: Mistakes,
     *,
     nonzero: Collection[sympy.Symbol] = (),
+    vanishes: Vanishing = NOTHING_VANISHES,
 ) -> tuple[Step, ...]:
     """Match, sort and solve.
 
@@ -97,6 +98,8 @@ def solve_blocks(
         equations that depend on each other.
     nonzero
         Parameters that no number can make zero; divisors stay when all others are zero, where possible.
+    vanishes
+        Whether an expression is zero with the scene's numbers; what is divided by must not be.
     """
     columns = {unknown: j for j, unknown in enumerate(unknowns)}
     incidence = [sorted(columns[s] for s in r.expression.free_symbols & columns.keys()) for r in residuals]
@@ -110,7 +113,7 @@ def solve_blocks(
         [row for j in columns_of if (row := match[j]) is not None and row != i]
         for i, columns_of in enumerate(incidence)
     ]
-    solver = _Solver(where, mistakes, frozenset(nonzero))
+    solver = _Solver(where, mistakes, frozenset(nonzero), vanishes)
     steps: list[Step] = []
     for block in strong_components(needs):
         rows = sorted(block)
@@ -125,8 +128,11 @@ def solve_blocks(
 class _Solver:
     """Solves blocks; keeps what they share: the zero test, and where mistakes go."""
 
-    def __init__(self, where: str, mistakes: Mistakes, nonzero: Set[sympy.Symbol]) -> None:
+    def __init__(
+        self, where: str, mistakes: Mistakes, nonzero: Set[sympy.Symbol], vanishes: Vanishing
+    ) -> None:
         self.where = where
+        self.vanishes = vanishes
         self.mistakes = mistakes
         self.is_zero = ZeroTest()
         self.can_vanish = ZeroTest(nonzero)
@@ -141,7 +147,7 @@ class _Solver:
             return self._eliminate(block, unknowns, linear)
         [(coefficients, rest)] = linear
         coefficient = coefficients[unknowns[0]]
-        if self.is_zero(coefficient):
+        if self.is_zero(coefficient) or self.vanishes(coefficient):
             self._report_dependent(block, unknowns)
             return []
         return [(unknowns[0].name, -rest / coefficient)]
@@ -181,12 +187,13 @@ class _Solver:
             short = symbol(f"{unknowns[0].name} by elimination {len(named) + 1}")
             self.is_zero.define(short, entry)
             self.can_vanish.define(short, entry)
+            self.vanishes.define(short, entry)
             named.append((short.name, entry))
             return short
 
-        def cost(i: int, j: int) -> tuple[bool, int, bool, int, int]:
+        def cost(i: int, j: int) -> tuple[bool, bool, int, bool, int, int]:
             entry, fill = rows[i][j], (len(rows[i]) - 1) * (len(holders[j]) - 1)
-            return self.can_vanish(entry), fill, not entry.is_Number, i, j
+            return self.vanishes(entry), self.can_vanish(entry), fill, not entry.is_Number, i, j
 
         heap = [cost(i, j) for i, row in enumerate(rows) for j in row]
         heapq.heapify(heap)
@@ -200,6 +207,8 @@ class _Solver:
             if (current := cost(i, j)) > entry:
                 heapq.heappush(heap, current)  # the pattern has filled in since
                 continue
+            if current[0]:
+                break  # with these numbers there is nothing left to divide by
             pivots.append((i, j))
             used.add(i)
             for column in rows[i]:

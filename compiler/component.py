@@ -165,6 +165,11 @@ class Component:
         return (parameter for parameter in self.parameters if isinstance(parameter, Number))
 
     @property
+    def depth(self) -> int:
+        """How deep parts stand inside parts: 1 for a component without any."""
+        return 1 + max((inner.component.depth for inner in self.inner), default=0)
+
+    @property
     def hears_others(self) -> bool:
         """Whether an equation, here or in an inner part, reads the other peers."""
         own = any(

@@ -81,6 +81,7 @@ COMPONENT_KEYS = (
 RESERVED = frozenset(
     {"peers", "others", "time", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
 )
+DEEPEST = 10  # levels of parts inside parts
 Sends = tuple[tuple[str, Expr, str, Place], ...]
 _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
@@ -246,6 +247,10 @@ def _read_inner(
         free = [connector for connector, _ in component.connectors]
         entry = read_entry(name, body, component, place, scope, mistakes, free_connectors=free)
         inner.append(Inner(name, component, entry, place))
+    deepest = max((component.depth for _, component, _ in bodies.values()), default=0)
+    if deepest >= DEEPEST:  # each level may double the parts
+        what = f"the parts of {outer.name} stand inside one another more than {DEEPEST} deep"
+        mistakes.add("E216", outer.place, what, hint="fewer components around one another")
     passed = [
         (theirs, part.name, own)
         for part in inner

@@ -25,7 +25,9 @@ import sympy
 from apc.compiler.blocks import Residual, match_columns, report_singular
 from apc.compiler.errors import Mistakes
 from apc.compiler.symbolic import (
+    NOTHING_VANISHES,
     NoDerivativeError,
+    Vanishing,
     ZeroTest,
     derivative_symbol,
     differential,
@@ -127,6 +129,7 @@ def reduce_index(
     jets: Jets,
     where: str,
     mistakes: Mistakes,
+    vanishes: Vanishing = NOTHING_VANISHES,
 ) -> Reduced | None:
     """Differentiate what must be and choose the states; None if the equations can't be solved.
 
@@ -143,6 +146,8 @@ def reduce_index(
     mistakes
         Takes E502 equations or unknowns left over or constraints that say the same, E508 the derivative of a
         value that jumps, E509 states that can't be chosen once and for all.
+    vanishes
+        Whether an expression is zero with the scene's numbers.
     """
     column = {name: j for j, name in enumerate(names)}
     incidence = [sorted({column[n] for n, _ in jets.jets(r.expression).values()}) for r in residuals]
@@ -150,7 +155,7 @@ def reduce_index(
     if len(residuals) != len(names) or None in match:
         report_singular(residuals, names, incidence, match, where, mistakes)
         return None
-    system = _System(residuals, names, jets)
+    system = _System(residuals, names, jets, vanishes)
     if not system.differentiate_constraints(mistakes):
         return None
     dummies = system.choose_dummies(started, where, mistakes)
@@ -171,7 +176,10 @@ def reduce_index(
 class _System:
     """The equations as they grow: each may have a derivative, which then takes its place in the matching."""
 
-    def __init__(self, residuals: Sequence[Residual], names: Sequence[str], jets: Jets) -> None:
+    def __init__(
+        self, residuals: Sequence[Residual], names: Sequence[str], jets: Jets, vanishes: Vanishing
+    ) -> None:
+        self.vanishes = vanishes
         self.residuals = list(residuals)
         self.names = names
         self.jets = jets
@@ -305,7 +313,11 @@ class _System:
         chosen: list[Jet] = []
         for jet in candidates:
             still = [row for row in columns[jet] if row in matrix and jet in matrix[row]]
-            fixed = [row for row in still if not self._moves(matrix[row][jet])]
+            fixed = [
+                row
+                for row in still
+                if not self._moves(matrix[row][jet]) and not self.vanishes(matrix[row][jet])
+            ]
             if not fixed:
                 continue
             pivot = min(fixed, key=lambda row: (not matrix[row][jet].is_Number, len(matrix[row]), row))
@@ -336,7 +348,7 @@ class _System:
         """Say which constraints are left without a variable that follows from them."""
         for row, entries in matrix.items():
             residual = self.residuals[row]
-            if entries:
+            if entries and not all(self.vanishes(c) for c in entries.values()):
                 factors = ", ".join(
                     f"{name} (by the factor {sympy.sstr(c)})" for (name, _), c in sorted(entries.items())
                 )

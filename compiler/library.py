@@ -29,6 +29,7 @@ class Library:
         self._components: dict[str, Component] = {}
         self._connectors: dict[str, Connector] = {}
         self._files: dict[str, Path] = dict(builtin_files())
+        self._failed: dict[str, ApcError] = {}
         self._open: list[str] = []  # the components being read, each asked for by the one before
         for folder in folders:
             for path in sorted(folder.rglob("*.yaml")):
@@ -65,9 +66,14 @@ class Library:
                 chain = " → ".join([*self._open[self._open.index(name) :], name])
                 what = f"components contain or extend each other: {chain}"
                 raise ApcError(Mistake("E212", source.root.place, what))
+            if name in self._failed:
+                raise self._failed[name]  # read once, even if a hundred parts are of it
             self._open.append(name)
             try:
                 self._components[name] = read_component(source, self)
+            except ApcError as error:
+                self._failed[name] = error
+                raise
             finally:
                 self._open.pop()
         return self._components[name]

@@ -20,7 +20,8 @@ from apc.compiler.units import Dimension
 from apc.compiler.values import Binding, read_binding
 
 GROUND = "ground"
-LARGEST_ARRAY = 10_000
+LARGEST_ARRAY = 1000
+MOST_PARTS = 2000  # of one peer, those inside parts included; a compile of so many takes seconds
 _TARGET = re.compile(
     r"(?P<part>[A-Za-z]\w*)(\[(?P<first>\d{1,6})(:(?P<last>\d{1,6}))?\])?(\.(?P<connector>[A-Za-z]\w*))?\Z",
     re.ASCII,

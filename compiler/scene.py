@@ -23,7 +23,7 @@ from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.graphs import COMPLETE, PairDelay, read_graph, read_pairs
 from apc.compiler.groups import Columns, GroupBody, read_counts, read_settings
 from apc.compiler.library import Library
-from apc.compiler.parts import LARGEST_ARRAY, Scope, read_entry
+from apc.compiler.parts import LARGEST_ARRAY, MOST_PARTS, Scope, read_entry
 from apc.compiler.reading import (
     add_unknown,
     brief,
@@ -225,6 +225,7 @@ class _Reader:
         self.faulty_names: set[str] = set()  # parameters without a value, likewise
         self.complete = True  # False when a section of parts is missing or faulty
         self.texts: dict[str, str] = {}
+        self.number_of_parts = 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -536,6 +537,12 @@ class _Reader:
     def _with_inner(self, part: Part) -> list[Part]:
         """Return a part and the parts inside it; an inner part's numbers are expressions over the outer's."""
         found = [part]
+        self.number_of_parts += 1
+        if self.number_of_parts > MOST_PARTS:
+            if self.number_of_parts == MOST_PARTS + 1:
+                what = f"a peer would have more than {MOST_PARTS} parts, those inside parts included"
+                self.mistakes.add("E216", part.place, what, hint="fewer or smaller arrays and components")
+            return found
         values = dict(part.values)
         references = dict(part.references)
         tables = {table.name: table for table in part.tables}

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence, Set
 from dataclasses import dataclass
+from fractions import Fraction
 
 import sympy
 
@@ -31,7 +32,15 @@ from apc.compiler.expression import Expr, Name
 from apc.compiler.flatten import FlatEquation
 from apc.compiler.index import Jet, Jets, reduce_index, report_no_derivative
 from apc.compiler.scene import Scene
-from apc.compiler.symbolic import NoDerivativeError, is_no_number, no_derivative, symbol, to_sympy
+from apc.compiler.symbolic import (
+    NOTHING_VANISHES,
+    NoDerivativeError,
+    Vanishing,
+    is_no_number,
+    no_derivative,
+    symbol,
+    to_sympy,
+)
 from apc.compiler.units import format_dimension
 
 __all__ = [
@@ -102,7 +111,10 @@ def sort(clocked: ClockedSystem) -> SortedSystem:
     """Sort and solve every partition. Raises ApcError naming the equations and unknowns left over."""
     mistakes = Mistakes()
     nonzero = _positive_parameters(clocked.scene)
-    kinds = tuple(sort_kind(kind, mistakes, nonzero=nonzero) for kind in clocked.kinds)
+    kinds = tuple(
+        sort_kind(kind, mistakes, nonzero=nonzero, vanishes=Vanishing(_numbers(clocked.scene, kind)))
+        for kind in clocked.kinds
+    )
     mistakes.raise_if_any()
     return SortedSystem(clocked.scene, kinds)
 
@@ -117,7 +129,26 @@ def _positive_parameters(scene: Scene) -> list[str]:
     ]
 
 
-def sort_kind(kind: ClockedKind, mistakes: Mistakes, *, nonzero: Collection[str] = ()) -> SortedKind:
+def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[sympy.Symbol, Fraction]]:
+    """Return the numbers of each group of a kind; of those that differ by peer, the first peer's."""
+    common = {f"{part.name}.{name}": value.number for part in scene.parts for name, value in part.values}
+    common["peers"] = Fraction(scene.peers)
+    found = []
+    for group in scene.groups:
+        if group.name in kind.flat.groups:
+            own = {name: value.number for name, value in group.values}
+            own |= {name: Fraction(float(numbers[0])) for name, numbers in group.columns}
+            found.append({symbol(name): number for name, number in (common | own).items()})
+    return found
+
+
+def sort_kind(
+    kind: ClockedKind,
+    mistakes: Mistakes,
+    *,
+    nonzero: Collection[str] = (),
+    vanishes: Vanishing = NOTHING_VANISHES,
+) -> SortedKind:
     """Sort and solve one kind; when there are mistakes, the value returned is not whole.
 
     Parameters
@@ -129,15 +160,17 @@ def sort_kind(kind: ClockedKind, mistakes: Mistakes, *, nonzero: Collection[str]
         start value.
     nonzero
         Parameters that no number can make zero.
+    vanishes
+        Whether an expression is zero with the scene's numbers; what is divided by must not be.
     """
     divisors = [symbol(name) for name in nonzero]
-    continuous = _sort_continuous(kind, divisors, mistakes)
+    continuous = _sort_continuous(kind, divisors, vanishes, mistakes)
     partitions = [SortedPartition(CONTINUOUS, continuous.steps)]
     for clock in kind.partitions[1:]:
         own = _residuals(clock.equations, no_derivative, mistakes)
         unknowns = [symbol(name) for name in clock.variables]
         where = f"the equations of clock {clock.clock}"
-        found = solve_blocks(own, unknowns, where, mistakes, nonzero=divisors)
+        found = solve_blocks(own, unknowns, where, mistakes, nonzero=divisors, vanishes=vanishes)
         partitions.append(SortedPartition(clock.clock, found))
     return SortedKind(
         kind,
@@ -166,7 +199,9 @@ class _Continuous:
     sent: tuple[sympy.Expr, ...] = ()
 
 
-def _sort_continuous(kind: ClockedKind, divisors: Sequence[sympy.Symbol], mistakes: Mistakes) -> _Continuous:
+def _sort_continuous(
+    kind: ClockedKind, divisors: Sequence[sympy.Symbol], vanishes: Vanishing, mistakes: Mistakes
+) -> _Continuous:
     partition = kind.partitions[0]
     assert partition.clock == CONTINUOUS
     where = "the continuous equations"
@@ -187,13 +222,17 @@ def _sort_continuous(kind: ClockedKind, divisors: Sequence[sympy.Symbol], mistak
     read_values = [aliases.substitute(value) for value in values if value is not None]
     jets = jets.renamed(aliases.kept, aliases.velocities)
     probes = _probes(reads, read_values, jets)
-    reduced = reduce_index([*residuals, *probes.values()], jets.names, started, jets, where, mistakes)
+    reduced = reduce_index(
+        [*residuals, *probes.values()], jets.names, started, jets, where, mistakes, vanishes
+    )
     if reduced is None:
         return _Continuous()
     states = tuple(s.name for s in reduced.states)
     _check_starts(states, started, partition.equations, mistakes)
     named = tuple((f"der({x})", symbol(v)) for x, v in aliases.velocities.items() if x in states)
-    solved = solve_blocks(reduced.residuals, reduced.unknowns, where, mistakes, nonzero=divisors)
+    solved = solve_blocks(
+        reduced.residuals, reduced.unknowns, where, mistakes, nonzero=divisors, vanishes=vanishes
+    )
     return _Continuous(
         states,
         aliases.assignments,

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import random
 import sys
-from collections.abc import Callable, Set
+from collections.abc import Callable, Mapping, Sequence, Set
+from fractions import Fraction
 from math import prod
 
 import sympy
@@ -227,14 +228,22 @@ class ZeroTest:
     isn't zero vanishes there with probability below its degree/2⁶¹ (Schwartz 1980, Zippel 1979). Expansion
     would decide the same at a cost that grows with the number of terms. The generator is seeded.
 
-    With `nonzero`, all other symbols are taken as zero: whether an expression is zero then.
+    With `nonzero`, all other symbols are taken as zero: whether an expression is zero then. With `values`,
+    these symbols have their values: whether it is zero for all values of the others.
     """
 
     _PRIME = 2**61 - 1
 
-    def __init__(self, nonzero: Set[sympy.Symbol] | None = None) -> None:
+    def __init__(
+        self,
+        nonzero: Set[sympy.Symbol] | None = None,
+        values: Mapping[sympy.Symbol, Fraction] | None = None,
+    ) -> None:
         self._nonzero = nonzero
-        self._values: dict[sympy.Expr, int] = {}
+        self._values: dict[sympy.Expr, int] = {
+            name: value.numerator * pow(value.denominator, -1, self._PRIME) % self._PRIME
+            for name, value in (values or {}).items()
+        }
         self._random = random.Random(0)
 
     def define(self, name: sympy.Symbol, expression: sympy.Expr) -> None:
@@ -269,3 +278,25 @@ class ZeroTest:
 def no_derivative(expression: sympy.Expr) -> sympy.Expr:
     """Stand in for `differentiate` where `der` can't occur."""
     raise AssertionError(f"der of {expression} stands in a clocked equation")
+
+
+class Vanishing:
+    """Says whether an expression is zero with the numbers of some group of peers.
+
+    What is divided by must not be, even though other numbers would do.
+    """
+
+    def __init__(self, numbers: Sequence[Mapping[sympy.Symbol, Fraction]]) -> None:
+        self._tests = [ZeroTest(values=values) for values in numbers]
+
+    def define(self, name: sympy.Symbol, expression: sympy.Expr) -> None:
+        """Let a symbol stand for an expression."""
+        for test in self._tests:
+            test.define(name, expression)
+
+    def __call__(self, expression: sympy.Expr) -> bool:
+        """Return whether the expression is zero for one of the groups."""
+        return any(test(expression) for test in self._tests)
+
+
+NOTHING_VANISHES = Vanishing(())

@@ -27,6 +27,7 @@ from apc.runtime.peers import PeerGroup, peer_groups, states_of
 from apc.runtime.schedule import ORDER, Schedule, build_schedules
 from apc.runtime.spectrum import Mode, solve_spectrum
 from apc.runtime.threads import single_threaded
+from apc.runtime.trouble import finite_equations
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +166,7 @@ def _analyze(
     method: Callable[[Sequence[PeerGroup], Exchange], Split],
 ) -> Analysis:
     """Analyse a system, split into closed systems by a method."""
-    with single_threaded(), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         groups, exchange = lifted_groups(system, prepared=prepared)
         found = method(groups, exchange)
         if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in found.systems):

@@ -17,6 +17,7 @@ from apc.compiler.errors import ApcError
 from apc.runtime.analysis import Prepared, lifted_groups, prepare
 from apc.runtime.linearize import edge_name
 from apc.runtime.modes import split
+from apc.runtime.trouble import finite_equations
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,11 @@ class Needs:
 
 def needs(system: CompiledSystem) -> Needs:
     """Count what a scene keeps from frame to frame."""
+    with finite_equations(system.name):
+        return _needs(system)
+
+
+def _needs(system: CompiledSystem) -> Needs:
     prepared = prepare(system)
     schedule_of = {
         group.kind: schedule

@@ -24,6 +24,7 @@ from apc.runtime.linearize import SiteJacobians, jacobians, linearize
 from apc.runtime.parameters import Numbers, resolve
 from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value, build_schedules
 from apc.runtime.threads import single_threaded
+from apc.runtime.trouble import finite_equations
 
 Floats = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ def check_frame(system: CompiledSystem) -> float:
     schedules = build_schedules(system, numbers.timings, [site.pattern for site in sites])
     generator = np.random.default_rng(SEED)
     largest = 0.0
-    with single_threaded(), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         for site, schedule, parameters in _checked(system, numbers, sites, schedules):
             lifted = lift(linearize(site, parameters), schedule)
             z = generator.standard_normal(len(lifted.z_names))

@@ -30,7 +30,13 @@ ORDER = (
     # what is shown of them
     *("apc.compiler.schema", "apc.compiler.listing", "apc.compiler.diagram", "apc.compiler.picture"),
     # one peer over a frame
-    *("apc.runtime.threads", "apc.runtime.exact", "apc.runtime.parameters", "apc.runtime.discretize"),
+    *(
+        "apc.runtime.threads",
+        "apc.runtime.trouble",
+        "apc.runtime.exact",
+        "apc.runtime.parameters",
+        "apc.runtime.discretize",
+    ),
     *("apc.runtime.exchange", "apc.runtime.linearize", "apc.runtime.schedule", "apc.runtime.lift"),
     # all peers, and what their motion tells
     *("apc.runtime.peers", "apc.runtime.modes", "apc.runtime.rigid", "apc.runtime.pseudospectrum"),
