@@ -44,12 +44,11 @@ from apc.compiler.expression import (
     Name,
     format_expression,
     names,
-    parse_equation,
-    parse_expression,
     transform,
     walk,
 )
 from apc.compiler.expression import Number as Literal
+from apc.compiler.grammar import parse_equation, parse_expression
 from apc.compiler.parts import Scope, read_entry
 from apc.compiler.reading import (
     add_unknown,

@@ -17,7 +17,8 @@ from apc.compiler.clocks import HoldCrossing, count_of
 from apc.compiler.compiled import PEERS, Clock, Column, Group, Kind, Link, PairDelay, Parameter, Timing
 from apc.compiler.component import Number as NumberParameter
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.expression import Expr, Name, Number, evaluate, format_expression, transform
+from apc.compiler.evaluation import evaluate
+from apc.compiler.expression import Expr, Name, Number, format_expression, transform
 from apc.compiler.flatten import FlatKind
 from apc.compiler.scene import PeerGroup, Scene, SceneLink
 from apc.compiler.units import format_dimension

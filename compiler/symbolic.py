@@ -15,18 +15,7 @@ from math import prod
 
 import sympy
 
-from apc.compiler.expression import (
-    Binary,
-    Call,
-    Compare,
-    Conditional,
-    Expr,
-    Logic,
-    Name,
-    Negate,
-    Not,
-    Number,
-)
+from apc.compiler.expression import Binary, Call, Compare, Conditional, Expr, Logic, Name, Negate, Not, Number
 
 # Smooth functions are SymPy's own; the others are opaque heads that only `functions` gives a meaning.
 SMOOTH: dict[str, Callable[[sympy.Expr], sympy.Expr]] = {

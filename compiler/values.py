@@ -15,15 +15,9 @@ from graphlib import CycleError, TopologicalSorter
 
 from apc.compiler.dimensions import ANY, dimension_of
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
-from apc.compiler.expression import (
-    Expr,
-    Name,
-    evaluate,
-    format_expression,
-    names,
-    parse_expression,
-    transform,
-)
+from apc.compiler.evaluation import evaluate
+from apc.compiler.expression import Expr, Name, format_expression, names, transform
+from apc.compiler.grammar import parse_expression
 from apc.compiler.reading import add_unknown, brief, read_text
 from apc.compiler.source import Node, Scalar, place_in
 from apc.compiler.units import (

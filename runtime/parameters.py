@@ -235,7 +235,8 @@ class _Columns:
         return self._found[name]
 
     def _evaluated(self, name: str, text: str) -> Floats | None:
-        from apc.compiler.expression import names, parse_expression
+        from apc.compiler.expression import names
+        from apc.compiler.grammar import parse_expression
 
         tree = parse_expression(text, Place(name, 1, 1, text))
         if all(self.of(".".join(node.parts)) is None for node in names(tree)):
@@ -335,7 +336,9 @@ class _Scope:
 
     def _evaluate(self, name: str, text: str) -> Fraction | None:
         """Evaluate an expression if an override reaches one of its names."""
-        from apc.compiler.expression import evaluate, names, parse_expression
+        from apc.compiler.evaluation import evaluate
+        from apc.compiler.expression import names
+        from apc.compiler.grammar import parse_expression
 
         place = Place(name, 1, 1, text)
         tree = parse_expression(text, place)

@@ -18,7 +18,14 @@ ORDER = (
     # what the others are written in, and what is handed over
     *("apc.compiler.errors", "apc.compiler.compiled", "apc.compiler.cache"),
     # text
-    *("apc.compiler.source", "apc.compiler.reading", "apc.compiler.expression", "apc.compiler.units"),
+    *(
+        "apc.compiler.source",
+        "apc.compiler.reading",
+        "apc.compiler.expression",
+        "apc.compiler.grammar",
+        "apc.compiler.evaluation",
+        "apc.compiler.units",
+    ),
     *("apc.compiler.dimensions", "apc.compiler.values", "apc.compiler.tables"),
     # components and scenes
     *("apc.compiler.component", "apc.compiler.parts", "apc.compiler.definitions", "apc.compiler.library"),

@@ -4,7 +4,8 @@ import pytest
 
 from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.expression import Name, parse_equation, parse_expression
+from apc.compiler.expression import Name
+from apc.compiler.grammar import parse_equation, parse_expression
 from apc.compiler.units import DIMENSIONLESS, Dimension, parse_unit
 
 HERE = Place("a.yaml")

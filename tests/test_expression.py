@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apc.compiler.errors import ApcError, Place
+from apc.compiler.evaluation import evaluate
 from apc.compiler.expression import (
     FUNCTIONS,
     Binary,
@@ -24,15 +25,13 @@ from apc.compiler.expression import (
     Not,
     Number,
     children,
-    evaluate,
     format_expression,
     names,
-    parse_equation,
-    parse_expression,
     rebuild,
     transform,
     walk,
 )
+from apc.compiler.grammar import parse_equation, parse_expression
 
 A, B, C, X = (Name((letter,)) for letter in "abcx")
 TWO = Number(Fraction(2))

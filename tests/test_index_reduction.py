@@ -15,8 +15,9 @@ import pytest
 from apc.compiler.blocks import ImplicitBlock
 from apc.compiler.clocks import CONTINUOUS, ClockedKind, HoldCrossing, Partition, SampleCrossing
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.expression import Number, parse_equation, parse_expression
+from apc.compiler.expression import Number
 from apc.compiler.flatten import FlatEquation, FlatKind, FlatVariable
+from apc.compiler.grammar import parse_equation, parse_expression
 from apc.compiler.structure import SortedKind, sort_kind
 from apc.compiler.units import DIMENSIONLESS
 

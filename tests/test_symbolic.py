@@ -6,7 +6,7 @@ import pytest
 import sympy
 
 from apc.compiler.errors import Place
-from apc.compiler.expression import parse_expression
+from apc.compiler.grammar import parse_expression
 from apc.compiler.symbolic import derivative_symbol, head, symbol, to_sympy
 
 X, Y = symbol("x"), symbol("y")

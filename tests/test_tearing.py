@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from apc.compiler.blocks import ImplicitBlock, Residual, match_columns, solve_blocks, strong_components
 from apc.compiler.compiled import Kind, SendPartition, State
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.expression import Name, parse_equation
+from apc.compiler.expression import Name
 from apc.compiler.flatten import FlatEquation
 from apc.compiler.functions import _Writer
+from apc.compiler.grammar import parse_equation
 from apc.compiler.symbolic import no_derivative, symbol, to_sympy
 from apc.runtime.linearize import jacobians, linearize
 
