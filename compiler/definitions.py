@@ -12,7 +12,6 @@ scene give the rest.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from fractions import Fraction
@@ -20,11 +19,9 @@ from typing import Protocol, TypeVar
 
 from apc.compiler.component import (
     OTHERS,
-    ROLES,
     Component,
     Connector,
     Inner,
-    Number,
     Option,
     Parameter,
     Reference,
@@ -32,6 +29,7 @@ from apc.compiler.component import (
     Variable,
     option_test,
 )
+from apc.compiler.declarations import Sends, read_equations, read_parameters, read_sends, read_variables
 from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.expression import (
@@ -48,21 +46,19 @@ from apc.compiler.expression import (
     walk,
 )
 from apc.compiler.expression import Number as Literal
-from apc.compiler.grammar import parse_equation, parse_expression
 from apc.compiler.parts import Scope, read_entry
 from apc.compiler.reading import (
     add_unknown,
     brief,
     check_keys,
     entries,
-    form,
     read_mapping,
     read_name,
     read_text,
 )
-from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source, place_in
-from apc.compiler.units import DIMENSIONLESS, Dimension, Unit, parse_quantity, parse_unit, quantity
-from apc.compiler.values import PEERS, text_place
+from apc.compiler.source import Mapping, Node, Scalar, Source, place_in
+from apc.compiler.units import DIMENSIONLESS, Dimension
+from apc.compiler.values import PEERS
 
 COMPONENT_KEYS = (
     "component",
@@ -81,9 +77,7 @@ RESERVED = frozenset(
     {"peers", "others", "time", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
 )
 DEEPEST = 10  # levels of parts inside parts
-Sends = tuple[tuple[str, Expr, str, Place], ...]
 _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
 
 
 def read_connector(source: Source) -> Connector:
@@ -93,8 +87,8 @@ def read_connector(source: Source) -> Connector:
     mistakes.raise_if_any()
     assert root is not None
     root = check_keys(root, ("connector", "about", "source", "potentials", "flows"), "a connector", mistakes)
-    potentials = _variables(root.get("potentials"), mistakes)
-    flows = _variables(root.get("flows"), mistakes)
+    potentials = read_variables(root.get("potentials"), mistakes)
+    flows = read_variables(root.get("flows"), mistakes)
     name = read_text(root.get("connector"), "connector", mistakes) or ""
     about = read_text(root.get("about"), "about", mistakes) or ""
     mistakes.raise_if_any()
@@ -129,7 +123,7 @@ def read_component(source: Source, library: Definitions) -> Component:
     draft = _read_declarations(root, library, mistakes)
     mistakes.raise_if_any()
     names = _Names(draft)
-    sends = _sends(root.get("sends"), mistakes)
+    sends = read_sends(root.get("sends"), mistakes)
     locals_, found = names.infer_locals(sends), names.infer_sends(sends, mistakes)
     component = replace(draft, locals=(*draft.locals, *locals_), sends=(*draft.sends, *found))
     mistakes.raise_if_any()
@@ -146,9 +140,9 @@ def _read_declarations(root: Mapping, library: Definitions, mistakes: Mistakes) 
     name = (read_name(title, "a component", mistakes) if isinstance(title, Scalar) else None) or "?"
     base = _base(root.get("extends"), library, mistakes)
     connectors = _connectors(root.get("connectors"), library, mistakes)
-    parameters = _parameters(root.get("parameters"), mistakes)
-    variables = _variables(root.get("variables"), mistakes)
-    equations = _equations(root.get("equations"), mistakes)
+    parameters = read_parameters(root.get("parameters"), mistakes)
+    variables = read_variables(root.get("variables"), mistakes)
+    equations = read_equations(root.get("equations"), mistakes)
     about = read_text(root.get("about"), "about", mistakes) or ""
     cited = read_text(root.get("source"), "source", mistakes) or ""
     place = title.place if title is not None else root.place
@@ -500,195 +494,3 @@ def _connectors(
         else:
             found.append((name, connector))
     return tuple(found)
-
-
-def _equations(node: Node | None, mistakes: Mistakes) -> tuple[Equation, ...]:
-    if node is None:
-        return ()
-    if not isinstance(node, Sequence):
-        mistakes.add(
-            "E203", node.place, "equations", expected="a list", got=form(node), hint="equations: [a + b = c]"
-        )
-        return ()
-    found = []
-    for item in node.items:
-        text = read_text(item, "an equation", mistakes, hint="- a + b = c")
-        if text is not None:
-            try:
-                found.append(parse_equation(text, text_place(item)))
-            except ApcError as error:
-                mistakes.take(error)
-    return tuple(found)
-
-
-def _sends(node: Node | None, mistakes: Mistakes) -> Sends:
-    found = []
-    for key, value in entries(read_mapping(node, "sends", mistakes, hint="sends: {x: sample(object.x)}")):
-        name = read_name(key, "what is sent", mistakes)
-        text = read_text(value, key.text, mistakes, hint=f"{key.text}: sample(object.x)")
-        if name is None or text is None:
-            continue
-        place = text_place(value)
-        try:
-            found.append((name, parse_expression(text, place), text, place))
-        except ApcError as error:
-            mistakes.take(error)
-    return tuple(found)
-
-
-def _variables(node: Node | None, mistakes: Mistakes) -> tuple[Variable, ...]:
-    found = []
-    for key, value in entries(read_mapping(node, "variables", mistakes, hint="variables: {x: {unit: m}}")):
-        name = read_name(key, "a variable", mistakes)
-        body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{unit: m}}")
-        if name is None or body is None:
-            continue
-        body = check_keys(body, ("unit", "start", "about"), f"variable {name}", mistakes)
-        unit = _unit(body, name, mistakes)
-        start = _declared(body.get("start"), name, unit, mistakes)
-        about = read_text(body.get("about"), "about", mistakes) or ""
-        if unit is not None:
-            found.append(Variable(name, unit, start, about, key.place))
-    return tuple(found)
-
-
-def _parameters(node: Node | None, mistakes: Mistakes) -> tuple[Parameter, ...]:
-    found: list[Parameter] = []
-    hint = "parameters: {stiffness: {unit: N/m, min: 0}}"
-    for key, value in entries(read_mapping(node, "parameters", mistakes, hint=hint)):
-        name = read_name(key, "a parameter", mistakes)
-        if name is None:
-            continue
-        parameter: Parameter | None
-        if isinstance(value, Scalar):
-            parameter = _reference(name, value, mistakes)
-        else:
-            body = read_mapping(value, f"parameter {name}", mistakes, hint=f"{name}: {{unit: N/m}}")
-            if body is None:
-                continue
-            if body.get("table") is not None:
-                parameter = _table(name, body, mistakes)
-            elif _has_words(body):
-                parameter = _option(name, body, mistakes)
-            else:
-                parameter = _number(name, body, mistakes)
-        if parameter is not None:
-            found.append(parameter)
-    return tuple(found)
-
-
-def _has_words(body: Mapping) -> bool:
-    return isinstance(body.get("options"), Sequence)
-
-
-def _reference(name: str, value: Scalar, mistakes: Mistakes) -> Reference | None:
-    if value.text in ROLES:
-        return Reference(name, value.text, "", value.place)
-    mistakes.add(
-        "E203",
-        value.place,
-        f"parameter {name}",
-        expected=f"{', '.join(ROLES)}, or a mapping with its unit",
-        got=brief(value.text) or "nothing",
-        hint=f"{name}: {{unit: N/m, min: 0}}",
-    )
-    return None
-
-
-def _option(name: str, body: Mapping, mistakes: Mistakes) -> Option | None:
-    body = check_keys(body, ("options", "default", "about"), f"parameter {name}", mistakes)
-    options = body.get("options")
-    assert isinstance(options, Sequence)
-    words = tuple(text for item in options.items if (text := read_text(item, "an option", mistakes)))
-    default = read_text(body.get("default"), "default", mistakes)
-    node = body.get("default")
-    if default is not None and node is not None and default not in words:
-        what = f"{name} has no option {brief(default)}"
-        add_unknown("E206", node.place, what, default, words, mistakes)
-    about = read_text(body.get("about"), "about", mistakes) or ""
-    return Option(name, words, default, about, options.place)
-
-
-def _table(name: str, body: Mapping, mistakes: Mistakes) -> Reference | None:
-    """Read `{table: N}`: a file of numbers over time, in a unit of the same dimension."""
-    body = check_keys(body, ("table", "about"), f"parameter {name}", mistakes)
-    node = body.get("table")
-    text = read_text(node, "table", mistakes, hint="table: N")
-    about = read_text(body.get("about"), "about", mistakes) or ""
-    if node is None or text is None:
-        return None
-    try:
-        return Reference(name, "table", about, body.place, parse_unit(text, node.place))
-    except ApcError as error:
-        mistakes.take(error)
-        return None
-
-
-def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
-    keys = ("unit", "min", "above", "max", "default", "about", "shared", "options")
-    body = check_keys(body, keys, f"parameter {name}", mistakes)
-    unit = _unit(body, name, mistakes)
-    shared = read_text(body.get("shared"), "shared", mistakes)
-    node = body.get("shared")
-    if shared not in (None, "divided", "whole") and node is not None:
-        mistakes.add("E203", node.place, "shared", expected="divided or whole", got=brief(shared or ""))
-    minimum = _declared(body.get("min"), name, unit, mistakes)
-    above = _declared(body.get("above"), name, unit, mistakes)
-    maximum = _declared(body.get("max"), name, unit, mistakes)
-    words = []
-    for key, value in entries(read_mapping(body.get("options"), "options", mistakes)):
-        number = _declared(value, key.text, unit, mistakes)
-        if number is not None:
-            words.append((key.text, number))
-    node = body.get("default")
-    named = dict(words).get(node.text) if isinstance(node, Scalar) else None
-    default = named if named is not None else _declared(node, name, unit, mistakes)
-    about = read_text(body.get("about"), "about", mistakes) or ""
-    if unit is None:
-        return None
-    return Number(
-        name,
-        unit,
-        default,
-        above if above is not None else minimum,
-        above is not None,
-        maximum,
-        shared == "divided",
-        tuple(words),
-        about,
-        body.place,
-    )
-
-
-def _unit(body: Mapping, name: str, mistakes: Mistakes) -> Unit | None:
-    node = body.get("unit")
-    if node is None:
-        mistakes.add(
-            "E201",
-            body.place,
-            f"{name} has no unit",
-            hint=f"{name}: {{unit: N/m}}  (unit: 1 when it has none)",
-        )
-        return None
-    text = read_text(node, "unit", mistakes, hint="unit: N/m")
-    if text is None:
-        return None
-    try:
-        return parse_unit(text, node.place)
-    except ApcError as error:
-        mistakes.take(error)
-        return None
-
-
-def _declared(node: Node | None, name: str, unit: Unit | None, mistakes: Mistakes) -> Fraction | None:
-    """Read a number of a declaration: bare, it is in the unit declared beside it."""
-    text = read_text(node, name, mistakes)
-    if node is None or text is None or unit is None:
-        return None
-    try:
-        if _NUMBER.match(text):
-            return parse_quantity(text, node.place).value * unit.scale
-        return quantity(text, node.place, what=name, unit=unit.text).value
-    except ApcError as error:
-        mistakes.take(error)
-        return None

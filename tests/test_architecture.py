@@ -28,7 +28,8 @@ ORDER = (
     ),
     *("apc.compiler.dimensions", "apc.compiler.values", "apc.compiler.tables"),
     # components and scenes
-    *("apc.compiler.component", "apc.compiler.parts", "apc.compiler.definitions", "apc.compiler.library"),
+    *("apc.compiler.component", "apc.compiler.parts", "apc.compiler.declarations"),
+    *("apc.compiler.definitions", "apc.compiler.library"),
     *("apc.compiler.graphs", "apc.compiler.groups", "apc.compiler.studies", "apc.compiler.scene"),
     # equations
     *("apc.compiler.flatten", "apc.compiler.clocks", "apc.compiler.symbolic", "apc.compiler.blocks"),
