@@ -60,6 +60,16 @@ def compiled(text: str, library: Library | None = None) -> CompiledSystem:
     return build_functions(ordered(text, library), Origin("scene.yaml", ()))
 
 
+def wall(mass: float, damping: float, delay: float, stiffness: float, virtual: float = 0.0) -> CompiledSystem:
+    """Return a device pressed against a sampled wall, the velocity by backward difference, T = 1 ms."""
+    return compiled(
+        "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+        f"masses: {{device: {{mass: {mass} kg, damping: {damping} N*s/m, x: 1 mm}}}}\n"
+        f"couplers: {{it: {{type: VirtualWall, flange: device, stiffness: {stiffness!r} N/m, clock: tick,"
+        f" period: 1 ms, damping: {virtual!r} N*s/m, delay: {delay} s, x: 1 mm}}}}\n"
+    )
+
+
 def library(folder: Path, *texts: str) -> Library:
     """Return the built-in library and components of our own, written to a folder."""
     for number, text in enumerate(texts):

@@ -1,0 +1,144 @@
+"""The command `sweep`: what it takes, what it prints, how it is interrupted.
+
+Takes: words of a command line. Gives: the click command `sweep_command`.
+Guarantees: with --json, stdout holds one JSON document and nothing else; progress goes to a terminal only;
+an interruption ends with what is kept, and says so.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from apc.compiler.errors import ApcError, Mistake, Place
+
+if TYPE_CHECKING:
+    from apc.runtime.sweep import Progress
+
+
+@click.command("sweep")
+@click.argument("file", required=False)
+@click.option(
+    "--over",
+    multiple=True,
+    required=True,
+    metavar="PATH=VALUES",
+    help="Vary a parameter: PATH='LOW:HIGH', 'LOW:HIGH:COUNT', 'LOW:HIGH:COUNT:log' or 'V1,V2,V3', with "
+    "units. May be repeated: every combination is computed, the last parameter turning fastest.",
+)
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the rows to this file, .parquet or .csv.",
+)
+@click.option(
+    "--of",
+    default="analyze",
+    show_default=True,
+    metavar="WHAT",
+    help="What to compute at each point; see below.",
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar='PATH="VALUE UNIT"',
+    help="Change a parameter for all points. May be repeated.",
+)
+@click.option("--jobs", type=click.IntRange(min=1), help="Processes to compute with; all cores by default.")
+@click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Compute on a running Dask cluster instead: its scheduler's address, tcp://HOST:8786.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+def sweep_command(
+    file: str | None,
+    over: tuple[str, ...],
+    out: Path,
+    of: str,
+    settings: tuple[str, ...],
+    jobs: int | None,
+    cluster: str | None,
+    as_json: bool,
+) -> None:
+    """Compute a result at every combination of parameter values.
+
+    FILE is a topology or a compiled model. What is finished is kept beside
+    the target as it comes; a sweep that was stopped, however it was, is taken
+    up by the same command.
+
+    \b
+        apc sweep --over contact.stiffness="100 N/m:3000 N/m:30" \\
+                  --over links.lan.delay="0,8 ms" --out results.csv
+
+    WHAT is "analyze" (verdict, spectral radius per frame with its error,
+    rigid modes, frequency and damping of the leading mode) or
+    "critical:PATH" (the value of another parameter at which the verdict
+    changes, with its error).
+    """
+    from apc.inputs import find_input, load_or_compile
+    from apc.runtime.sweep import sweep
+
+    values = _values(over)
+    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
+    if settings:
+        from apc.runtime.parameters import apply, parse_override
+
+        system = apply(system, [parse_override(system, text) for text in settings])
+    with _progress(out) as progress:
+        result = sweep(system, values, of=of, out=out, jobs=jobs, cluster=cluster, progress=progress)
+    if as_json:
+        click.echo(json.dumps(result.to_dict(), ensure_ascii=False, allow_nan=False, indent=2))
+    else:
+        click.echo(str(result))
+
+
+def _values(over: tuple[str, ...]) -> dict[str, str]:
+    """Return the values of each parameter by its name as written."""
+    form = "--over contact.stiffness='100 N/m:3000 N/m:30'"
+    found: dict[str, str] = {}
+    for text in over:
+        name, equals, values = (part.strip() for part in text.partition("="))
+        if not (equals and name and values):
+            raise ApcError(Mistake("E880", Place("sweep"), "--over", "PATH=VALUES", text[:80], form))
+        if name in found:
+            raise ApcError(Mistake("E883", Place("sweep"), f"{name[:80]} is swept twice"))
+        found[name] = values
+    return found
+
+
+@contextmanager
+def _progress(out: Path) -> Iterator[Progress]:
+    """Give a function that shows progress on a terminal; say what is kept if the body doesn't end well."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    state = {"done": 0, "of": 0}
+    shown = sys.stderr.isatty()
+    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
+        task = bar.add_task("sweep", total=None)
+
+        def progress(done: int, points: int) -> None:
+            state.update(done=done, of=points)
+            bar.update(task, completed=done, total=points)
+
+        try:
+            yield progress
+        except BaseException:
+            bar.stop()
+            if state["done"] > 0 and state["of"]:
+                kept = f"{state['done']:,} of {state['of']:,} points are kept in {out}.parts"
+                click.echo(f"{kept}; the same command takes up from there", err=True)
+            raise

@@ -1,0 +1,179 @@
+"""Published conditions on the stiffness of a virtual wall: passivity, Z-width, approximate stability.
+
+Takes: the physical quantities of a condition as arrays, in SI.
+Gives: `PublishedCondition`, `CONDITIONS`, and the largest stiffness each allows (`colgate_limit` and so on).
+Guarantees: each condition carries its source and its assumptions.
+Does not: know scenes (see `overlay`), or prove that one has the form a condition assumes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+# The symbols of the conditions: unit and meaning.
+UNITS = {"K": "N/m", "B": "N*s/m", "b": "N*s/m", "T": "s", "t_d": "s", "c": "N", "D": "m"}
+MEANINGS = {
+    "K": "stiffness of the virtual wall",
+    "B": "its damping, on the backward difference of positions",
+    "b": "physical damping of the device",
+    "T": "sampling period",
+    "t_d": "delay of the loop beyond the sample and hold",
+    "c": "Coulomb friction of the device",
+    "D": "resolution of the position sensor",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedCondition:
+    """A condition of the literature, limit(…) being the largest stiffness K it allows.
+
+    `symbols` are K and those that `limit` takes, in its order; `margin`, of all of them in their order, is
+    above zero where the condition holds, and continuous. `formula` is the condition as published.
+    """
+
+    name: str
+    title: str
+    formula: str
+    says: str
+    source: str
+    assumptions: tuple[str, ...]
+    symbols: tuple[str, ...]
+    limit: Callable[..., Floats]
+    margin: Callable[..., Floats]
+
+    def __str__(self) -> str:
+        """Return the condition with its meaning, assumptions and source."""
+        assumed = "; ".join(self.assumptions)
+        return f"{self.title}: {self.formula} ({self.says})\n  assumes {assumed}\n  source: {self.source}"
+
+
+def colgate_limit(b: ArrayLike, B: ArrayLike, T: ArrayLike) -> Floats:
+    """Return the largest passive stiffness, 2 (b − |B|)/T in N/m, or 0 where b ≤ |B| allows none.
+
+    Parameters
+    ----------
+    b, B
+        Physical damping of the device and damping of the wall, N·s/m.
+    T
+        Sampling period, s.
+    """
+    b, B, T = (np.asarray(value, dtype=np.float64) for value in (b, B, T))
+    return np.asarray(np.maximum(2 * (b - np.abs(B)) / T, 0.0))
+
+
+def gil_limit(b: ArrayLike, B: ArrayLike, T: ArrayLike, t_d: ArrayLike) -> Floats:
+    """Return the largest stable stiffness of the linear condition, (b + B)/(T/2 + t_d) in N/m.
+
+    Parameters
+    ----------
+    b, B
+        Physical damping of the device and damping of the wall, N·s/m.
+    T, t_d
+        Sampling period and delay, s.
+    """
+    b, B, T, t_d = (np.asarray(value, dtype=np.float64) for value in (b, B, T, t_d))
+    return np.asarray((b + B) / (T / 2 + t_d))
+
+
+def diolaiti_limit(b: ArrayLike, T: ArrayLike, t_d: ArrayLike) -> Floats:
+    """Return the largest stiffness that viscous damping pays for, b/(T/2 + t_d) in N/m.
+
+    Parameters
+    ----------
+    b
+        Physical damping of the device, N·s/m.
+    T, t_d
+        Sampling period and delay, s.
+    """
+    return gil_limit(b, 0.0, T, t_d)
+
+
+def abbott_limit(b: ArrayLike, T: ArrayLike, c: ArrayLike, D: ArrayLike) -> Floats:
+    """Return the largest passive stiffness with a quantized position, min(2 b/T, 2 c/D) in N/m.
+
+    Parameters
+    ----------
+    b, T
+        Physical damping of the device, N·s/m, and sampling period, s.
+    c, D
+        Coulomb friction of the device, N, and resolution of its position sensor, m.
+    """
+    b, T, c, D = (np.asarray(value, dtype=np.float64) for value in (b, T, c, D))
+    return np.asarray(np.minimum(2 * b / T, 2 * c / D))
+
+
+CONDITIONS: Mapping[str, PublishedCondition] = {
+    condition.name: condition
+    for condition in (
+        PublishedCondition(
+            name="colgate",
+            title="Colgate and Schenkel",
+            formula="b > K T/2 + |B|",
+            says="the wall is passive",
+            source="J. E. Colgate and G. G. Schenkel, J. Robotic Systems 14(1) (1997) 37",
+            assumptions=(
+                "a device of one degree of freedom: mass and viscous damping",
+                "the wall's velocity by backward difference, its force held from sample to sample",
+                "no delay beyond that",
+                "any passive user",
+            ),
+            symbols=("K", "b", "B", "T"),
+            limit=colgate_limit,
+            margin=lambda K, b, B, T: b - K * T / 2 - np.abs(B),
+        ),
+        PublishedCondition(
+            name="gil",
+            title="Gil et al.",
+            formula="K < (b + B)/(T/2 + t_d)",
+            says="contact with the wall is stable, approximately",
+            source="J. J. Gil, E. Sánchez, T. Hulin, C. Preusche and G. Hirzinger, "
+            "J. Computing and Information Science in Engineering 9(1) (2009) 011005",
+            assumptions=(
+                "a linear system: contact lasts",
+                "short delays and fast sampling",
+                "little physical and virtual damping for the mass",
+                "no user holds the device",
+            ),
+            symbols=("K", "b", "B", "T", "t_d"),
+            limit=gil_limit,
+            margin=lambda K, b, B, T, t_d: b + B - K * (T / 2 + t_d),
+        ),
+        PublishedCondition(
+            name="diolaiti",
+            title="Diolaiti et al.",
+            formula="b/(K T) ≥ 1/2 + t_d/T",
+            says="viscous damping pays for sampling and delay",
+            source="N. Diolaiti, G. Niemeyer, F. Barbagli and J. K. Salisbury, "
+            "IEEE Trans. Robotics 22(2) (2006) 256",
+            assumptions=(
+                "a device of one degree of freedom: mass and viscous damping",
+                "a wall without damping of its own, its force held from sample to sample",
+                "what the sensor's resolution adds is left out",
+            ),
+            symbols=("K", "b", "T", "t_d"),
+            limit=diolaiti_limit,
+            margin=lambda K, b, T, t_d: b - K * (T / 2 + t_d),
+        ),
+        PublishedCondition(
+            name="abbott",
+            title="Abbott and Okamura",
+            formula="K ≤ min(2 b/T, 2 c/D)",
+            says="the wall is passive in spite of a quantized position",
+            source="J. J. Abbott and A. M. Okamura, IEEE Trans. Robotics 21(5) (2005) 952",
+            assumptions=(
+                "a device of one degree of freedom: mass, viscous damping and Coulomb friction",
+                "a wall without damping of its own, its force held from sample to sample",
+                "no delay beyond that",
+            ),
+            symbols=("K", "b", "T", "c", "D"),
+            limit=abbott_limit,
+            margin=lambda K, b, T, c, D: np.minimum(b - K * T / 2, c - K * D / 2),
+        ),
+    )
+}

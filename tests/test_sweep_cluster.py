@@ -1,0 +1,144 @@
+"""The same sweep on a real Dask cluster: the same numbers, and a sentence when the cluster isn't there."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from pathlib import Path
+
+import pytest
+
+from apc.compiler.errors import ApcError, Place
+from apc.runtime import sweep_cluster, sweep_work
+from apc.runtime.sweep import sweep
+from tests.sweeping import CHEAP, parts
+from tests.topologies import compiled, told
+
+distributed = pytest.importorskip("distributed", reason="Dask's distributed is not installed: apc[cluster]")
+
+MODEL = compiled(CHEAP)
+OVER = {"it.stiffness": "10 N/m:9000 N/m:100", "it.delay": "0,1,1.5 ms"}
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[distributed.LocalCluster]:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=2, processes=True, dashboard_address=":0"
+    ) as found:
+        yield found
+
+
+def test_a_cluster_gives_the_same_file_to_the_last_bit(
+    tmp_path: Path, cluster: distributed.LocalCluster
+) -> None:
+    here, there = tmp_path / "here.csv", tmp_path / "there.csv"
+    sweep(MODEL, OVER, out=here, jobs=1)
+    sweep(MODEL, OVER, out=there, cluster=cluster.scheduler_address)
+    assert here.read_bytes() == there.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["here.csv", "there.csv"]
+
+
+def test_what_was_begun_here_is_finished_on_the_cluster(
+    tmp_path: Path, cluster: distributed.LocalCluster
+) -> None:
+    whole, target = tmp_path / "whole.csv", tmp_path / "r.csv"
+    sweep(MODEL, OVER, out=whole, jobs=1)
+
+    def stop(done: int, points: int) -> None:
+        if done >= 128:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep(MODEL, OVER, out=target, jobs=1, progress=stop)
+    found = sweep(MODEL, OVER, out=target, cluster=cluster.scheduler_address)
+    assert found.notes == ("128 points were there already",)
+    assert target.read_bytes() == whole.read_bytes()
+
+
+def test_workers_with_other_versions_are_refused(
+    tmp_path: Path, cluster: distributed.LocalCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tuple(
+        (name, "1.2.3" if name == "numpy" else found) for name, found in sweep_work.program_versions()
+    )
+    monkeypatch.setattr("apc.runtime.sweep.program_versions", lambda: here)
+    address = cluster.scheduler_address
+    with pytest.raises(ApcError, match=r"E888 a worker has numpy .* \(here 1\.2\.3\): the same numbers"):
+        sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=address)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cluster_that_is_not_there_is_told_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 0.5)
+    with socket.socket() as taken:  # a port that nobody listens at
+        taken.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        assert told(lambda: sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=address)) == [
+            f"{address}: E888 no Dask scheduler answers there within 0.5 s. Write: --cluster tcp://HOST:8786"
+        ]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("address", ["", "tcp://", "tcp://host", "host without port", "a:b:c", "x" * 200])
+def test_an_address_that_is_none_is_told(address: str) -> None:
+    shown = address[:80]
+    assert told(lambda: sweep(MODEL, OVER, cluster=address)) == [
+        f"{shown}: E888 a scheduler's address wants HOST:PORT"
+        + (f", got {shown}" if address else "")
+        + ". Write: --cluster tcp://HOST:8786"
+    ]
+
+
+def test_a_transport_nobody_knows_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 0.5)
+    (message,) = told(lambda: sweep(MODEL, OVER, cluster="nonsense://host:1"))
+    assert message.startswith("nonsense://host:1: E888 no Dask scheduler answers there")
+
+
+def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 1)
+    with distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=":0") as empty:
+        assert told(lambda: sweep(MODEL, OVER, cluster=empty.scheduler_address)) == [
+            f"{empty.scheduler_address}: E888 the cluster there has no workers."
+        ]
+
+
+def test_a_cluster_lost_on_the_way_keeps_what_is_finished(tmp_path: Path) -> None:
+    target = tmp_path / "r.csv"
+    lost = distributed.LocalCluster(n_workers=1, processes=True, dashboard_address=":0")
+
+    def lose(done: int, points: int) -> None:
+        if done >= 64:
+            lost.close()
+
+    with pytest.raises(ApcError, match="E888 the connection to the cluster is lost"):
+        sweep(MODEL, OVER, out=target, cluster=lost.scheduler_address, progress=lose)
+    assert len(parts(target)) >= 1
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (CancelledError(), "the connection to the cluster is lost"),
+        (distributed.KilledWorker("part", None, 3), "several workers of the cluster died on the same part"),
+        (ModuleNotFoundError("No module named 'apc'"), "the workers of the cluster can't load apc"),
+        (RuntimeError("Error during deserialization of the task graph"), "can't load apc"),
+    ],
+)
+def test_what_a_cluster_may_suffer_is_told(error: Exception, message: str) -> None:
+    told_error = sweep_cluster._trouble(error, Place("tcp://host:1"))
+    assert told_error is not None
+    assert message in str(told_error)
+
+
+def test_a_bug_of_ours_is_no_trouble_of_the_cluster() -> None:
+    assert sweep_cluster._trouble(AssertionError("ours"), Place("tcp://host:1")) is None
+
+
+def test_a_missing_distributed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert told(lambda: sweep(MODEL, OVER, cluster="tcp://host:1")) == [
+        "tcp://host:1: E888 a cluster needs Dask's distributed, here and on its workers. "
+        "Write: pip install 'apc[cluster]'"
+    ]

@@ -1,0 +1,78 @@
+"""Tables as files: every digit, nothing for nothing, the same bytes for the same rows."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from apc.runtime.table_file import BLOCK, check_table_path, write_table
+from tests.topologies import told
+
+HEADINGS = ("x [m]", "verdict", "modes")
+KINDS = ("number", "text", "count")
+ROWS = ((0.1 + 0.2, "stable, or so", 1), (5e-324, 'say "no"', None), (None, None, 3), (-1e300, "ρ\nσ", 4))
+
+
+def test_csv_keeps_every_digit_and_leaves_empty_cells_empty(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    write_table(path, HEADINGS, KINDS, ROWS, {})
+    with path.open(encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert tuple(head) == HEADINGS
+    back = [tuple(float(c) if i != 1 and c else c or None for i, c in enumerate(row)) for row in rows]
+    assert back == list(ROWS)
+    assert "nan" not in path.read_text(encoding="utf-8")
+
+
+def test_parquet_keeps_types_and_what_made_it(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "t.parquet"
+    write_table(path, HEADINGS, KINDS, ROWS, {"model": "abc"})
+    table = parquet.read_table(path)
+    assert [tuple(row.values()) for row in table.to_pylist()] == list(ROWS)
+    assert [str(kind) for kind in table.schema.types] == ["double", "string", "int64"]
+    assert json.loads(table.schema.metadata[b"apc"]) == {"model": "abc"}
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_the_same_rows_give_the_same_bytes_over_many_blocks(tmp_path: Path, suffix: str) -> None:
+    pytest.importorskip("pyarrow")
+    rows = [(math.sqrt(i), "word", i) for i in range(BLOCK + 10)]
+    paths = [tmp_path / f"{i}.{suffix}" for i in range(2)]
+    for path in paths:
+        write_table(path, HEADINGS, KINDS, iter(rows), {"a": 1})
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+@pytest.mark.parametrize(("name", "got"), [("t.xlsx", ".xlsx"), ("t", "no suffix")])
+def test_another_suffix_is_refused(name: str, got: str) -> None:
+    assert told(check_table_path, Path(name)) == [f"{name}: E887 a table wants .csv or .parquet, got {got}."]
+
+
+def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    assert told(check_table_path, Path("t.parquet")) == [
+        "t.parquet: E887 is a Parquet file, which needs pyarrow; without it, --out can end in .csv. "
+        "Write: pip install 'apc[data]'"
+    ]
+    assert told(check_table_path, Path("t.csv")) == []
+
+
+def test_an_unwritable_folder_is_told_and_nothing_is_left(tmp_path: Path) -> None:
+    path = tmp_path / "not-there" / "t.csv"
+    (message,) = told(write_table, path, HEADINGS, KINDS, ROWS, {})
+    assert message == f"{path}: E601 can't be written: No such file or directory."
+
+
+def test_a_folder_in_the_way_is_told_before_anything_is_computed(tmp_path: Path) -> None:
+    (tmp_path / "r.csv").mkdir()
+    path = tmp_path / "r.csv"
+    assert told(check_table_path, path) == [f"{path}: E601 can't be written: it is a folder."]
