@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path, PurePath
 
-FORMAT = 3  # of NAME.apc
+FORMAT = 4  # of NAME.apc
 MEMBER = "model.json"  # of the archive: structure, numbers and the digests of the other members
 LARGEST = 256 * 2**20
 PROGRAM = "apc"

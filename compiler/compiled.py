@@ -59,11 +59,46 @@ class PairDelay:
 
 
 @dataclass(frozen=True, slots=True)
+class Loss:
+    """How packets get lost, by netem's `gemodel` (after Gilbert and Elliott): names of four parameters.
+
+    In its good state a way from peer to peer loses a packet with the probability `one_minus_k`, in its bad
+    state with `one_minus_h`; after each packet a good one turns bad with the probability `p`, a bad one good
+    with `r`. With r = 1 − p losses are independent.
+    """
+
+    p: str
+    r: str
+    one_minus_h: str
+    one_minus_k: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channel:
+    """What makes a link unreliable; every way from peer to peer on its own.
+
+    `jitter` is the name of a timing, added to the delay times a number drawn from `distribution` ("uniform",
+    "normal" or "pareto"). `trace` (n,) are recorded delays in seconds instead, one a packet, infinite for one
+    that was lost, from the first again after the last. `reorder` says whether the packet sent last wins
+    ("newest") or the one that arrived last ("all"); `on_loss` whether a receiver that misses a packet holds
+    the one before ("hold") or takes what it would itself send at that moment ("zero": no difference, no
+    force).
+    """
+
+    loss: Loss | None
+    jitter: str | None
+    distribution: str
+    reorder: str
+    on_loss: str
+    trace: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True, slots=True)
 class Link:
     """Carries every sender's channels to those who hear it.
 
     `clock` is the name of a clock, `delay` of a timing; `delays` are the pairs of groups with a delay of
-    their own.
+    their own. `channel` is None for a reliable link.
     """
 
     name: str
@@ -71,6 +106,7 @@ class Link:
     delay: str
     graph: Graph
     delays: tuple[PairDelay, ...]
+    channel: Channel | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,12 +178,14 @@ class Receive:
 class ClockPartition:
     """What a site computes at a tick of one clock.
 
-    `tick(x, u, m, r, p, t) -> y (n_y,)`; `outputs` names the rows of y; `memories` are the rows of y
-    whose values at the previous tick make up m; `starts` are the parameters holding their start values.
+    `tick(x, u, m, r, p, t) -> y (n_y,)`; `outputs` names the rows of y, `units` their SI units; `memories`
+    are the rows of y whose values at the previous tick make up m; `starts` are the parameters holding their
+    start values.
     """
 
     clock: str
     outputs: tuple[str, ...]
+    units: tuple[str, ...]
     memories: tuple[int, ...]
     starts: tuple[str, ...]
     receives: tuple[Receive, ...]
@@ -165,6 +203,18 @@ class SendPartition:
 
 
 @dataclass(frozen=True, slots=True)
+class Ports:
+    """Where held values act on what moves: `port(x, u, p, t) -> (potentials, then flows) (2 n,)`.
+
+    `parts` (n,) names the part of each; a flow counts into its part and follows from u and p alone. A part
+    does the work −flow · (change of the potential) while nothing switches.
+    """
+
+    parts: tuple[str, ...]
+    port: Any  # casadi.Function
+
+
+@dataclass(frozen=True, slots=True)
 class Kind:
     """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`."""
 
@@ -175,6 +225,7 @@ class Kind:
     derivative: Any  # casadi.Function
     clocks: tuple[ClockPartition, ...]
     sends: tuple[SendPartition, ...]
+    ports: Ports | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,8 +260,28 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True)
+class Experiment:
+    """How long a simulation runs, in seconds (None if not said), and the seed of what is random in it."""
+
+    duration: Fraction | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A range of a parameter, in SI, for a study."""
+
+    parameter: str
+    low: Fraction
+    high: Fraction
+
+
+@dataclass(frozen=True, slots=True)
 class CompiledSystem:
-    """A compiled scene. `dropped` lists what the scene named but does not need, with the reason."""
+    """A compiled scene. `dropped` lists what the scene named but does not need, with the reason.
+
+    `region` are the axes x and y of the study of that name, empty or one if the scene leaves them open.
+    """
 
     name: str
     about: str
@@ -222,6 +293,8 @@ class CompiledSystem:
     groups: tuple[Group, ...]
     dropped: tuple[tuple[str, str], ...]
     origin: Origin
+    experiment: Experiment = Experiment()
+    region: tuple[Axis, ...] = ()
 
     def __str__(self) -> str:
         """Return what the model holds, a line a kind of peer."""

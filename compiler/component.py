@@ -19,7 +19,7 @@ from apc.compiler.values import Binding, Bounds
 
 OTHERS = "others"
 # A parameter of one of these roles isn't a number: it names, or describes, something of the scene.
-ROLES = ("clock", "link", "graph", "delays", "table")
+ROLES = ("clock", "link", "graph", "delays", "loss", "trace", "table")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Option:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A parameter of a role: it names a clock or link, or describes a graph, delays or a table."""
+    """A parameter of a role: it names a clock or link, or describes a graph, delays, loss or a table."""
 
     name: str
     role: str

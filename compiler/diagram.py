@@ -210,6 +210,7 @@ def _net(link: SceneLink) -> Net:
     if not link.delay.number:
         lines[-1] = "available at once"
     lines += [f"{d.sender} to {d.receiver}: {seconds(d.delay.number)} later" for d in link.delays]
+    lines += [] if link.channel is None else link.channel.told
     pairs = tuple((int(sender), int(receiver)) for sender, receiver in link.graph.arcs)
     return Net(link.name, tuple(lines), link.clock, link.graph.shape, pairs)
 

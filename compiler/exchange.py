@@ -13,8 +13,21 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.channels import SceneChannel
 from apc.compiler.clocks import HoldCrossing, count_of
-from apc.compiler.compiled import PEERS, Clock, Column, Group, Kind, Link, PairDelay, Parameter, Timing
+from apc.compiler.compiled import (
+    PEERS,
+    Channel,
+    Clock,
+    Column,
+    Group,
+    Kind,
+    Link,
+    Loss,
+    PairDelay,
+    Parameter,
+    Timing,
+)
 from apc.compiler.component import Number as NumberParameter
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.evaluation import evaluate
@@ -26,6 +39,12 @@ from apc.compiler.values import Value
 
 NO_DELAY = "no delay"
 COUNT_ABOUT = "peers heard over the link, counted with their weights"
+LOSS_ABOUT = (
+    "probability that a good link turns bad after a packet",
+    "probability that a bad link turns good after a packet",
+    "probability that a bad link loses a packet",
+    "probability that a good link loses a packet",
+)
 
 
 class Timings:
@@ -105,7 +124,20 @@ def _link(link: SceneLink, timings: Timings) -> Link:
         )
         for pair in link.delays
     )
-    return Link(link.name, link.clock, timings.use(f"{link.name}.delay", link.delay), link.graph, delays)
+    delay = timings.use(f"{link.name}.delay", link.delay)
+    channel = None if link.channel is None else _channel(link.name, link.channel, timings)
+    return Link(link.name, link.clock, delay, link.graph, delays, channel)
+
+
+def _channel(link: str, channel: SceneChannel, timings: Timings) -> Channel:
+    return Channel(
+        Loss(*(name for name, _ in channel.loss)) if channel.loss else None,
+        None if channel.jitter is None else timings.use(f"{link}.jitter", channel.jitter),
+        channel.distribution,
+        channel.reorder,
+        channel.on_loss,
+        channel.trace,
+    )
 
 
 def used_clocks(
@@ -214,8 +246,8 @@ def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
     return Parameter(name, unit, number, value.expression, about=f"start value: {variable.about}")
 
 
-def all_parameters(scene: Scene, kinds: Sequence[Kind]) -> tuple[Parameter, ...]:
-    """Return every parameter of the scene: named ones, then each part's, then the start values in use."""
+def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
+    """Return every parameter of the scene: named ones, each part's, start values in use, those of links."""
     found = {name: compiled_parameter(scene, name, value) for name, value in scene.parameters}
     needed = {name for kind in kinds for name in kind.parameters}
     for part in scene.parts:
@@ -232,5 +264,10 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind]) -> tuple[Parameter, ...]
         if count_of(link.name) in needed:  # every group has its own value
             name = count_of(link.name)
             found[name] = Parameter(name, "1", float(scene.peers - 1), about=COUNT_ABOUT)
+        if link.channel is not None and any(used.name == link.name for used in links):
+            found |= {
+                name: Parameter(name, "1", float(value.number), value.expression, 0.0, False, 1.0, about)
+                for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
+            }
     found[PEERS] = Parameter(PEERS, "1", float(scene.peers), about="number of peers")
     return tuple(found.values())

@@ -24,12 +24,14 @@ from apc.compiler.compiled import (
     Hold,
     Kind,
     Origin,
+    Ports,
     Receive,
     SendPartition,
     State,
 )
 from apc.compiler.component import OTHERS
 from apc.compiler.exchange import Timings, all_parameters, compiled_groups, used_clocks, used_links
+from apc.compiler.ports import held_ports
 from apc.compiler.scene import Scene
 from apc.compiler.structure import SortedKind, SortedSystem
 from apc.compiler.symbolic import derivative_symbol, no_derivative, symbol, to_sympy
@@ -82,11 +84,13 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         tuple(clocks),
         tuple(links),
         timings.found,
-        all_parameters(scene, kinds),
+        all_parameters(scene, kinds, links),
         tuple(kinds),
         compiled_groups(scene, kinds, numbers, links, timings),
         tuple(dict.fromkeys([*dropped, *unheard, *silent])),
         origin,
+        scene.experiment,
+        scene.region,
     )
 
 
@@ -125,6 +129,7 @@ class _KindBuilder:
 
     def __init__(self, scene: Scene, kind: SortedKind, timings: Timings) -> None:
         self.kind = kind
+        self.scene = scene
         self.tables = {
             f"{part.name}.{table.name}": table
             for part in scene.parts
@@ -220,7 +225,24 @@ class _KindBuilder:
             derivative,
             clocks,
             sends,
+            self._ports(writer, inputs),
         )
+
+    def _ports(self, writer: _Writer, inputs: dict[str, Any]) -> Ports | None:
+        """Write where held values act, of those that anything reads."""
+        written = writer.known.keys()
+        found = [port for port in held_ports(self.scene, self.kind) if port.symbols <= written]
+        if not found:
+            return None
+        rows = [port.potential for port in found] + [port.flow for port in found]
+        port = casadi.Function(
+            "port",
+            [inputs["x"], inputs["u"], inputs["p"], inputs["t"]],
+            [writer.column(writer.translate(row) for row in rows)],
+            ["x", "u", "p", "t"],
+            ["potentials_flows"],
+        )
+        return Ports(tuple(port.part for port in found), port)
 
     @staticmethod
     def _hold_name(hold: HoldCrossing, holds: Sequence[HoldCrossing]) -> str:
@@ -228,8 +250,11 @@ class _KindBuilder:
         return hold.variable if same == 1 else hold.symbol
 
     def _state(self, name: str) -> State:
+        return State(name, self._unit(name), name)
+
+    def _unit(self, name: str) -> str:
         variable = next(v for v in self.kind.clocked.flat.variables if v.name == name)
-        return State(name, format_dimension(variable.dimension), name)
+        return format_dimension(variable.dimension)
 
     def _reach(self) -> set[sympy.Symbol]:
         """Return every symbol that the motion of the states, through all crossings, depends on."""
@@ -336,6 +361,7 @@ class _KindBuilder:
         return ClockPartition(
             clock,
             tuple(outputs),
+            tuple(self._unit(name) for name in outputs),
             tuple(outputs.index(previous.variable) for previous in remembered.values()),
             tuple(previous.variable for previous in remembered.values()),
             tuple(

@@ -76,6 +76,8 @@ def _(scene: Scene) -> str:
     for link in scene.links:
         lines.append(f"link {link.name}: {link.graph.shape}, on {link.clock}, delay {_quantity(link.delay)}")
         lines += [f"  from {d.sender} to {d.receiver}: {_quantity(d.delay)}" for d in link.delays]
+        if link.channel is not None:
+            lines += [f"  {told}" for told in link.channel.told]
     return "\n".join(lines)
 
 

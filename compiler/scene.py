@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
-from apc.compiler.compiled import Graph
+from apc.compiler.channels import SceneChannel, read_channel
+from apc.compiler.compiled import Axis, Experiment, Graph
 from apc.compiler.component import Component, Number, Option, Reference, Settable
 from apc.compiler.definitions import RESERVED, read_type
 from apc.compiler.dimensions import SECOND
@@ -35,7 +36,7 @@ from apc.compiler.reading import (
     read_text,
 )
 from apc.compiler.source import Mapping, Node, Scalar, Sequence, Source
-from apc.compiler.studies import Axis, Experiment, read_experiment, read_region
+from apc.compiler.studies import read_experiment, read_region
 from apc.compiler.tables import TimeTable, read_time_table
 from apc.compiler.units import DIMENSIONLESS, Dimension
 from apc.compiler.values import (
@@ -113,13 +114,14 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class SceneLink:
-    """Who hears whom over a link, and how late."""
+    """Who hears whom over a link, how late, and how unreliably (`channel`, None for a reliable one)."""
 
     name: str
     clock: str
     delay: Value
     graph: Graph
     delays: tuple[PairDelay, ...]
+    channel: SceneChannel | None
     place: Place
 
 
@@ -673,9 +675,20 @@ class _Reader:
             what = f"{part.name} is a {part.component.name}, which is no link: it has no clock and delay"
             self.mistakes.add("E210", part.place, what, hint="type: Link")
             return None
+        channel = read_channel(
+            part.name,
+            body,
+            {role: body.get(name) for role, name in roles.items()} | {"jitter": body.get("jitter")},
+            values.get("jitter"),
+            dict(part.options),
+            lambda node, what: self._value(node, what, DIMENSIONLESS, "%"),
+            self.folder,
+            self.mistakes,
+            self.texts,
+        )
         if clock is None or "delay" not in values:
             return None  # reported where it is
-        return SceneLink(part.name, clock, values["delay"], graph, tuple(delays), part.place)
+        return SceneLink(part.name, clock, values["delay"], graph, tuple(delays), channel, part.place)
 
     def _group(self, group: GroupBody, settable: dict[str, list[tuple[str, Settable]]]) -> PeerGroup:
         own = {name: items for name, items in settable.items() if not self._is_of_link(name)}

@@ -12,8 +12,10 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+from apc.compiler.channels import PROBABILITIES
 from apc.compiler.component import Component, Number, Option, Parameter, Reference
 from apc.compiler.errors import Place
+from apc.compiler.exchange import LOSS_ABOUT
 from apc.compiler.graphs import SHAPES
 from apc.compiler.groups import LARGEST_COUNT
 from apc.compiler.library import Library
@@ -86,6 +88,8 @@ def topology_schema(library: Library) -> Schema:
         ),
         "graph": _graph(),
         "delays": _named(_named(quantities.of(_unit("s")))),
+        "probability": _probability(),
+        "loss": _loss(),
         "axis": {
             **_object({}),
             "additionalProperties": {
@@ -131,6 +135,16 @@ class _Quantities:
                 _number_schema() if unit.text == "1" else _quantity_schema(unit, or_rate=or_rate)
             )
         return {"$ref": f"#/$defs/{self._names[key]}"}
+
+
+def _probability() -> Schema:
+    return {
+        "type": ["number", "string"],
+        "minimum": 0,
+        "maximum": 1,
+        "description": "a number from 0 to 1, a percentage, or an expression",
+        "examples": ["2 %"],
+    }
 
 
 def _number_schema() -> Schema:
@@ -187,6 +201,8 @@ def _parameter(parameter: Parameter, quantities: _Quantities) -> Schema:
             "link": {"$ref": "#/$defs/name", "description": "a link"},
             "graph": {"$ref": "#/$defs/graph", "description": "who hears whom"},
             "delays": {"$ref": "#/$defs/delays", "description": "other delays: sending group, hearing group"},
+            "loss": {"$ref": "#/$defs/loss", "description": "how packets get lost"},
+            "trace": {**_string(), "description": "a CSV file of recorded delays, one a packet"},
             "table": {**_string(), "description": "a CSV file of numbers over time"},
         }
         return {**by_role[parameter.role], **about}
@@ -276,6 +292,12 @@ def _graph() -> Schema:
     pairs = {"anyOf": [{"type": "array", "items": pair}, {"type": "string", "pattern": r"\.csv$"}]}
     either = {**_object({"edges": pairs, "arcs": pairs}), "minProperties": 1, "maxProperties": 1}
     return {"anyOf": [{"enum": list(SHAPES)}, either]}
+
+
+def _loss() -> Schema:
+    told = dict(zip(PROBABILITIES, LOSS_ABOUT, strict=True))
+    each = {name: {"$ref": "#/$defs/probability", "description": about} for name, about in told.items()}
+    return {"anyOf": [{"$ref": "#/$defs/probability"}, _object(each, required=["p"])]}
 
 
 def _named(schema: Schema) -> Schema:

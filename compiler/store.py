@@ -119,9 +119,14 @@ def _is_consistent(system: CompiledSystem) -> bool:
     named = [timing for clock in system.clocks for timing in (clock.period, clock.phase)]
     named += [link.delay for link in system.links]
     named += [pair.delay for link in system.links for pair in link.delays]
+    channels = [link.channel for link in system.links if link.channel is not None]
+    named += [channel.jitter for channel in channels if channel.jitter is not None]
+    losses = [dataclasses.astuple(channel.loss) for channel in channels if channel.loss is not None]
     return (
         bool(system.groups)
         and timings.issuperset(named)
+        and all(parameters.issuperset(loss) for loss in losses)
+        and all(channel.trace is None or channel.trace.size > 0 for channel in channels)
         and all(link.clock in clocks for link in system.links)
         and all({pair.sender, pair.receiver} <= groups for link in system.links for pair in link.delays)
         and all(0 <= group.kind < len(system.kinds) and group.count > 0 for group in system.groups)
@@ -143,6 +148,10 @@ def _is_kind_consistent(
         and parameters.issuperset(state.start for state in kind.states)
         and partitions.keys() <= clocks
         and sends.keys() <= links
+        and all(len(partition.units) == len(partition.outputs) for partition in kind.clocks)
+        and (
+            kind.ports is None or _sizes(kind.ports.port) == ([n_x, n_u, n_p, 1], [2 * len(kind.ports.parts)])
+        )
         and all(hold.delay in timings and hold.clock in partitions for hold in kind.holds)
         and all(0 <= hold.output < len(partitions[hold.clock].outputs) for hold in kind.holds)
         and all(receive.link in links for receive in receives)

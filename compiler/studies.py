@@ -1,6 +1,6 @@
 """What a topology asks to be done with its scene: the experiment, and ranges of parameters to study.
 
-Takes: the sections `experiment` and `studies`. Gives: `Experiment`, `Axis`.
+Takes: the sections `experiment` and `studies`. Gives: an `Experiment`, `Axis`es.
 Guarantees: a duration is more than nothing, a range has its lower end first and the parameter's unit.
 Does not: do it.
 """
@@ -8,9 +8,8 @@ Does not: do it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from fractions import Fraction
 
+from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.component import Number, Settable
 from apc.compiler.errors import Mistakes
 from apc.compiler.reading import add_unknown, brief, check_keys, form, read_mapping
@@ -21,30 +20,13 @@ from apc.compiler.values import Value
 SettableNames = Mapping[str, list[tuple[str, Settable]]]
 
 
-@dataclass(frozen=True, slots=True)
-class Experiment:
-    """How long a simulation runs, in seconds (None if not said), and the seed of what is random in it."""
-
-    duration: Fraction | None
-    seed: int
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """A range of a parameter, in SI, for a study."""
-
-    parameter: str
-    low: Fraction
-    high: Fraction
-
-
 def read_experiment(
     node: Node | None, read_time: Callable[[Node | None, str], Value | None], mistakes: Mistakes
 ) -> Experiment:
     """Read `experiment: {duration: 3 s, seed: 1}`; `read_time` reads a duration."""
     section = read_mapping(node, "experiment", mistakes, hint="experiment: {duration: 3 s}")
     if section is None:
-        return Experiment(None, 0)
+        return Experiment()
     section = check_keys(section, ("duration", "seed"), "experiment", mistakes)
     duration = read_time(section.get("duration"), "duration")
     if duration is not None and duration.number <= 0:

@@ -1,7 +1,8 @@
 """Tables in CSV files: columns with their units in the headings.
 
-Takes: a path. Gives: `Table` and `TimeTable`, in SI.
-Guarantees: every cell is a finite number, or a mistake names its file, line and column.
+Takes: a path. Gives: `Table`, `TimeTable` and `Trace`, in SI.
+Guarantees: every cell is a finite number (or says that a packet was lost, in a trace), or a mistake names its
+file, line and column.
 Does not: know what a column means.
 """
 
@@ -11,8 +12,10 @@ import csv
 import hashlib
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +27,20 @@ from apc.compiler.units import NO_UNIT, Unit, parse_unit
 
 MAX_BYTES = 1 << 28  # 256 MiB: some ten million numbers
 MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows
+LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with nothing in it
 _HEADING = re.compile(r"\s*(?P<name>[^\[\]]*?)\s*(\[\s*(?P<unit>[^\[\]]*?)\s*\])?\s*\Z")
+
+
+class Reader(Protocol):
+    """A reader of the module `csv`, whose type has no public name."""
+
+    @property
+    def line_num(self) -> int:
+        """The line read last."""
+
+    def __iter__(self) -> Iterator[list[str]]: ...
+
+    def __next__(self) -> list[str]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +112,94 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeT
     return TimeTable(name, times.numbers, numbers.numbers, table.digest)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """Recorded one-way delays: `delays` (n,) in seconds, one a packet, infinite for one that was lost.
+
+    `digest` is the SHA-256 of the file's bytes.
+    """
+
+    delays: NDArray[np.float64]
+    digest: str
+
+
+def read_trace(path: Path, named_at: Place) -> Trace:
+    """Read the column `delay` of a CSV file: 0 or more a packet; `lost`, or nothing, if it was lost.
+
+    Other columns may say anything. A line without a character is no packet.
+
+    Parameters
+    ----------
+    path
+        The CSV file.
+    named_at
+        Where the topology names it, for a file that can't be read.
+
+    Raises
+    ------
+    ApcError
+        E701 it can't be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is at
+        fault, or there is none.
+    """
+    reader, digest = _reader(path, named_at)
+    file = str(path)
+    mistakes = Mistakes()
+    delays: list[float] = []
+    try:
+        names = _headings(reader, file, mistakes)
+        mistakes.raise_if_any()
+        own = _delay_column(names)
+        faults = 0
+        for cells in reader:
+            if not cells or (len(cells) == 1 and cells[0].isspace()):
+                continue
+            delay = _delay(cells, own, names, Place(file, reader.line_num), mistakes)
+            delays.append(delay)
+            faults += math.isnan(delay)
+            if faults >= MOST_MISTAKES:
+                break
+    except csv.Error as error:
+        raise ApcError(Mistake("E703", Place(file, reader.line_num or 1, 1), f"is no CSV: {error}")) from None
+    mistakes.raise_if_any()
+    if not delays:
+        raise ApcError(Mistake("E703", Place(file, 2, 1), "the table has headings but no rows"))
+    return Trace(np.array(delays), digest)
+
+
+def _delay_column(names: list[tuple[str, Unit, Place]]) -> int:
+    """Return which column is called delay. Raises ApcError if there is none, or it is in no unit of time."""
+    got, place = ", ".join(name for name, _, _ in names), names[0][2]
+    for column, (name, unit, at) in enumerate(names):
+        if name == "delay":
+            if unit.dimension == SECOND:
+                return column
+            got, place = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
+    expected = "a column delay in a unit of time"
+    raise ApcError(Mistake("E702", place, "a trace", expected, brief(got), "delay [ms]"))
+
+
+def _delay(
+    cells: list[str], own: int, names: list[tuple[str, Unit, Place]], row: Place, mistakes: Mistakes
+) -> float:
+    """Return a packet's delay in seconds: infinite if it was lost, not a number if its row is at fault."""
+    if len(cells) != len(names):
+        what = f"the row has {len(cells)} cells and there are {len(names)} headings"
+        mistakes.add("E703", row.shifted(1), what)
+        return math.nan
+    cell = cells[own].strip()
+    if cell in ("", LOST):
+        return math.inf
+    try:
+        number = float(cell)
+    except ValueError:
+        number = math.nan
+    if 0 <= number < math.inf:
+        return number * float(names[own][1].scale)
+    place = row.shifted(sum(len(other) + 1 for other in cells[:own]) + 1)
+    mistakes.add("E703", place, "a delay", expected=f"a time of 0 or more, or {LOST}", got=brief(cell))
+    return math.nan
+
+
 def read_table(path: Path, named_at: Place) -> Table:
     """Read a CSV file of numbers below headings such as `device.mass [kg]`.
 
@@ -111,25 +215,13 @@ def read_table(path: Path, named_at: Place) -> Table:
     ApcError
         E701 it can't be read, E702 a heading, E703 a row or cell is at fault.
     """
-    data = _bytes(path, named_at)
+    reader, digest = _reader(path, named_at)
     file = str(path)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ApcError(
-            Mistake("E701", named_at, f"{path.name} is not UTF-8 text (byte {error.start})")
-        ) from None
-    reader = csv.reader(text.splitlines())
     mistakes = Mistakes()
     try:
-        headings = next(reader, [])
-        if not any(heading.strip() for heading in headings):
-            raise ApcError(
-                Mistake("E702", Place(file, 1, 1), "the table has no headings", hint="device.mass [kg]")
-            )
-        names = [_heading(heading, file, headings[:i], mistakes) for i, heading in enumerate(headings)]
+        names = _headings(reader, file, mistakes)
         mistakes.raise_if_any()
-        rows, lines = _rows(reader, len(headings), file, mistakes)
+        rows, lines = _rows(reader, len(names), file, mistakes)
     except csv.Error as error:
         raise ApcError(Mistake("E703", Place(file, reader.line_num or 1, 1), f"is no CSV: {error}")) from None
     mistakes.raise_if_any()
@@ -140,7 +232,29 @@ def read_table(path: Path, named_at: Place) -> Table:
         Column(name, unit, numbers[:, i] * float(unit.scale), place)
         for i, (name, unit, place) in enumerate(names)
     )
-    return Table(file, columns, tuple(lines), hashlib.sha256(data).hexdigest())
+    return Table(file, columns, tuple(lines), digest)
+
+
+def _reader(path: Path, named_at: Place) -> tuple[Reader, str]:
+    """Return a file's rows of cells, and the SHA-256 of its bytes."""
+    data = _bytes(path, named_at)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ApcError(
+            Mistake("E701", named_at, f"{path.name} is not UTF-8 text (byte {error.start})")
+        ) from None
+    return csv.reader(text.splitlines()), hashlib.sha256(data).hexdigest()
+
+
+def _headings(reader: Reader, file: str, mistakes: Mistakes) -> list[tuple[str, Unit, Place]]:
+    """Return the name, unit and place of every heading."""
+    headings = next(reader, [])
+    if not any(heading.strip() for heading in headings):
+        raise ApcError(
+            Mistake("E702", Place(file, 1, 1), "the table has no headings", hint="device.mass [kg]")
+        )
+    return [_heading(heading, file, headings[:i], mistakes) for i, heading in enumerate(headings)]
 
 
 def _bytes(path: Path, named_at: Place) -> bytes:
@@ -183,14 +297,14 @@ def _heading(text: str, file: str, before: list[str], mistakes: Mistakes) -> tup
     return name, unit, place
 
 
-def _rows(reader: object, width: int, file: str, mistakes: Mistakes) -> tuple[list[list[float]], list[int]]:
+def _rows(reader: Reader, width: int, file: str, mistakes: Mistakes) -> tuple[list[list[float]], list[int]]:
     rows: list[list[float]] = []
     lines: list[int] = []
     found = 0
-    for cells in reader:  # type: ignore[attr-defined] # csv's reader type has no public name
+    for cells in reader:
         if not cells or not any(cell.strip() for cell in cells):
             continue
-        line = reader.line_num  # type: ignore[attr-defined]
+        line = reader.line_num
         if len(cells) != width:
             what = f"the row has {len(cells)} cells and there are {width} headings"
             mistakes.add("E703", Place(file, line, 1), what)

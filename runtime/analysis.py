@@ -1,16 +1,16 @@
 """Is it stable, and by how much: the whole road from a compiled system to its spectrum.
 
 Takes: a `CompiledSystem`.
-Gives: `Analysis`, `analyze_modes`, `analyze_dense`; `Prepared`, `prepare` for many analyses of one system.
-Guarantees: the cost of `analyze_modes` grows with the number of different groups, not of peers; of equal
-input comes equal output.
+Gives: `Analysis`, `analyze`, `METHODS`; `Prepared`, `prepare` for many analyses of one system.
+Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
+delay; of equal input comes equal output.
 Does not: read files, or draw.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -18,16 +18,36 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.crowds import crowds
+from apc.runtime.determinant_spectrum import solve_crowds, solve_loops
 from apc.runtime.discretize import TOO_LARGE
 from apc.runtime.exchange import Exchange, build_exchange
 from apc.runtime.linearize import SiteJacobians, jacobians
-from apc.runtime.modes import Split, dense, split
-from apc.runtime.parameters import resolve
-from apc.runtime.peers import PeerGroup, peer_groups, states_of
+from apc.runtime.modes import Arrangement, Loop, arrange, close_loop, dense_loop
+from apc.runtime.parameters import Numbers, resolve
+from apc.runtime.peers import (
+    MOST_STATES,
+    PeerGroup,
+    different_peers,
+    peer_groups,
+    states_of,
+    too_large,
+    used_ways,
+)
 from apc.runtime.schedule import ORDER, Schedule, build_schedules
-from apc.runtime.spectrum import Mode, solve_spectrum
+from apc.runtime.spectrum import Mode, Spectrum, solve_spectrum
 from apc.runtime.threads import single_threaded
+from apc.runtime.translation import count_translations
 from apc.runtime.trouble import finite_equations
+
+METHODS = ("auto", "modes", "dense", "determinant", "krylov")
+
+# Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
+# says more.
+FEW_STATES = 200
+
+# From so many packets on their way on, leaving them out of the state is quicker.
+LONG_LINES = 120
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +68,9 @@ class Prepared:
 class Analysis:
     """The answer of an analysis; `spectral_radius` is per frame, rigid modes removed.
 
-    `states_per_peer` is that of the largest kind of peer in the scene. `method` is "modes" or "dense".
+    `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `METHODS`.
     `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
-    say why it was analysed as it was.
+    say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided.
     """
 
     topology: str
@@ -66,6 +86,7 @@ class Analysis:
     modes: tuple[Mode, ...]
     linearized: bool
     notes: tuple[str, ...]
+    proof: str = ""
 
     def __str__(self) -> str:
         """Return the verdict in words, the numbers, and the modes as a table."""
@@ -101,6 +122,7 @@ class Analysis:
             ],
             "linearized": self.linearized,
             "notes": list(self.notes),
+            "proof": self.proof,
         }
 
 
@@ -118,22 +140,166 @@ def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared
     return _scheduled(system, built, resolve(system).timings, tuple(order))
 
 
-def analyze_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -> Analysis:
-    """Analyse a system as few small ones where its graphs and groups allow, or else as a whole.
+def analyze(
+    system: CompiledSystem,
+    *,
+    method: str = "auto",
+    prepared: Prepared | None = None,
+    certify: bool = False,
+) -> Analysis:
+    """Analyse a system by the method that serves it, or by one that is asked for.
 
     Parameters
     ----------
     system
         The compiled scene, with the numbers to analyse (see `parameters.apply`).
+    method
+        One of `METHODS`. "modes": a few small systems, where equal peers and the graph allow that; "dense":
+        all peers as one matrix, the check on all else, at the cost of N³; "determinant": the zeros of a small
+        characteristic function, for peers that all differ on complete graphs and for delays of any length;
+        "krylov": the largest eigenvalues of one sparse matrix, for peers that differ on sparse graphs.
     prepared
         From `prepare`, of this system with any numbers; saves building the Jacobians again.
+    certify
+        Prove the verdict in ball arithmetic, whether or not floats leave it open.
+
+    Raises
+    ------
+    ApcError
+        E804 a system of too many states for its matrix, E806 numbers beyond floats, E850 a method that can't
+        serve this scene; and those of `peers.peer_groups`.
     """
-    return _analyze(system, prepared, split)
+    assert method in METHODS, f"no such method: {method}"
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        numbers = resolve(system)
+        prepared = _timed(system, prepared or prepare(system), numbers)
+        exchange = build_exchange(system, numbers.timings)
+        if method in ("auto", "determinant", "krylov"):
+            reason = _not_crowds(system, prepared)
+            if method == "krylov" and reason:
+                raise _cannot(system, method, reason)
+            if not reason and (method == "krylov" or _many(system, prepared, numbers, exchange)):
+                return _analyze_crowds(system, prepared, numbers, exchange, method)
+        groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
+        found = _arranged(system, groups, exchange, method)
+        if found.method == "determinant":
+            spectrum = solve_loops(found.loops)
+        else:
+            closed = tuple(close_loop(loop) for loop in _small_enough(found.loops, exchange))
+            if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
+                raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
+            spectrum = solve_spectrum(closed, certify=certify)
+        states = max(states_of(group.schedule, group.jacobians) for group in groups)
+        affine = all(group.site.affine for group in groups)
+        return _answer(system, exchange, prepared, found.method, spectrum, states, affine, found.notes)
 
 
-def analyze_dense(system: CompiledSystem, *, prepared: Prepared | None = None) -> Analysis:
-    """Analyse a system as one matrix over all peers: the check on `analyze_modes`, at the cost of N³."""
-    return _analyze(system, prepared, lambda groups, exchange: Split("dense", (dense(groups, exchange),), ()))
+def _answer(
+    system: CompiledSystem,
+    exchange: Exchange,
+    prepared: Prepared,
+    method: str,
+    spectrum: Spectrum,
+    states: int,
+    affine: bool,
+    notes: tuple[str, ...],
+) -> Analysis:
+    """Put an analysis together."""
+    return Analysis(
+        topology=system.name,
+        peers=exchange.peers,
+        frame_s=float(prepared.schedules[0].frame_s),
+        states_per_peer=states,
+        method=method,
+        verdict=spectrum.verdict,
+        stable=spectrum.stable,
+        spectral_radius=spectrum.spectral_radius,
+        spectral_radius_error=spectrum.spectral_radius_error,
+        rigid_modes=spectrum.rigid_modes,
+        modes=spectrum.modes,
+        linearized=not affine,
+        notes=(*notes, *spectrum.notes),
+        proof=spectrum.proof,
+    )
+
+
+def _cannot(system: CompiledSystem, method: str, reason: str) -> ApcError:
+    """Return the refusal of a method that can't serve a scene."""
+    what = f"method {method} can't serve this scene: {reason}"
+    return ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto"))
+
+
+def _not_crowds(system: CompiledSystem, prepared: Prepared) -> str:
+    """Say why peers can't be taken by the thousand, "" if they can."""
+    for kind, site in zip(system.kinds, prepared.jacobians, strict=True):
+        if site.edges:
+            return f"{kind.name} looks at each sender by itself"
+        if not site.affine:
+            return f"{kind.name} is not linear, so that each peer is linearized where it starts"
+    return ""
+
+
+def _many(system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange) -> bool:
+    """Say whether so many peers differ that they are not worth an object each."""
+    states = sum(
+        len(rows) * len(system.kinds[group.kind].states)
+        for rows, group in zip(numbers.parameters, system.groups, strict=True)
+    )
+    if states <= FEW_STATES:
+        return False
+    most = max(len(kind.states) for kind in system.kinds)
+    return different_peers(system, prepared.jacobians, numbers, exchange) * most > FEW_STATES
+
+
+def _arranged(
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, method: str
+) -> Arrangement:
+    """Split the whole into loops, and say by which method they are solved."""
+    if method == "dense":
+        if exchange.peers * min(len(group.jacobians.kind.states) for group in groups) > MOST_STATES:
+            states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
+            raise too_large(exchange, f"{exchange.peers:,} peers", states)
+        return Arrangement("dense", (dense_loop(groups, exchange),), ())
+    found = arrange(groups, exchange)
+    if method == "modes" and found.method != "modes":
+        raise _cannot(system, method, found.notes[0])
+    packets = max(sum(sum(group.schedule.depths) for group in loop.sites) for loop in found.loops)
+    if method == "determinant":
+        return replace(found, method="determinant")
+    if method == "auto" and packets > LONG_LINES:
+        note = f"{packets:,} packets are on their way at a time, none of which is made a state"
+        return replace(found, method="determinant", notes=(*found.notes, note))
+    return found
+
+
+def _small_enough(loops: Sequence[Loop], exchange: Exchange) -> Sequence[Loop]:
+    """Refuse loops whose matrix would be too large."""
+    for loop in loops:
+        if loop.states > MOST_STATES:
+            raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
+    return loops
+
+
+def _analyze_crowds(
+    system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange, method: str
+) -> Analysis:
+    """Analyse peers that all differ."""
+    graphs = [way.link for way in used_ways(prepared.schedules) if not exchange.is_complete(way.link)]
+    if method == "auto":
+        method = "krylov" if graphs else "determinant"
+    if method == "determinant" and graphs:
+        raise _cannot(
+            system, method, f"the peers differ, and not all of them hear all others over {graphs[0]}"
+        )
+    listed = crowds(system, prepared.jacobians, prepared.schedules, numbers)
+    different = sum(len(crowd.parameters) for crowd in listed)
+    states = max(states_of(crowd.schedule, crowd.jacobians) for crowd in listed)
+    rigid = count_translations(listed, exchange)
+    notes = [f"{different:,} peers of different numbers, by one determinant of what is sent in a frame"]
+    if rigid is None:
+        notes.append("the first peer moves freely in a way that not all others do: left open")
+    spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
+    return _answer(system, exchange, prepared, method, spectrum, states, True, tuple(notes))
 
 
 def lifted_groups(
@@ -141,12 +307,17 @@ def lifted_groups(
 ) -> tuple[tuple[PeerGroup, ...], Exchange]:
     """Return the peers of a system in groups of equal dynamics, lifted, and the exchange between them."""
     numbers = resolve(system)
-    prepared = prepared or prepare(system)
-    if numbers.timings != prepared.timings:
-        prepared = _scheduled(system, prepared.jacobians, numbers.timings, prepared.order)
+    prepared = _timed(system, prepared or prepare(system), numbers)
     exchange = build_exchange(system, numbers.timings)
     groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
     return groups, exchange
+
+
+def _timed(system: CompiledSystem, prepared: Prepared, numbers: Numbers) -> Prepared:
+    """Return what was prepared, with the schedules of these timings."""
+    if numbers.timings == prepared.timings:
+        return prepared
+    return _scheduled(system, prepared.jacobians, numbers.timings, prepared.order)
 
 
 def _scheduled(
@@ -160,30 +331,13 @@ def _scheduled(
     return Prepared(built, schedules, timings, order)
 
 
-def _analyze(
-    system: CompiledSystem,
-    prepared: Prepared | None,
-    method: Callable[[Sequence[PeerGroup], Exchange], Split],
+def analyze_modes(
+    system: CompiledSystem, *, prepared: Prepared | None = None, certify: bool = False
 ) -> Analysis:
-    """Analyse a system, split into closed systems by a method."""
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        groups, exchange = lifted_groups(system, prepared=prepared)
-        found = method(groups, exchange)
-        if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in found.systems):
-            raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
-        spectrum = solve_spectrum(found.systems)
-    return Analysis(
-        topology=system.name,
-        peers=system.peers,
-        frame_s=found.systems[0].frame_s,
-        states_per_peer=max(states_of(group.schedule, group.jacobians) for group in groups),
-        method=found.method,
-        verdict=spectrum.verdict,
-        stable=spectrum.stable,
-        spectral_radius=spectrum.spectral_radius,
-        spectral_radius_error=spectrum.spectral_radius_error,
-        rigid_modes=spectrum.rigid_modes,
-        modes=spectrum.modes,
-        linearized=not all(group.site.affine for group in groups),
-        notes=found.notes,
-    )
+    return analyze(system, prepared=prepared, certify=certify)
+
+
+def analyze_dense(
+    system: CompiledSystem, *, prepared: Prepared | None = None, certify: bool = False
+) -> Analysis:
+    return analyze(system, method="dense", prepared=prepared, certify=certify)

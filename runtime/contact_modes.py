@@ -21,7 +21,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import Analysis, Prepared, analyze_modes, prepare
+from apc.runtime.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.linearize import SiteJacobians, linearize
 from apc.runtime.parameters import resolve
 from apc.runtime.spectrum import UNSTABLE
@@ -216,7 +216,7 @@ class _Scene:
             return _refused(name, on, refusal)
         prepared = replace(self.prepared, jacobians=sites)
         try:
-            return _mode(name, on, analyze_modes(system, prepared=prepared))
+            return _mode(name, on, analyze(system, prepared=prepared))
         except ApcError as error:
             return _refused(name, on, error.mistakes[0].sentence)
 

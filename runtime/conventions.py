@@ -26,7 +26,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import Analysis, Prepared, analyze_modes, prepare
+from apc.runtime.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.linearize import LinearSite, SiteJacobians
 from apc.runtime.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value, build_schedules
 
@@ -185,7 +185,7 @@ def conventions(
         Whatever the analysis under the default conventions raises.
     """
     prepared = prepared or prepare(system)
-    default = default or analyze_modes(system, prepared=prepared)
+    default = default or analyze(system, prepared=prepared)
     used = [prepared.jacobians[group.kind] for group in system.groups]
     matters = any(_hearing_matters(site) for site in used)
     carried = any(send.u.any() for site in used for send in site.pattern.sends)
@@ -207,7 +207,7 @@ def conventions(
             heard = silent if start == NOTHING else prepared.jacobians
             changed = Prepared(heard, schedules, prepared.timings, orders[0])
             try:
-                found = analyze_modes(system, prepared=changed)
+                found = analyze(system, prepared=changed)
             except ApcError as refused:
                 outcomes.append(_refused(refused, orders, pairs, start, float(schedules[0].frame_s)))
             else:

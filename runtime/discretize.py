@@ -1,6 +1,6 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
-Takes: the matrices of dx/dt = A x + B u, exact. Gives: `Step`, `discretize`.
+Takes: the matrices of dx/dt = A x + B u, exact. Gives: `Step`, `discretize`; `step_balls`.
 Guarantees: every entry is right to the last digit but one, proved by ball arithmetic, whether a mode dies
 out in a nanosecond or never.
 Does not: know when anything happens (see `schedule`).
@@ -69,14 +69,41 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
     ApcError
         E806 an entry of the exponential is too large for a float: something grows without measure within T.
     """
+    generator = _generator(a, b)
+    return tuple(_step(generator * _rational(duration), len(a)) for duration in durations)
+
+
+def step_balls(a: NDArray[Any], b: NDArray[Any], duration: Fraction) -> NDArray[Any]:
+    """Return [F G] (n_x, n_x + n_u) of one duration as balls at python-flint's present precision.
+
+    Parameters
+    ----------
+    a, b
+        A and B, entries exact or balls (`flint.arb`), which the step then holds for every value of.
+    duration
+        T in seconds.
+    """
+    import flint
+
+    size = sum(b.shape)
+    length = flint.arb(_rational(duration))
+    entries = [flint.arb(entry) * length for entry in np.hstack([a, b]).ravel()]
+    entries += [flint.arb(0)] * (size * b.shape[1])
+    step = flint.arb_mat(size, size, entries).exp().entries()[: len(a) * size]
+    balls = np.empty(len(step), dtype=object)
+    balls[:] = [0 if ball.is_zero() else ball for ball in step]
+    return balls.reshape(len(a), size)
+
+
+def _generator(a: NDArray[Any], b: NDArray[Any]) -> Any:
+    """Return [A B; 0 0] as an exact matrix."""
     # Imported here: commands that never discretize need not wait for it.
     import flint
 
     n_x, n_u = b.shape
     rows = [[_rational(value) for value in row] for row in np.hstack([a, b])]
     rows += [[flint.fmpq(0)] * (n_x + n_u) for _ in range(n_u)]
-    generator = flint.fmpq_mat(n_x + n_u, n_x + n_u, [value for row in rows for value in row])
-    return tuple(_step(generator * _rational(duration), n_x) for duration in durations)
+    return flint.fmpq_mat(n_x + n_u, n_x + n_u, [value for row in rows for value in row])
 
 
 def _rational(value: Any) -> Any:

@@ -1,7 +1,7 @@
 """Walk a CasADi function's instructions over any kind of number.
 
 Takes: a CasADi SX Function and arguments that are rationals, intervals, long floats, anything with
-arithmetic. Gives: `evaluate_exact`.
+arithmetic. Gives: `evaluate_exact`, `is_rational`.
 Guarantees: over `Fraction`, sums, products, quotients, whole powers, comparisons and constants are exact.
 Does not: evaluate MX functions; transcendental operations over `Fraction` are rounded to double precision.
 """
@@ -118,6 +118,28 @@ def evaluate_exact(
         else:
             raise ValueError(f"no exact rule for CasADi operation {code} in {function.name()}")
     return results
+
+
+def is_rational(function: Any) -> bool:
+    """Say whether a function's value over `Fraction` is exact: no step of it is rounded to a double."""
+    if not function.is_a("SXFunction"):
+        return False
+    constants: dict[int, float] = {}
+    for index in range(function.n_instructions()):
+        code = function.instruction_id(index)
+        outputs = function.instruction_output(index)
+        if code == casadi.OP_CONST:
+            constants[outputs[0]] = function.instruction_constant(index)
+            continue
+        if code in (casadi.OP_POW, casadi.OP_CONSTPOW):
+            exponent = constants.get(function.instruction_input(index)[1], 0.5)
+            if exponent != int(exponent):
+                return False
+        elif code in _ROUNDED:
+            return False
+        if code != casadi.OP_OUTPUT:
+            constants.pop(outputs[0], None)
+    return True
 
 
 def _power(base: Any, exponent: Any, number: Callable[[float], Any]) -> Any:

@@ -1,7 +1,8 @@
 """Who hears whom, with what weight and how late: the links of a scene between its peers.
 
 Takes: a `CompiledSystem` and its timings.
-Gives: `Exchange`, `build_exchange`, `arcs`, `check_mean`; `GraphMode`, `graph_modes`.
+Gives: `Exchange`, `build_exchange`, `arcs`, `check_mean`; `GraphMode`, `Surd`, `graph_modes`,
+`ring_mode`.
 Guarantees: a complete graph, a ring and a star cost no more than their arcs; an eigenvalue that equal row
 sums make exact is exact, any other comes with a bound on its error.
 Does not: know what is sent, or when (see `schedule`).
@@ -167,10 +168,20 @@ def check_mean(exchange: Exchange, peer: int, link: str, operator: str, hears: b
 
 
 @dataclass(frozen=True, slots=True)
+class Surd:
+    """A real number known in closed form: `scale` · cos(2π · `turn`) · √`square`."""
+
+    scale: Fraction
+    turn: Fraction = Fraction(0)
+    square: int = 1
+
+
+@dataclass(frozen=True, slots=True)
 class GraphMode:
     """An eigenvalue of W, held `multiplicity` times; with a positive imaginary part it stands for a pair.
 
-    `doubt` bounds its error; `common` says that all peers move alike in it.
+    `doubt` bounds its error; `common` says that all peers move alike in it. `surd` is what it is exactly,
+    where `doubt` is not zero and there is a closed form.
     """
 
     real: Fraction
@@ -178,6 +189,7 @@ class GraphMode:
     multiplicity: int
     doubt: float
     common: bool
+    surd: Surd | None = None
 
     @property
     def value(self) -> complex:
@@ -199,18 +211,7 @@ def graph_modes(graph: Graph, peers: int, *, mean: bool) -> tuple[GraphMode, ...
     """
     n = peers
     if graph.shape == "ring" and n > 2:
-        # A circulant: 2 cos(2πk/n) of the sum, twice but at both ends.
-        scale = Fraction(1, 2) if mean else Fraction(1)
-        return tuple(
-            GraphMode(
-                2 * scale * _cosine(k, n),
-                Fraction(0),
-                1 if 2 * k in (0, n) else 2,
-                _cosine_doubt(k, n),
-                k == 0,
-            )
-            for k in range(n // 2 + 1)
-        )
+        return tuple(ring_mode(k, n, mean=mean) for k in range(n // 2 + 1))
     if graph.shape == "star" and n > 2:
         # The centre against the others, alike or opposite: ±1 of the mean, ±√(n−1) of the sum; the others
         # apart.
@@ -219,11 +220,19 @@ def graph_modes(graph: Graph, peers: int, *, mean: bool) -> tuple[GraphMode, ...
         largest = Fraction(1) if mean else Fraction(root) if exact else Fraction(math.sqrt(n - 1))
         doubt = 0.0 if exact else float(largest) * UNIT
         return (
-            GraphMode(largest, Fraction(0), 1, doubt, mean),
-            GraphMode(-largest, Fraction(0), 1, doubt, False),
+            GraphMode(largest, Fraction(0), 1, doubt, mean, Surd(Fraction(1), square=n - 1)),
+            GraphMode(-largest, Fraction(0), 1, doubt, False, Surd(Fraction(-1), square=n - 1)),
             GraphMode(Fraction(0), Fraction(0), n - 2, 0.0, False),
         )
     return _numeric_modes(graph, n, mean=mean)
+
+
+def ring_mode(k: int, n: int, *, mean: bool) -> GraphMode:
+    """Return an eigenvalue of a ring of n peers, a circulant: 2 cos(2πk/n) of the sum, k up to n/2."""
+    scale = Fraction(1, 2) if mean else Fraction(1)
+    times = 1 if 2 * k in (0, n) else 2
+    value = 2 * scale * _cosine(k, n)
+    return GraphMode(value, Fraction(0), times, _cosine_doubt(k, n), k == 0, Surd(2 * scale, Fraction(k, n)))
 
 
 def _cosine(k: int, n: int) -> Fraction:

@@ -1,7 +1,7 @@
 """One frame of one site as one linear map.
 
 Takes: a `LinearSite` and its `Schedule`.
-Gives: `LiftedSite`, `lift`.
+Gives: `LiftedSite`, `lift`; `follow`, the same frame over numbers of any kind.
 Guarantees: the continuous part is propagated by its exact exponential; every matrix comes with a bound on
 its rounding error, entry by entry.
 Does not: know who the others are (see `modes`).
@@ -15,8 +15,9 @@ sent.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from apc.runtime.linearize import LinearSite, magnitudes
 from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value
 
 Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
 
 # Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
 # short polynomials of the parameters, a few roundings an entry.
@@ -114,23 +116,68 @@ def _compose(
     site: LinearSite, schedule: Schedule, steps: Mapping[int, Floats]
 ) -> tuple[Floats, Floats, Floats]:
     """Follow z and r through one frame; return (z⁺, s, inside), every row over the columns (z, r)."""
+    n_z = len(site.kind.states) + len(schedule.carried)
+    unit = np.eye(n_z + len(schedule.heard))
+    sent = np.zeros((len(schedule.sent), len(unit)))
+    course = follow(site, schedule, steps, unit[:n_z], lambda row: unit[n_z + row])
+    while True:
+        try:
+            row, packet = next(course)
+        except StopIteration as end:
+            z, inside = end.value
+            return z, sent, inside
+        sent[row] = packet
+
+
+def follow(
+    site: LinearSite,
+    schedule: Schedule,
+    steps: Mapping[int, Matrix],
+    start: Matrix,
+    hear: Callable[[int], Matrix | None],
+    *,
+    multiply: Callable[[Matrix, Matrix], Matrix] = np.matmul,
+) -> Generator[tuple[int, Matrix], None, tuple[Matrix, Matrix]]:
+    """Follow a site through one frame, event by event, over numbers of any kind.
+
+    Every quantity is a row over columns of the caller's choice.
+
+    Parameters
+    ----------
+    site
+        The site's matrices, in the kind of number wanted.
+    schedule
+        What happens in a frame.
+    steps
+        [F G] (n_x, n_x + n_u) by duration in quanta.
+    start
+        The state z (n_z, columns) at the start of the frame.
+    hear
+        Gives the row (columns,) of an entry of r, or None while it isn't sent yet: it is asked again.
+    multiply
+        The product of a site's matrix and rows.
+
+    Yields
+    ------
+    The row of s and its value (columns,) as soon as it is sent; (−1, nothing) while waiting to hear.
+
+    Returns
+    -------
+    z⁺ (n_z, columns), and the continuous states at the schedule's marks (marks, n_x, columns).
+    """
     kind = site.kind
-    n_x, n_u, n_r = len(kind.states), len(kind.holds), len(schedule.heard)
-    n_z = n_x + len(schedule.carried)
-    unit = np.eye(n_z + n_r)
-    nothing = np.zeros(n_z + n_r)
-    value: dict[Value, Floats] = {one: unit[n_x + row] for row, one in enumerate(schedule.carried)}
-    heard = unit[n_z:]
+    n_x, n_u = len(kind.states), len(kind.holds)
+    nothing = np.zeros(start.shape[1], dtype=start.dtype)
+    value: dict[Value, Matrix] = {one: start[n_x + row] for row, one in enumerate(schedule.carried)}
 
     # The continuous states above what the holds put out: a step multiplies both at once.
-    moving = np.zeros((n_x + n_u, n_z + n_r))
-    moving[:n_x] = unit[:n_x]
+    moving = np.zeros((n_x + n_u, start.shape[1]), dtype=start.dtype)
+    moving[:n_x] = start[:n_x]
     for hold, one in enumerate(schedule.acting):
         moving[n_x + hold] = value.get(one, nothing) if one is not None else nothing
     sends = [np.hstack([send.x, send.u]) for send in site.sends]
     ticks = [np.hstack([tick.x, tick.u, tick.m, tick.r]) for tick in site.ticks]
-    sent = np.zeros((len(schedule.sent), n_z + n_r))
-    inside = np.zeros((len(schedule.marks), n_x, n_z + n_r))
+    inside = np.zeros((len(schedule.marks), n_x, start.shape[1]), dtype=start.dtype)
     now, mark = 0, 0
     for event in schedule.events:
         if mark < len(schedule.marks) and schedule.marks[mark] == now:
@@ -138,24 +185,31 @@ def _compose(
             mark += 1
         match event:
             case Propagate(duration):
-                moving[:n_x] = steps[duration][:n_x] @ moving
+                moving[:n_x] = multiply(steps[duration][:n_x], moving)
                 now += duration
             case Act(hold, one):
                 moving[n_x + hold] = value.get(one, nothing)
             case Send(partition, rows):
-                everything = sends[partition] @ moving
+                everything = multiply(sends[partition], moving)
                 for channel, row in rows:
-                    sent[row] = everything[channel]
+                    yield row, everything[channel]
             case Tick(partition, index, rows_heard):
                 memories = kind.clocks[partition].memories
                 before = [value.get(Value(partition, o, index - 1), nothing) for o in memories]
-                received = [heard[list(rows)].sum(axis=0) for rows in rows_heard]
+                received = []
+                for places in rows_heard:
+                    total = nothing
+                    for place in places:
+                        while (packet := hear(place)) is None:
+                            yield -1, nothing
+                        total = total + packet
+                    received.append(total)
                 inputs = np.vstack([moving, *before, *received])
-                for output, row_of in enumerate(ticks[partition] @ inputs):
+                for output, row_of in enumerate(multiply(ticks[partition], inputs)):
                     value[Value(partition, output, index)] = row_of
     inside[-1] = moving[:n_x]
     after = [
         value[Value(one.partition, one.output, one.index + schedule.ticks[one.partition])]
         for one in schedule.carried
     ]
-    return np.vstack([moving[:n_x], *after]), sent, inside
+    return np.vstack([moving[:n_x], *after]), inside

@@ -34,6 +34,9 @@ from apc.runtime.exact import evaluate_exact
 
 Matrix = NDArray[Any]
 
+# Parameter vectors evaluated by one call: of many more at once, CasADi's copies take longer than its work.
+MAPPED = 1024
+
 
 @dataclass(frozen=True, slots=True)
 class LinearTick:
@@ -316,9 +319,30 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     """
     assert site.affine and not site.edges, "the start matters"
     zeros = [np.zeros(site.function.numel_in(argument)) for argument in range(4)]
-    many = site.function.map(len(parameters))
-    flats = many(*(np.repeat(zero[:, None], len(parameters), axis=1) for zero in zeros), parameters.T, 0.0)
-    return np.asarray(flats, dtype=np.float64).reshape(-1, len(parameters)).T + 0.0  # −0 and 0 are one number
+    rows = np.empty((len(parameters), site.function.numel_out(0)))
+    for start in range(0, len(parameters), MAPPED):
+        some = parameters[start : start + MAPPED]
+        many = site.function.map(len(some))
+        flats = many(*(np.repeat(zero[:, None], len(some), axis=1) for zero in zeros), some.T, 0.0)
+        rows[start : start + MAPPED] = np.asarray(flats, dtype=np.float64).reshape(-1, len(some)).T
+    return rows + 0.0  # −0 and 0 are one number
+
+
+def sites_of_rows(site: SiteJacobians, rows: NDArray[np.float64]) -> LinearSite:
+    """Return the sites of many rows (k, …) of `linearize_rows` as one, its matrices with a leading axis (k)."""
+    matrices, start = [], 0
+    for height, width in site.shapes:
+        block = rows[:, start : start + height * width].reshape(len(rows), width, height)
+        matrices.append(np.ascontiguousarray(block.swapaxes(1, 2)))
+        start += height * width
+    return _assemble(site.kind, site.affine, matrices, _channels_of(site))
+
+
+def site_of_entries(site: SiteJacobians, flat: Sequence[Any]) -> LinearSite:
+    """Return the site of a function's output over another kind of number (see `exact`)."""
+    entries = np.empty(len(flat), dtype=object)
+    entries[:] = list(flat)
+    return _assemble(site.kind, site.affine, _cut(entries, site.shapes), _channels_of(site))
 
 
 def site_of_row(site: SiteJacobians, row: NDArray[np.float64]) -> LinearSite:
@@ -358,18 +382,24 @@ def _channels_of(site: SiteJacobians) -> list[tuple[tuple[int, ...], ...]]:
     return [tick.channels for tick in site.pattern.ticks]
 
 
+def entrywise(site: LinearSite, change: Callable[[Any], Any], kind_of_number: type = object) -> LinearSite:
+    """Return the site with every entry changed, in arrays of another kind of number."""
+    channels = [tick.channels for tick in site.ticks]
+    changed = []
+    for matrix in _matrices(site):
+        entries: Matrix = np.empty(matrix.size, dtype=kind_of_number)
+        entries[:] = [change(value) for value in matrix.ravel()]
+        changed.append(entries.reshape(matrix.shape))
+    return _assemble(site.kind, site.affine, changed, channels)
+
+
 def rational_floats(site: LinearSite) -> LinearSite:
     """Return the site with every float as the rational it is."""
-    channels = [tick.channels for tick in site.ticks]
-    exact = []
-    for matrix in _matrices(site):
-        rows = [[Fraction(value) for value in row] for row in matrix]
-        exact.append(np.array(rows, dtype=object).reshape(matrix.shape))
-    return _assemble(site.kind, site.affine, exact, channels)
+    return entrywise(site, Fraction)
 
 
 def magnitudes(site: LinearSite) -> LinearSite:
-    """Return the site with every entry replaced by its absolute value."""
+    """Return the site with every entry replaced by its absolute value; its matrices may have a leading axis."""
     channels = [tick.channels for tick in site.ticks]
     return _assemble(site.kind, site.affine, [np.abs(matrix) for matrix in _matrices(site)], channels)
 

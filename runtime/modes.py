@@ -1,7 +1,8 @@
 """Close the loop between peers, as few small systems instead of one large one.
 
 Takes: the groups of equal peers of a scene, and the exchange between them.
-Gives: `ClosedSystem`, `close`; `Split`, `split`, `modes`, `dense`.
+Gives: `Loop`, `arrange`, `complete_loops`, `dense_loop`, `graph_loop`; `ClosedSystem`, `close`; `Split`,
+`split`, `modes`, `dense`.
 Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
 `dense`, whatever the number of peers.
 Does not: compute eigenvalues (see `spectrum`).
@@ -21,14 +22,14 @@ are one whole system.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.discretize import UNIT
-from apc.runtime.exchange import Exchange, GraphMode, check_mean, graph_modes
+from apc.runtime.exchange import Exchange, GraphMode, Surd, check_mean, graph_modes
 from apc.runtime.peers import MOST_STATES, PeerGroup, states_of, too_large, used_ways
 from apc.runtime.schedule import Way
 
@@ -36,9 +37,6 @@ Floats = NDArray[np.float64]
 
 # What site g hears of site h on a way: the weight on h's packet.
 Coupling = Mapping[Way, tuple[tuple[Fraction, ...], ...]]
-
-# More systems than this are refused: each takes some milliseconds.
-MOST_SYSTEMS = 3000
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +46,50 @@ class Split:
     method: str
     systems: tuple[ClosedSystem, ...]
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Arrangement:
+    """A whole system as independent loops; `method` and `notes` as in `Split`."""
+
+    method: str
+    loops: tuple[Loop, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Some sites and what each hears of each, `coupling`: a closed system before its matrix is built.
+
+    The whole holds it `multiplicity` times. `doubts` and `surds` as in `ClosedSystem`.
+    """
+
+    name: str
+    multiplicity: int
+    sites: tuple[PeerGroup, ...]
+    coupling: Coupling
+    doubts: Mapping[Way, float] = field(default_factory=dict)
+    surds: Mapping[Way, Surd] = field(default_factory=dict)
+
+    @property
+    def packets(self) -> tuple[Packet, ...]:
+        """The packets on their way, in order of state."""
+        return tuple(
+            Packet(h, row, lag)
+            for h, group in enumerate(self.sites)
+            for row, depth in enumerate(group.schedule.depths)
+            for lag in range(1, depth + 1)
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the state."""
+        return _layout(self.sites, self.packets)[1]
+
+    @property
+    def states(self) -> int:
+        """How many states there are."""
+        return sum(states_of(group.schedule, group.jacobians) for group in self.sites)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +109,8 @@ class ClosedSystem:
     where each site's part starts, `packets` lists the packets in order of state (site by site). `error`
     bounds the rounding error of the matrix entry by entry. `inside` holds all continuous states (site by
     site) at the ticks of the fastest clock as rows over the state; `motion` says where these are in the
-    state.
+    state. `doubts` say by how much each weight of a way may be off; `surds`, of a system of one site, what
+    its weights are in closed form.
     """
 
     name: str
@@ -82,10 +125,12 @@ class ClosedSystem:
     error: Floats  # (n, n)
     inside: Floats  # (marks, n_x of all sites, n)
     motion: tuple[int, ...]
+    doubts: Mapping[Way, float] = field(default_factory=dict)
+    surds: Mapping[Way, Surd] = field(default_factory=dict)
 
 
 def split(groups: Sequence[PeerGroup], exchange: Exchange) -> Split:
-    """Split the whole system into as few and small systems as its graphs and groups allow.
+    """Split the whole system into as few and small closed systems as its graphs and groups allow.
 
     Parameters
     ----------
@@ -97,25 +142,46 @@ def split(groups: Sequence[PeerGroup], exchange: Exchange) -> Split:
     Raises
     ------
     ApcError
-        E801, E802 a mean that can't be; E804 one system of too many states, E805 too many systems.
+        E801, E802 a mean that can't be; E804 one system of too many states.
+    """
+    found = arrange(groups, exchange)
+    for loop in found.loops:
+        if loop.states > MOST_STATES:
+            raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
+    return Split(found.method, tuple(close_loop(loop) for loop in found.loops), found.notes)
+
+
+def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
+    """Find the independent loops of a whole system: `split`, before any matrix is built.
+
+    Parameters
+    ----------
+    groups, exchange
+        As for `split`.
     """
     ways = used_ways(group.schedule for group in groups)
     graphs = list(dict.fromkeys(way.link for way in ways if not exchange.is_complete(way.link)))
     if not graphs:
-        return Split("modes", modes(groups, exchange), ())
+        return Arrangement("modes", complete_loops(groups, exchange), ())
     named = " and ".join(f"{link} ({exchange.links[link].graph.shape})" for link in graphs)
     reason = f"the peers on {named} differ" if len(groups) > 1 else _no_common_graph(ways, exchange)
     if not reason:
-        found = _graph_modes(groups[0], ways, exchange)
+        scale = graph_scale(groups[0], ways, exchange)
+        found = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
         if found is not None:
             note = f"{len(found)} systems, one an eigenvalue of the graph of {named}"
-            return Split("modes", found, (note,))
+            return Arrangement("modes", tuple(graph_loop(groups[0], one, scale) for one in found), (note,))
         reason = f"the graph of {named} has no full set of eigenvectors"
-    return Split("dense", (dense(groups, exchange),), (f"all peers as one system: {reason}",))
+    return Arrangement("dense", (dense_loop(groups, exchange),), (f"all peers as one system: {reason}",))
 
 
 def modes(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[ClosedSystem, ...]:
-    """Split a system of complete graphs into a common system and a difference system a group of two or more.
+    """Close the loops of `complete_loops`."""
+    return tuple(close_loop(loop) for loop in complete_loops(groups, exchange))
+
+
+def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
+    """Split a system of complete graphs into a common loop and a difference loop a group of two or more.
 
     Parameters
     ----------
@@ -125,31 +191,19 @@ def modes(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[ClosedSystem
         The links, all of them complete.
     """
     peers = sum(group.count for group in groups)
-    name = "single" if peers == 1 else "common"
     degrees = _degrees(groups, exchange)
-    systems = [
-        close(
-            groups,
-            _couple(
-                groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
-            ),
-            name=name,
-        )
-    ]
+    weights = _couple(
+        groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
+    )
+    loops = [Loop("single" if peers == 1 else "common", 1, tuple(groups), weights)]
     for place, group in enumerate(groups):
         if group.count < 2:
             continue
-        weights = _couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
-        own = {key: ((rows[place][place],),) for key, rows in weights.items()}
-        systems.append(
-            close(
-                [group],
-                own,
-                name="difference" if len(groups) == 1 else f"difference {group.name}",
-                multiplicity=group.count - 1,
-            )
-        )
-    return tuple(systems)
+        apart = _couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
+        own = {key: ((rows[place][place],),) for key, rows in apart.items()}
+        name = "difference" if len(groups) == 1 else f"difference {group.name}"
+        loops.append(Loop(name, group.count - 1, (group,), own))
+    return tuple(loops)
 
 
 def dense(groups: Sequence[PeerGroup], exchange: Exchange) -> ClosedSystem:
@@ -170,12 +224,17 @@ def dense(groups: Sequence[PeerGroup], exchange: Exchange) -> ClosedSystem:
     states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
     if states > MOST_STATES:
         raise too_large(exchange, f"{exchange.peers:,} peers", states)
-    everyone = [
+    return close_loop(dense_loop(groups, exchange))
+
+
+def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
+    """Return every peer of the whole system as one loop."""
+    everyone = tuple(
         replace(group, name=exchange.peer_name(peer), count=1, peers=np.array([peer]))
         for peer, group in sorted(
             ((int(peer), group) for group in groups for peer in group.peers), key=lambda pair: pair[0]
         )
-    ]
+    )
     weights = {
         link: {
             (receiver, sender): Fraction(weight)
@@ -188,11 +247,10 @@ def dense(groups: Sequence[PeerGroup], exchange: Exchange) -> ClosedSystem:
         for (receiver, sender), weight in entries.items():
             if everyone[sender].sends(link):
                 degrees[link, receiver] = degrees.get((link, receiver), Fraction(0)) + weight
-    return close(
-        everyone,
-        _couple(everyone, exchange, lambda way, g, h: weights[way.link].get((g, h), Fraction(0)), degrees),
-        name="dense",
+    coupling = _couple(
+        everyone, exchange, lambda way, g, h: weights[way.link].get((g, h), Fraction(0)), degrees
     )
+    return Loop("dense", 1, everyone, coupling)
 
 
 def _degrees(groups: Sequence[PeerGroup], exchange: Exchange) -> dict[tuple[str, int], Fraction]:
@@ -281,10 +339,22 @@ def _degree(link: str, exchange: Exchange) -> Fraction | None:
     return sums[0] if len(set(sums)) == 1 else None
 
 
-def _graph_modes(
-    group: PeerGroup, ways: Sequence[Way], exchange: Exchange
-) -> tuple[ClosedSystem, ...] | None:
-    """Return one system an eigenvalue of the graph that equal peers share, None if it lacks eigenvectors."""
+@dataclass(frozen=True, slots=True)
+class GraphScale:
+    """What each way weighs a neighbour by, in units of W; `by_mean`: of the W whose rows add up to 1."""
+
+    weights: Mapping[Way, Fraction]
+    by_mean: bool
+
+
+def graph_scale(group: PeerGroup, ways: Sequence[Way], exchange: Exchange) -> GraphScale:
+    """Return how equal peers weigh their neighbours on the graph that all their ways share.
+
+    Raises
+    ------
+    ApcError
+        E801, E802 a mean that can't be.
+    """
     link = ways[0].link
     means = any(way.operator == "mean" for way in ways)
     pairs, weights = exchange.arcs(link)
@@ -295,35 +365,39 @@ def _graph_modes(
             total = sum(map(Fraction, weights[pairs[:, 1] == peer].tolist()), Fraction(0))
             check_mean(exchange, peer, link, "mean", bool(hears[peer]), total)
     degree = _degree(link, exchange)
-    by_mean = means and degree is None
-    found = graph_modes(exchange.links[link].graph, exchange.peers, mean=by_mean)
-    if found is None:
-        return None
-    if len(found) > MOST_SYSTEMS:
-        raise too_large(
-            exchange, f"{exchange.peers:,} peers on a graph", len(found) * len(group.lifted.z_names)
-        )
-    # What a way weighs a neighbour by, in units of W.
-    scale = {
-        way: group.gain(way, group) / (degree if degree and way.operator == "mean" else Fraction(1))
-        for way in ways
-    }
-    return tuple(_graph_mode(group, mode, scale) for mode in found)
+    return GraphScale(
+        {
+            way: group.gain(way, group) / (degree if degree and way.operator == "mean" else Fraction(1))
+            for way in ways
+        },
+        means and degree is None,
+    )
 
 
-def _graph_mode(group: PeerGroup, mode: GraphMode, scale: Mapping[Way, Fraction]) -> ClosedSystem:
-    """Close one site by an eigenvalue, or two by a complex pair."""
+def graph_loop(group: PeerGroup, mode: GraphMode, scale: GraphScale) -> Loop:
+    """Let one site hear itself by an eigenvalue, or two by a complex pair."""
     a, b = mode.real, mode.imaginary
-    doubts = {way: float(abs(one)) * mode.doubt for way, one in scale.items()}
+    weights = scale.weights
+    doubts = {way: float(abs(one)) * mode.doubt for way, one in weights.items()}
     name = "common" if mode.common else f"graph {mode.value.real:+.6g}"
     if not b:
-        coupling: Coupling = {way: ((one * a,),) for way, one in scale.items()}
-        return close([group], coupling, name=name, multiplicity=mode.multiplicity, doubts=doubts)
-    pair = {way: ((one * a, -one * b), (one * b, one * a)) for way, one in scale.items()}
-    sites = [replace(group, name=part) for part in ("real", "imaginary")]
-    return close(
-        sites, pair, name=f"{name} ± {mode.value.imag:.6g}i", multiplicity=mode.multiplicity, doubts=doubts
+        coupling: Coupling = {way: ((one * a,),) for way, one in weights.items()}
+        surds: Mapping[Way, Surd] = {}
+        if mode.doubt and mode.surd:
+            surd = mode.surd
+            surds = {way: replace(surd, scale=one * surd.scale) for way, one in weights.items()}
+        return Loop(name, mode.multiplicity, (group,), coupling, doubts, surds)
+    pair = {way: ((one * a, -one * b), (one * b, one * a)) for way, one in weights.items()}
+    sites = tuple(replace(group, name=part) for part in ("real", "imaginary"))
+    return Loop(f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, sites, pair, doubts)
+
+
+def close_loop(loop: Loop) -> ClosedSystem:
+    """Build the matrix of a loop."""
+    closed = close(
+        loop.sites, loop.coupling, name=loop.name, multiplicity=loop.multiplicity, doubts=loop.doubts
     )
+    return replace(closed, surds=loop.surds) if loop.surds else closed
 
 
 def close(
@@ -361,7 +435,7 @@ def close(
         for lag in range(1, depth + 1)
     )
     offsets, names = _layout(sites, packets)
-    place_of = _places(sites, packets, offsets)
+    place_of = packet_places(sites, packets, offsets)
     n = len(names)
     s_start = np.cumsum([0] + [len(site.s) for site in lifted])
 
@@ -430,6 +504,7 @@ def close(
         error=error,
         inside=inside,
         motion=tuple(motion),
+        doubts=doubts or {},
     )
 
 
@@ -491,7 +566,7 @@ def _layout(sites: Sequence[PeerGroup], packets: Sequence[Packet]) -> tuple[tupl
     return tuple(offsets), tuple(names)
 
 
-def _places(
+def packet_places(
     sites: Sequence[PeerGroup], packets: Sequence[Packet], offsets: Sequence[int]
 ) -> dict[Packet, int]:
     """Return where in the state each packet is."""

@@ -1,7 +1,7 @@
 """The numbers of a compiled system, and changing them without compiling again.
 
 Takes: a `CompiledSystem` and overrides such as `contact.stiffness=800 N/m`.
-Gives: `Override`, `parse_override`, `apply`, `Numbers`, `resolve`.
+Gives: `Override`, `parse_override`, `find`, `apply`; `Numbers`, `resolve`; `Free`, `free_rows`.
 Guarantees: what depends on a changed parameter by an expression changes with it, in exact rationals; bounds
 are kept; the rest keeps the very numbers it was compiled with. What depends on a parameter that differs from
 peer to peer is worked out peer by peer, in floats, in a time that grows with the number of peers.
@@ -36,7 +36,7 @@ _OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
     "-": operator.sub,
     "*": operator.mul,
     "/": np.true_divide,
-    "^": np.float_power,
+    "^": lambda base, exponent: _power(base, exponent),
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,
@@ -46,9 +46,10 @@ _OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
 }
 _EXTREMES: dict[str, Callable[[Any, Any], Any]] = {"max": np.maximum, "min": np.minimum}
 _FUNCTIONS: dict[str, Callable[[Any], Any]] = {
-    "abs": np.abs,
-    "sign": np.sign,
-    "floor": np.floor,
+    # Of a complex step, the imaginary part is a derivative and follows the real part.
+    "abs": lambda value: np.where(np.real(value) < 0, -value, value),
+    "sign": lambda value: np.sign(np.real(value)),
+    "floor": lambda value: np.floor(np.real(value)),
     "sqrt": np.sqrt,
     "exp": np.exp,
     "log": np.log,
@@ -56,6 +57,27 @@ _FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "cos": np.cos,
     "tanh": np.tanh,
 }
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    """Return base^exponent; of a complex step, with the derivative as imaginary part."""
+    value = np.float_power(np.real(base), np.real(exponent))
+    if not (np.iscomplexobj(base) or np.iscomplexobj(exponent)):
+        return value
+    b, e = np.real(base), np.real(exponent)
+    slope = e * np.float_power(b, e - 1) * np.imag(base)
+    growing = np.imag(exponent)
+    if np.any(growing):
+        slope = slope + value * np.log(b) * growing
+    return value + 1j * slope
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """A parameter or timing whose value is left open: of one group, or of all (`group` None)."""
+
+    name: str
+    group: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +277,71 @@ class _Columns:
         if column is not None:
             return column
         return self._holder[name].value if name in self._holder else self._timings[name]
+
+
+def parameter_of(system: CompiledSystem, free: Free) -> Parameter:
+    """Return a free parameter as its group has it, or everybody."""
+    for group in system.groups:
+        for parameter in group.values:
+            if group.name == free.group and parameter.name == free.name:
+                return parameter
+    return next(parameter for parameter in system.parameters if parameter.name == free.name)
+
+
+def free_rows(
+    system: CompiledSystem, group: Group, peer: int, values: Mapping[Free, NDArray[Any]]
+) -> NDArray[Any]:
+    """Return a peer's parameter vector for many values of some parameters, what depends on them included.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    group, peer
+        The peer: its group, and its number in it, from 0.
+    values
+        Values (k,) of each free parameter, as `apply` would set them; complex ones are complex steps, whose
+        imaginary part comes out as the derivative.
+
+    Returns
+    -------
+    The vectors (k, n_p), or (1, n_p) when none of the values reaches this peer.
+    """
+    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    columns = _Columns(system, group, holder)
+    given = {column.name for column in group.columns}
+    known: dict[str, Any] = {free.name: value for free, value in values.items() if free.group is None}
+    known |= {free.name: value for free, value in values.items() if free.group == group.name}
+    timings = {timing.name: float(timing.value) for timing in system.timings}
+
+    def value_of(name: str) -> Any:
+        if name not in known:
+            known[name] = evaluated(name)
+        return known[name]
+
+    def evaluated(name: str) -> Any:
+        parameter = holder.get(name)
+        if parameter is None:
+            return timings[name]
+        if parameter.expression and name not in given:
+            from apc.compiler.expression import names
+            from apc.compiler.grammar import parse_expression
+
+            tree = parse_expression(parameter.expression, Place(name, 1, 1, parameter.expression))
+            reached = [value_of(".".join(node.parts)) for node in names(tree)]
+            if any(np.ndim(one) for one in reached):
+                with np.errstate(all="ignore"):
+                    return _evaluate_rows(tree, lambda parts: value_of(".".join(parts)))
+        column = columns.of(name)
+        return parameter.value if column is None else float(column[peer])
+
+    listed = [value_of(name) for name in system.kinds[group.kind].parameters]
+    count = max((len(one) for one in listed if np.ndim(one)), default=1)
+    dtype = np.result_type(np.float64, *(one.dtype for one in listed if np.ndim(one)))
+    rows = np.empty((count, len(listed)), dtype=dtype)
+    for place, one in enumerate(listed):
+        rows[:, place] = one
+    return rows
 
 
 def _evaluate_rows(expr: Any, lookup: Callable[[tuple[str, ...]], Any]) -> Any:

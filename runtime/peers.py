@@ -1,7 +1,7 @@
 """Which peers move alike: the groups of equal peers of a scene, each linearized and lifted once.
 
 Takes: a `CompiledSystem`, its numbers, Jacobians and schedules, and the exchange.
-Gives: `PeerGroup`, `peer_groups`.
+Gives: `PeerGroup`, `peer_groups`, `different_peers`, `group_of_row`.
 Guarantees: as few groups as there are peers of different dynamics, found in a time that grows with the number
 of peers, not with its square. A site that is not affine is linearized at its own start values, hearing the
 others at theirs.
@@ -181,9 +181,7 @@ def _by_matrices(
             rows.setdefault(keys[-1], (place, vector, matrices))
         for key, peers in _split(keys, numbers.rows[place]):
             members.setdefault(key, []).append((place, peers))
-    _check_size(
-        [schedules[rows[key][0]] for key in members], [jacobians[key[0]] for key in members], exchange
-    )
+    _check_size([jacobians[key[0]] for key in members], exchange)
     found = []
     for number, (key, parts) in enumerate(members.items()):
         place, vector, matrices = rows[key]
@@ -191,6 +189,36 @@ def _by_matrices(
         site = site_of_row(built, matrices)
         found.append(_group(number, parts, vector, built, site, schedules[place], exchange))
     return tuple(found)
+
+
+def different_peers(
+    system: CompiledSystem, jacobians: Sequence[SiteJacobians], numbers: Numbers, exchange: Exchange
+) -> int:
+    """Return how many peers of different matrices there are, all of them affine and without edges."""
+    keys = set()
+    for place, group in enumerate(system.groups):
+        rows = linearize_rows(jacobians[group.kind], numbers.parameters[place])
+        keys |= {(group.kind, exchange.role(place), row.tobytes()) for row in rows}
+    return len(keys)
+
+
+def group_of_row(
+    built: SiteJacobians, vector: Floats, schedule: Schedule, exchange: Exchange, group: int, count: int
+) -> PeerGroup:
+    """Return `count` peers of the scene's group `group` as if all were like one of them.
+
+    Parameters
+    ----------
+    built, vector, schedule
+        Its kind's Jacobians, its parameters (n_p,), its schedule.
+    exchange
+        The links.
+    group, count
+        The scene's group, and how many.
+    """
+    site = site_of_row(built, linearize_rows(built, vector[None])[0])
+    parts = [(group, Runs((range(count),)))]
+    return _group(group, parts, vector, built, site, schedule, exchange)
 
 
 # What equal peers have in common: their kind, their role in the exchange, their numbers as bytes.
@@ -209,9 +237,9 @@ def _split(keys: Sequence[_Key], row_of: Integers) -> list[tuple[_Key, Peers]]:
     return list(zip(different, np.split(order, ends), strict=True))
 
 
-def _check_size(schedules: Sequence[Schedule], sites: Sequence[SiteJacobians], exchange: Exchange) -> None:
-    """Refuse more different peers than one system can hold."""
-    states = sum(states_of(schedule, site) for schedule, site in zip(schedules, sites, strict=True))
+def _check_size(sites: Sequence[SiteJacobians], exchange: Exchange) -> None:
+    """Refuse more different peers than are worth an object each."""
+    states = sum(len(site.kind.states) for site in sites)
     if states > MOST_STATES:
         raise too_large(exchange, f"{len(sites):,} different peers", states)
 
@@ -227,8 +255,8 @@ def too_large(exchange: Exchange, what: str, states: int) -> ApcError:
         Mistake(
             "E804",
             Place(exchange.scene),
-            f"{what} make one system of {states:,} states, more than the {MOST_STATES:,} that are analysed"
-            " at once: fewer different peers, or equal ones on a complete graph or a ring, need less",
+            f"{what} make one system of {states:,} states; the matrix of one may have {MOST_STATES:,}",
+            hint="--method auto: linear peers without edge functions need no such matrix",
         )
     )
 
@@ -320,7 +348,7 @@ def _by_start(
         joined.setdefault(merged.setdefault(same, g), []).extend(parts[g])
     first = list(joined)
     built = [jacobians[system.groups[parts[g][0][0]].kind] for g in first]
-    _check_size([schedules[parts[g][0][0]] for g in first], built, exchange)
+    _check_size(built, exchange)
     return tuple(
         _group(
             g,

@@ -16,7 +16,7 @@ from typing import Literal
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.runtime.analysis import Analysis, Prepared, analyze_modes, prepare
+from apc.runtime.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.parameters import find
 
 PLACE = Place("sweep")
@@ -87,7 +87,7 @@ def faulty(columns: tuple[ResultColumn, ...], error: ApcError) -> Row:
 
 
 def _analysis(system: CompiledSystem, prepared: Prepared) -> Analysis:
-    return analyze_modes(system, prepared=prepared)
+    return analyze(system, prepared=prepared)
 
 
 def _analyze(system: CompiledSystem, argument: str) -> Quantity:

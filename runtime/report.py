@@ -17,6 +17,7 @@ from rich.table import Table
 
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis import Analysis
+from apc.runtime.answer import Answer
 from apc.runtime.needs import Needs
 from apc.runtime.selfcheck import skipped
 from apc.runtime.spectrum import Mode
@@ -114,10 +115,26 @@ def analysis_report(result: Analysis) -> str:
         f" per frame of {_time(result.frame_s)}",
         f"  peers            {result.peers}, {result.states_per_peer} states each",
         f"  method           {result.method}{removed}",
-        "",
-        _mode_table(result.modes),
     ]
+    if result.proof:
+        lines.append(f"  proof            {result.proof}")
+    lines += ["", _mode_table(result.modes)]
+    lines += [_wrapped(note) for note in result.notes]
     return "\n".join(lines)
+
+
+def answer_report(found: Answer) -> str:
+    """Return what `apc analyze` prints: the analysis, and what stands beside it."""
+    parts = [analysis_report(found.analysis), str(found.sensitivities), str(found.margins)]
+    if found.contact_modes is not None:
+        parts.append(str(found.contact_modes))
+    if found.detailed:
+        parts.append(str(found.conventions))
+    elif found.conventions.warning:
+        parts.append(f"Warning: {found.conventions.warning}")
+    if found.box is not None:
+        parts.append(str(found.box))
+    return "\n\n".join(parts)
 
 
 def _mode_table(modes: tuple[Mode, ...]) -> str:

@@ -1,7 +1,7 @@
 """The motions that nothing holds back, found in exact arithmetic.
 
-Takes: a `ClosedSystem`.
-Gives: `RigidModes`, `find_rigid_modes`.
+Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
+Gives: `RigidModes`, `find_rigid_modes`; `stays_rigid`, `independent_places`.
 Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
 a stiffness of exactly zero frees what it held.
 Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from apc.runtime.exchange import QUICK_PRIME
 from apc.runtime.linearize import LinearSite
-from apc.runtime.modes import ClosedSystem
+from apc.runtime.modes import ClosedSystem, Loop
 from apc.runtime.peers import PeerGroup
 from apc.runtime.schedule import Act, Propagate, Send, Tick, Value
 
@@ -45,11 +45,13 @@ class RigidModes:
 
     `directions` (n, k) are eigenvectors with eigenvalue 1, `generalized` (n, drifts) the second vectors
     of Jordan pairs, both over the state of the closed system; `names` says what moves in each direction.
+    `exact` holds the same vectors, directions first, as rationals.
     """
 
     directions: Floats
     generalized: Floats
     names: tuple[str, ...]
+    exact: tuple[tuple[Fraction, ...], ...]
 
     @property
     def drifts(self) -> int:
@@ -62,7 +64,7 @@ class RigidModes:
         return np.hstack([self.directions, self.generalized])
 
 
-def find_rigid_modes(system: ClosedSystem, *, with_drifts: bool = True) -> RigidModes:
+def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> RigidModes:
     """Find the rigid modes of a closed system and the drifts among them, in exact rationals.
 
     Parameters
@@ -74,12 +76,8 @@ def find_rigid_modes(system: ClosedSystem, *, with_drifts: bool = True) -> Rigid
     """
     exact = _exact_sites(system.sites)
     numbering = _Numbering(system.sites)
-    still = _null_space(
-        list(_standing(system, exact, numbering)), numbering.size, split=numbering.size, known=0
-    )
+    still = _standing_solutions(system, exact, numbering)
     vectors = [_standing_state(system, exact, numbering, solution) for solution in still]
-    kept = _independent(vectors)  # an output nobody reads may be free without being part of the state
-    still, vectors = [still[place] for place in kept], [vectors[place] for place in kept]
     pairs = _drifts(system, exact, numbering, still) if still and with_drifts else []
     n = len(system.names)
     return RigidModes(
@@ -89,7 +87,62 @@ def find_rigid_modes(system: ClosedSystem, *, with_drifts: bool = True) -> Rigid
             ", ".join(name for name, entry in zip(system.names, vector, strict=True) if entry)
             for vector in vectors
         ),
+        exact=tuple(tuple(vector) for vector in (*vectors, *pairs)),
     )
+
+
+def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bool:
+    """Say whether the directions of a system's rigid modes are rigid with other matrices of its sites, too.
+
+    Parameters
+    ----------
+    system
+        The closed system.
+    others
+        Matrices of each site, over rationals or quotients of polynomials: then for all values of these.
+    """
+    numbering = _Numbering(system.sites)
+    exact = _exact_sites(system.sites)
+    for solution in _standing_solutions(system, exact, numbering):
+        if any(_value(form, solution) for form in _standing(system, others, numbering)):
+            return False
+        moved = zip(
+            _standing_state(system, others, numbering, solution),
+            _standing_state(system, exact, numbering, solution),
+            strict=True,
+        )
+        if any(one - other for one, other in moved):
+            return False
+    return True
+
+
+def _standing_solutions(
+    system: ClosedSystem | Loop, exact: Sequence[LinearSite], numbering: _Numbering
+) -> list[list[Fraction]]:
+    """Return the standing solutions whose states are independent.
+
+    An output nobody reads may be free without being part of the state.
+    """
+    still = _null_space(
+        list(_standing(system, exact, numbering)), numbering.size, split=numbering.size, known=0
+    )
+    kept = _independent([_standing_state(system, exact, numbering, solution) for solution in still])
+    return [still[place] for place in kept]
+
+
+def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
+    """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
+    left = np.array(rows)
+    places: list[int] = []
+    for _ in range(len(rows)):
+        scaled = np.abs(left) / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        line, place = divmod(int(np.argmax(scaled)), rows.shape[1])
+        places.append(place)
+        if left[line, place] != 0:
+            pivot = left[line] / left[line, place]
+            left = left - left[:, [place]] * pivot
+            left[line] = 0.0
+    return np.array(sorted(places), dtype=np.intp)
 
 
 class _Numbering:
@@ -131,7 +184,7 @@ def _combine(terms: Iterable[tuple[Any, Form]]) -> Form:
     return total
 
 
-def _standing(system: ClosedSystem, exact: Sequence[LinearSite], number: _Numbering) -> Iterator[Form]:
+def _standing(system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: _Numbering) -> Iterator[Form]:
     """Yield the equations of a constant solution, each a form that must vanish."""
     sent = [_standing_sends(site, number, g) for g, site in enumerate(exact)]
     for g, site in enumerate(exact):
@@ -177,7 +230,7 @@ def _standing_sends(site: LinearSite, number: _Numbering, g: int) -> dict[tuple[
 
 
 def _standing_state(
-    system: ClosedSystem, exact: Sequence[LinearSite], number: _Numbering, solution: Sequence[Fraction]
+    system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: _Numbering, solution: Sequence[Fraction]
 ) -> list[Fraction]:
     """Return the closed system's state that belongs to a standing solution."""
     state: list[Fraction] = []
@@ -207,7 +260,7 @@ class _Ramp:
 
     def __init__(
         self,
-        system: ClosedSystem,
+        system: ClosedSystem | Loop,
         exact: Sequence[LinearSite],
         number: _Numbering,
         still: Sequence[Sequence[Fraction]],
@@ -307,7 +360,7 @@ class _Ramp:
 
 
 def _drifts(
-    system: ClosedSystem,
+    system: ClosedSystem | Loop,
     exact: Sequence[LinearSite],
     number: _Numbering,
     still: Sequence[Sequence[Fraction]],

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -28,7 +28,7 @@ from apc.runtime.linearize import LinearSite, edge_name
 ORDER = ("send", "deliver", "tick", "act")
 
 MOST_TICKS = 20_000  # in a frame: each is a step of the lifting
-MOST_PACKETS = 1000  # of one peer: a dense eigenproblem of this size takes seconds
+MOST_PACKETS = 100_000  # of one peer: each has a name
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -67,11 +67,27 @@ class Way:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Heard:
-    """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame)."""
+    """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame).
+
+    On a way that loses or delays packets, each tick has a row of its own: tick `tick` of `clock` hears
+    whichever packets of the channel it does, and `sent` and `lag` say nothing more. With `gap` the row is not
+    what it hears but the weight of what it misses.
+    """
 
     way: Way
     sent: Sent
     lag: int
+    clock: str = ""
+    tick: int = -1
+    gap: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """An unreliable link: its packets are kept for `frames` frames; with `gaps`, what is missing counts."""
+
+    frames: int
+    gaps: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +194,7 @@ def build_schedules(
     patterns: Sequence[LinearSite],
     *,
     order: Sequence[str] = ORDER,
+    kept: Mapping[str, Kept] | None = None,
 ) -> tuple[Schedule, ...]:
     """Build the schedule of every group, over the frame they share; equal ones are one object.
 
@@ -193,6 +210,9 @@ def build_schedules(
         The order of coincident events, a permutation of `ORDER`. With "act" before "tick", a value that acts
         at once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and
         "tick" before "deliver" for a packet that arrives exactly at a tick.
+    kept
+        The links whose packets get lost or come late, by name: all that is sent over them is kept, and each
+        tick hears it in rows of its own. None: every link is as reliable as its delay says.
 
     Raises
     ------
@@ -201,6 +221,7 @@ def build_schedules(
     """
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
     rank = {name: place for place, name in enumerate(order)}
+    kept = kept or {}
     exchange = build_exchange(system, timings)
     live = [_live_outputs(pattern) for pattern in patterns]
     read = [_live_receives(pattern, outputs) for pattern, outputs in zip(patterns, live, strict=True)]
@@ -211,10 +232,15 @@ def build_schedules(
     depth: dict[Sent, int] = {}
     for group, own in zip(system.groups, ears, strict=True):
         if (group.kind, own) not in known:
-            heard = _heard_at_ticks(patterns[group.kind], exchange, live[group.kind], own, times, rank)
+            heard = _heard_at_ticks(patterns[group.kind], exchange, live[group.kind], own, times, rank, kept)
             known[group.kind, own] = heard
             for one in (one for row in heard.values() for receive in row for one in receive):
-                depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
+                link = one.sent.link
+                if link in kept:
+                    slots = times.frame // times.clocks[exchange.links[link].clock].period
+                    depth |= {Sent(link, one.sent.channel, k): kept[link].frames for k in range(slots)}
+                else:
+                    depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
     _check_depth(system, depth)
     built = {
         (kind, own): _build(patterns[kind], system, live[kind], heard, depth, times, rank)
@@ -376,13 +402,13 @@ def _check_frame_length(
 
 
 def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
-    """Refuse delays so long that a peer would keep more packets than can be analysed."""
+    """Refuse delays so long that nobody can have meant them."""
     packets = sum(depth.values())
     if packets > MOST_PACKETS:
         links = ", ".join(sorted({sent.link for sent in depth}))
         what = (
-            f"with these delays each peer keeps {packets} numbers on their way over {links}; "
-            f"at most {MOST_PACKETS} can be analysed"
+            f"with these delays each peer keeps {packets:,} numbers on their way over {links}; "
+            f"at most {MOST_PACKETS:,} can be named"
         )
         raise ApcError(
             Mistake("E805", Place(system.name), what, hint="a shorter delay, or a slower link clock")
@@ -403,17 +429,23 @@ def _heard_at_ticks(
     ears: _Ears,
     times: _Times,
     rank: Mapping[str, int],
+    kept: Mapping[str, Kept],
 ) -> dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]:
     """Return, for every (partition, tick) of the frame, what each receive of the partition hears."""
     heard: dict[tuple[int, int], tuple[tuple[Heard, ...], ...]] = {}
+
+    def rows(way: Way, channel: str, clock: str, index: int) -> tuple[Heard, ...]:
+        if way.link not in kept:
+            instant = times.clocks[clock].at(index)
+            return (_newest(way, channel, exchange.links[way.link], instant, times, rank),)
+        row = Heard(way, Sent(way.link, channel, 0), 0, clock, index)
+        return (row, replace(row, gap=True)) if kept[way.link].gaps else (row,)
+
     for p in sorted({partition for partition, _ in live}):
-        grid = times.clocks[pattern.kind.clocks[p].clock]
-        for index in range(times.frame // grid.period):
+        clock = pattern.kind.clocks[p].clock
+        for index in range(times.frame // times.clocks[clock].period):
             heard[p, index] = tuple(
-                tuple(
-                    _newest(way, channel, exchange.links[way.link], grid.at(index), times, rank)
-                    for way, channel in receive
-                )
+                tuple(row for way, channel in receive for row in rows(way, channel, clock, index))
                 for receive in ears[p]
             )
     return heard

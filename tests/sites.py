@@ -96,6 +96,7 @@ def user(operator: str = "mean", *, own_delay: bool = False) -> Kind:
             ClockPartition(
                 clock="haptic",
                 outputs=names,
+                units=("N",) * len(names),
                 memories=(),
                 starts=(),
                 receives=(
@@ -236,6 +237,7 @@ def alone(
     partition = ClockPartition(
         clock="haptic",
         outputs=outputs,
+        units=("N",) * len(outputs),
         memories=memories,
         starts=("zero",) * len(memories),
         receives=(),

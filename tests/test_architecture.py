@@ -30,10 +30,12 @@ ORDER = (
     # components and scenes
     *("apc.compiler.component", "apc.compiler.parts", "apc.compiler.declarations"),
     *("apc.compiler.definitions", "apc.compiler.library"),
-    *("apc.compiler.graphs", "apc.compiler.groups", "apc.compiler.studies", "apc.compiler.scene"),
+    *("apc.compiler.graphs", "apc.compiler.channels", "apc.compiler.groups", "apc.compiler.studies"),
+    "apc.compiler.scene",
     # equations
     *("apc.compiler.flatten", "apc.compiler.clocks", "apc.compiler.symbolic", "apc.compiler.blocks"),
-    *("apc.compiler.index", "apc.compiler.structure", "apc.compiler.exchange", "apc.compiler.functions"),
+    *("apc.compiler.index", "apc.compiler.structure", "apc.compiler.exchange", "apc.compiler.ports"),
+    "apc.compiler.functions",
     *("apc.compiler.pipeline", "apc.compiler.store"),
     # what is shown of them
     *("apc.compiler.schema", "apc.compiler.listing", "apc.compiler.diagram", "apc.compiler.picture"),
@@ -45,16 +47,61 @@ ORDER = (
         "apc.runtime.parameters",
         "apc.runtime.discretize",
     ),
-    *("apc.runtime.exchange", "apc.runtime.linearize", "apc.runtime.schedule", "apc.runtime.lift"),
+    *(
+        "apc.runtime.exchange",
+        "apc.runtime.packets",
+        "apc.runtime.timetable",
+        "apc.runtime.linearize",
+        "apc.runtime.schedule",
+        "apc.runtime.gathering",
+    ),
+    "apc.runtime.lift",
     # all peers, and what their motion tells
     *("apc.runtime.peers", "apc.runtime.modes", "apc.runtime.rigid", "apc.runtime.pseudospectrum"),
+    *("apc.runtime.enclosure", "apc.runtime.balls", "apc.runtime.certify"),
+    *("apc.runtime.ratios", "apc.runtime.duals"),
     *("apc.runtime.spectrum", "apc.runtime.selfcheck", "apc.runtime.analysis", "apc.runtime.needs"),
+    *("apc.runtime.box", "apc.runtime.box_proof"),
+    # many values of some parameters at once, and where the verdict changes
+    *("apc.runtime.wiring", "apc.runtime.batch", "apc.runtime.evaluator", "apc.runtime.crossings"),
+    "apc.runtime.bracket",
+    *("apc.runtime.delays", "apc.runtime.search", "apc.runtime.critical", "apc.runtime.margins"),
+    "apc.runtime.sensitivity",
+    # other ways to analyse: the paper's, other readings of ties, each state of a contact
+    *("apc.runtime.openloop", "apc.runtime.paper", "apc.runtime.conventions"),
+    *("apc.runtime.switches", "apc.runtime.contact_modes"),
+    # published conditions, and results at many values of some parameters
+    *("apc.runtime.passivity", "apc.runtime.overlay", "apc.runtime.grid", "apc.runtime.quantities"),
+    *("apc.runtime.table_file", "apc.runtime.sweep_work", "apc.runtime.sweep_store"),
+    *("apc.runtime.sweep_local", "apc.runtime.sweep_cluster", "apc.runtime.sweep"),
+    # a scene played in time
+    *("apc.runtime.propagate", "apc.runtime.forcing", "apc.runtime.program", "apc.runtime.native"),
+    *("apc.runtime.population", "apc.runtime.signals", "apc.runtime.simulation", "apc.runtime.summary"),
+    *("apc.runtime.trajectory", "apc.runtime.recording", "apc.runtime.figures"),
+    "apc.runtime.ensemble",
+    # the stable region of two parameters
+    *("apc.runtime.eigenpairs", "apc.runtime.surrogate", "apc.runtime.cells", "apc.runtime.curves"),
+    *("apc.runtime.boundary", "apc.runtime.staircase", "apc.runtime.region", "apc.runtime.region_panels"),
+    *("apc.runtime.region_report", "apc.runtime.region_figure", "apc.runtime.region_files"),
     "apc.runtime.report",
     # what a person calls
-    *("apc.inputs", "apc.contents", "apc.api", "apc.cli", "apc.__main__"),
+    *(
+        "apc.inputs",
+        "apc.contents",
+        "apc.api",
+        "apc.cli_region",
+        "apc.cli_simulate",
+        "apc.cli_sweep",
+        "apc.cli_critical",
+        "apc.cli",
+        "apc.__main__",
+    ),
 )
 # A result prints itself: it asks for the report, which knows it, when it is printed and not before.
-BACKWARDS = {("apc.runtime.analysis", "apc.runtime.report")}
+BACKWARDS = {
+    ("apc.runtime.analysis", "apc.runtime.report"),
+    ("apc.runtime.trajectory", "apc.runtime.figures"),  # likewise a trajectory that draws itself
+}
 PACKAGES = {"compiler": "apc.compiler", "runtime": "apc.runtime", "runtime/apc": "apc"}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "sympify", "parse_expr", "lambdify", "S"}
 FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "sympy.parsing"}

@@ -9,7 +9,7 @@ import casadi
 import mpmath
 import pytest
 
-from apc.runtime.exact import evaluate_exact
+from apc.runtime.exact import evaluate_exact, is_rational
 
 
 def _function(build: object, size: int = 2) -> casadi.Function:
@@ -63,3 +63,12 @@ def test_a_jacobian_can_be_walked_too() -> None:
     f = casadi.Function("f", [x], [casadi.vec(jacobian)])
     a, b = Fraction(1, 3), Fraction(2, 7)
     assert evaluate_exact(f, [[a, b]]) == [[b, 0, a, 2 * b]]
+
+
+def test_what_is_rounded_over_rationals_is_told() -> None:
+    assert is_rational(_function(lambda x: casadi.if_else(x[0] < 2, x[0] ** 3 / x[1], x[0] ** -2)))
+    assert not is_rational(_function(lambda x: x[0] ** 0.3 + x[1]))
+    assert not is_rational(_function(lambda x: x[0] ** x[1]))
+    assert not is_rational(_function(lambda x: casadi.sqrt(x[0]) + x[1]))
+    x = casadi.MX.sym("x", 2)
+    assert not is_rational(casadi.Function("f", [x], [x * x]))

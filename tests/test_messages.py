@@ -676,7 +676,7 @@ COMPONENT = [
     (
         "{unit: N/m, min: 0}",
         "stiff",
-        "5:14: E203 parameter stiffness wants clock, link, graph, delays, table, or a mapping "
+        "5:14: E203 parameter stiffness wants clock, link, graph, delays, loss, trace, table, or a mapping "
         "with its unit, got stiff. Write: stiffness: {unit: N/m, min: 0}",
     ),
     (
@@ -828,7 +828,7 @@ COMPONENT = [
     (
         "clock: clock\n",
         "clock: clok\n",
-        "9:10: E203 parameter clock wants clock, link, graph, delays, table, or a mapping with "
+        "9:10: E203 parameter clock wants clock, link, graph, delays, loss, trace, table, or a mapping with "
         "its unit, got clok. Write: clock: {unit: N/m, min: 0}",
     ),
     (

@@ -91,7 +91,7 @@ def test_another_format_version_is_refused_by_number(model: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["", "[]", "{}", "null", '{"format": 3}', "{", '{"format": 3, "functions": 3}']
+    "content", ["", "[]", "{}", "null", '{"format": 4}', "{", '{"format": 4, "functions": 3}']
 )
 def test_a_document_of_another_shape_is_refused(model: Path, content: str) -> None:
     rewritten(model, "model.json", content)

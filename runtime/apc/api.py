@@ -8,7 +8,7 @@ Does not: print.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,8 +18,17 @@ from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
     from apc.runtime.analysis import Analysis
+    from apc.runtime.box_proof import BoxProof
+    from apc.runtime.contact_modes import ContactModes
+    from apc.runtime.conventions import Conventions
+    from apc.runtime.critical import Critical
+    from apc.runtime.margins import Margins
+    from apc.runtime.paper import PaperRoute
+    from apc.runtime.sensitivity import Sensitivities
+    from apc.runtime.sweep import Sweep
+    from apc.runtime.trajectory import Trajectory
 
-Method = Literal["modes", "dense"]
+Method = Literal["auto", "modes", "dense", "determinant", "krylov", "paper"]
 Format = Literal["text", "json", "dot", "svg"]
 
 
@@ -83,7 +92,11 @@ def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> Compiled
 
 
 def analyze(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None, method: Method = "modes"
+    model: CompiledSystem | str | Path,
+    *,
+    set: Mapping[str, str] | None = None,
+    method: Method = "auto",
+    certify: bool = False,
 ) -> Analysis:
     """Say whether a scene is stable, by how much, and in which modes.
 
@@ -94,8 +107,13 @@ def analyze(
     set
         Parameter values to change first, as in `set_parameters`.
     method
-        "modes": a few systems of a site's size, at a cost that does not grow with the number of peers;
-        "dense": every peer in one system, the check on the other.
+        "auto": what serves the scene; "modes": a few systems of a site's size, at a cost that does not grow
+        with the number of equal peers; "dense": every peer in one system, the check on the others;
+        "determinant": the zeros of a small determinant, for peers that all differ and for long delays;
+        "krylov": a sparse matrix, for peers that differ on a sparse graph; "paper": the lifted matrices of
+        Rakhsha and Constantinescu, eqs. (18) to (20).
+    certify
+        Prove the verdict in ball arithmetic.
 
     Returns
     -------
@@ -105,17 +123,218 @@ def analyze(
     Raises
     ------
     ApcError
+        The input is at fault, or the method can't serve the scene.
+    """
+    from apc.runtime.answer import judge
+
+    return judge(_model(model, set), method=method, certify=certify)
+
+
+def critical(
+    model: CompiledSystem | str | Path,
+    parameter: str,
+    *,
+    set: Mapping[str, str] | None = None,
+    lower: str | None = None,
+    upper: str | None = None,
+) -> Critical:
+    """Find every value of a parameter or delay at which a scene becomes stable or unstable.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    parameter
+        Its name, such as "coordination.stiffness" or "lan.delay".
+    lower, upper
+        Quantities between which to look, such as "5000 N/m".
+
+    Raises
+    ------
+    ApcError
         The input is at fault.
     """
-    from apc.runtime.analysis import analyze_dense, analyze_modes
+    from apc.runtime import critical as crossings
 
+    return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper)
+
+
+def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Margins:
+    """Say how far each coupler's stiffness and damping and each delay may grow, all else as it is.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.runtime import margins as growth
+
+    return growth.margins(_model(model, set))
+
+
+def sensitivities(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+) -> Sensitivities:
+    """Differentiate the spectral radius with respect to every parameter.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.runtime import sensitivity
+
+    return sensitivity.sensitivities(_model(model, set))
+
+
+def conventions(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Conventions:
+    """Repeat the analysis under every order of coincident events and both readings of the start.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.runtime import conventions as orders
+
+    return orders.conventions(_model(model, set))
+
+
+def contact_modes(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+) -> ContactModes:
+    """Analyse a scene whose couplers push and never pull in each of their modes.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.runtime import contact_modes as switched
+
+    return switched.contact_modes(_model(model, set))
+
+
+def prove_box(
+    model: CompiledSystem | str | Path, box: Mapping[str, str], *, set: Mapping[str, str] | None = None
+) -> BoxProof:
+    """Prove that a scene is stable for every value of some parameters within their ranges.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    box
+        Ranges by parameter, such as {"contact.stiffness": "±1%"} or "900 N/m:1100 N/m".
+    """
+    from apc.runtime import box_proof
+    from apc.runtime.box import parse_range
+
+    system = _model(model, set)
+    ranges = [parse_range(system, f"{name}={value}") for name, value in box.items()]
+    return box_proof.prove_box(system, ranges)
+
+
+def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> PaperRoute:
+    """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+
+    Raises
+    ------
+    ApcError
+        E861 the scene has not the form these matrices need.
+    """
+    from apc.runtime import paper
+
+    return paper.paper_route(_model(model, set))
+
+
+def sweep(
+    model: CompiledSystem | str | Path,
+    over: Mapping[str, str | Sequence[str]],
+    *,
+    of: str = "analyze",
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    set: Mapping[str, str] | None = None,
+) -> Sweep:
+    """Compute a result at every combination of some parameters' values.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    over
+        Values by parameter: "500 N/m:1500 N/m:11" (lower end, upper end, how many), or a list of quantities.
+    of
+        "analyze", or "critical:PARAMETER".
+    out
+        A .parquet or .csv file; finished parts are kept beside it, and the same call takes up where it ended.
+    jobs
+        Processes; the number of cores if not given.
+    cluster
+        The address of a Dask scheduler.
+    """
+    from apc.runtime import sweep as points
+
+    path = None if out is None else Path(out)
+    return points.sweep(_model(model, set), over, of=of, out=path, jobs=jobs, cluster=cluster)
+
+
+def _model(model: CompiledSystem | str | Path, set: Mapping[str, str] | None) -> CompiledSystem:
+    """Return a compiled model, with the parameters set."""
     if not isinstance(model, CompiledSystem):
         from apc.inputs import load_or_compile
 
         model = load_or_compile(Path(model))
-    if set:
-        model = set_parameters(model, set)
-    return analyze_modes(model) if method == "modes" else analyze_dense(model)
+    return set_parameters(model, set) if set else model
+
+
+def simulate(
+    model: CompiledSystem | str | Path,
+    *,
+    duration: str | None = None,
+    set: Mapping[str, str] | None = None,
+    signals: Sequence[str] = (),
+    jit: bool = True,
+    seed: int | None = None,
+) -> Trajectory:
+    """Play a scene in time.
+
+    Parameters
+    ----------
+    model
+        A compiled model, or the path of a topology or compiled model.
+    duration
+        How long, such as "2 s"; that of the scene's experiment if not given.
+    set
+        Parameter values to change first, as in `set_parameters`.
+    signals
+        Patterns of the signals to keep, such as "cube.x" or "left[2].*"; all if there is none.
+    jit
+        Whether to compile to machine code where there is a C compiler.
+    seed
+        Of the packets that get lost or come late; that of the scene's experiment if not given.
+
+    Returns
+    -------
+    Trajectory
+        A row for every tick of the fastest clock with the values before the tick, and a summary.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.runtime import trajectory
+
+    seconds = trajectory.parse_duration(duration) if duration is not None else None
+    return trajectory.simulate(_model(model, set), duration=seconds, signals=signals, jit=jit, seed=seed)
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

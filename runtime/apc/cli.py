@@ -11,10 +11,15 @@ import json
 import re
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import click
 
+from apc.cli_analyze import analyze_command
+from apc.cli_critical import critical_command
+from apc.cli_region import region_command
+from apc.cli_simulate import simulate_command
+from apc.cli_sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
@@ -54,10 +59,21 @@ def apc() -> None:
         apc new            write a topology.yaml to start from
         apc compile        check it and turn it into topology.apc
         apc analyze        stable or not, by how much, in which modes
+        apc critical       the largest stable value of a parameter
+        apc simulate       what happens over time, as rows and a picture
+        apc region         where it is stable over two parameters: curves, areas
+        apc sweep          any of it at many values of some parameters
         apc show           what the scene is made of, as text or a picture
 
     Without FILE a command takes the only topology of the folder.
     """
+
+
+apc.add_command(analyze_command)
+apc.add_command(critical_command)
+apc.add_command(simulate_command)
+apc.add_command(region_command)
+apc.add_command(sweep_command)
 
 
 @apc.command()
@@ -229,52 +245,6 @@ def _print_or_write(text: str, out: Path | None) -> None:
 
     write_atomically(out, write)
     click.echo(f"{out} is written")
-
-
-@apc.command()
-@click.argument("file", required=False)
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar='PATH="VALUE UNIT"',
-    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
-)
-@click.option(
-    "--method",
-    type=click.Choice(["modes", "dense"]),
-    default="modes",
-    show_default=True,
-    help="modes: a few small systems, whatever the number of peers. dense: all peers in one, to check.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
-def analyze(file: str | None, settings: tuple[str, ...], method: str, as_json: bool) -> None:
-    """Say whether a scene is stable, by how much, and in which modes.
-
-    FILE is a topology or a compiled model. The spectral radius is per frame,
-    the time after which all clocks stand as before; below 1 every motion
-    dies out. A motion of all peers together, which nothing hinders, is left
-    out of it and named.
-    """
-    from apc.inputs import find_input, load_or_compile
-    from apc.runtime.analysis import analyze_dense, analyze_modes
-
-    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
-    if settings:
-        from apc.runtime.parameters import apply, parse_override
-
-        system = apply(system, [parse_override(system, text) for text in settings])
-    result = analyze_modes(system) if method == "modes" else analyze_dense(system)
-    if as_json:
-        _print_json(result.to_dict())
-    else:
-        from apc.runtime.report import analysis_report
-
-        click.echo(analysis_report(result))
-
-
-def _print_json(document: dict[str, Any]) -> None:
-    click.echo(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
 
 
 def _counted(number: int, noun: str) -> str:

@@ -1,0 +1,89 @@
+"""The command `apc analyze`.
+
+Takes: words of a command line. Gives: text on stdout.
+Guarantees: with --json, stdout holds one JSON document and nothing else.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+METHODS = ("auto", "modes", "dense", "determinant", "krylov", "paper")
+
+
+@click.command("analyze")
+@click.argument("file", required=False)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar='PATH="VALUE UNIT"',
+    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
+)
+@click.option(
+    "--method",
+    type=click.Choice(METHODS),
+    default="auto",
+    show_default=True,
+    metavar="METHOD",
+    help="auto: what serves the scene. modes: a few small systems. dense: all peers in one, to check. "
+    "determinant: zeros of a small determinant, for peers that all differ and for long delays. krylov: a "
+    "sparse matrix, for peers that differ on a sparse graph. paper: the lifted matrices of Rakhsha and "
+    "Constantinescu, eqs. (18) to (20).",
+)
+@click.option("--certify", is_flag=True, help="Prove the verdict in ball arithmetic.")
+@click.option(
+    "--box",
+    "box",
+    multiple=True,
+    metavar="PATH=±P%",
+    help="Prove stability for every value within, e.g. --box contact.stiffness=±1%, or "
+    '--box "contact.stiffness=900 N/m:1100 N/m". May be repeated.',
+)
+@click.option(
+    "--conventions",
+    "every_convention",
+    is_flag=True,
+    help="Repeat the analysis under every order of events that coincide.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+def analyze_command(
+    file: str | None,
+    settings: tuple[str, ...],
+    method: str,
+    certify: bool,
+    box: tuple[str, ...],
+    every_convention: bool,
+    as_json: bool,
+) -> None:
+    """Say whether a scene is stable, by how much, and in which modes.
+
+    FILE is a topology or a compiled model. The spectral radius is per frame,
+    the time after which all clocks stand as before; below 1 every motion
+    dies out. A motion of all peers together, which nothing hinders, is left
+    out of it and named. Beside the verdict stand what moves the radius most,
+    how far each coupler and delay may grow, and for contacts that push and
+    never pull, which of them make it unstable.
+    """
+    from apc.inputs import find_input, load_or_compile
+    from apc.runtime.answer import answer
+
+    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
+    if settings:
+        from apc.runtime.parameters import apply, parse_override
+
+        system = apply(system, [parse_override(system, text) for text in settings])
+    ranges = []
+    if box:
+        from apc.runtime.box import parse_range
+
+        ranges = [parse_range(system, text) for text in box]
+    found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), ensure_ascii=False, allow_nan=False, indent=2))
+    else:
+        click.echo(str(found))

@@ -1,0 +1,204 @@
+"""The command `simulate`: what it takes, what it prints, how it is interrupted.
+
+Takes: words of a command line. Gives: the click command `simulate_command`.
+Guarantees: with --json, stdout holds one JSON document and nothing else; progress goes to a terminal only;
+Ctrl-C ends the run and keeps what is done.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from apc.compiler.errors import ApcError
+
+LONG = 1.0  # seconds of work after which progress is shown
+
+
+@click.command("simulate")
+@click.argument("file", required=False)
+@click.option(
+    "--duration",
+    metavar='"TIME"',
+    help='How long, such as "2 s"; that of the scene\'s experiment if not given.',
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar='PATH="VALUE UNIT"',
+    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
+)
+@click.option(
+    "--signals",
+    multiple=True,
+    metavar="PATTERN",
+    help="Record only what fits, such as cube.x, 'left[2].*' or '*.v'. May be repeated.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the rows to this file: .csv, .parquet, .mat or .npz.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Draw them, a panel a quantity: .png, .svg or .pdf.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+@click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**63 - 1),
+    metavar="NUMBER",
+    help="Of packets that get lost or come late; the experiment's if not given.",
+)
+@click.option(
+    "--runs",
+    type=click.IntRange(1, 10_000_000),
+    metavar="NUMBER",
+    help="Play it so often, with other packets each time, and say what that amounts to.",
+)
+@click.option(
+    "--jobs",
+    type=click.IntRange(1, 1024),
+    default=1,
+    show_default=True,
+    metavar="NUMBER",
+    help="Processes that share the runs.",
+)
+def simulate_command(
+    file: str | None,
+    duration: str | None,
+    settings: tuple[str, ...],
+    signals: tuple[str, ...],
+    out: Path | None,
+    plot: Path | None,
+    as_json: bool,
+    no_jit: bool,
+    seed: int | None,
+    runs: int | None,
+    jobs: int,
+) -> None:
+    """Play a scene in time.
+
+    FILE is a topology or a compiled model. Devices move by their exact
+    transition from event to event, forces are computed at their ticks,
+    packets arrive when they are due; there is no step size. A row is written
+    for every tick of the fastest clock, with the values before the tick.
+
+    \b
+        apc simulate --duration "3 s" --plot run.png
+        apc simulate --signals cube.x --out run.csv
+        apc simulate --runs 1000 --seed 1 --jobs 4
+    """
+    from apc.inputs import find_input, load_or_compile
+    from apc.runtime.recording import open_recording
+    from apc.runtime.simulation import prepare
+    from apc.runtime.summary import summary_text
+    from apc.runtime.trajectory import (
+        Keeper,
+        duration_of,
+        parse_duration,
+        play,
+        provenance_of,
+        result_document,
+        trajectory_of,
+    )
+
+    if runs is not None and (signals or out or plot):
+        raise click.UsageError("--runs keeps no rows: --signals, --out and --plot are for one run")
+    if plot is not None:
+        from apc.runtime.figures import check_format
+
+        check_format(plot)
+    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
+    if settings:
+        from apc.runtime.parameters import apply, parse_override
+
+        system = apply(system, [parse_override(system, text) for text in settings])
+    seconds = duration_of(system, parse_duration(duration) if duration is not None else None)
+    if runs is not None:
+        from apc.runtime.ensemble import play_many
+
+        with _progress(runs, "runs") as progress:
+            many = play_many(
+                system, seconds, runs=runs, seed=seed, jobs=jobs, jit=not no_jit, progress=progress
+            )
+        as_text = json.dumps(many.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
+        click.echo(as_text if as_json else str(many))
+        if many.interrupted:
+            raise click.Abort
+        return
+    simulation = prepare(system, seconds, signals=signals, jit=not no_jit, seed=seed)
+    recording = open_recording(out, simulation) if out is not None else None
+    try:
+        keeper = Keeper(simulation) if plot is not None else None
+        sinks = [sink for sink in (recording, keeper) if sink is not None]
+        with _progress(float(seconds)) as progress:
+            summary, interrupted = play(simulation, sinks, progress=progress)
+        if recording is not None:
+            recording.close()
+    except ApcError:  # the run can't go on: what was done is kept
+        if recording is not None:
+            recording.close()
+        raise
+    except BaseException:
+        if recording is not None:
+            recording.discard()
+        raise
+    if plot is not None and keeper is not None:
+        from apc.runtime.figures import save
+
+        save(trajectory_of(simulation, keeper, summary, interrupted), plot)
+    if as_json:
+        document = result_document(system.name, summary, provenance_of(simulation), interrupted)
+        click.echo(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
+    else:
+        click.echo(summary_text(system.name, summary))
+        for written in (out, plot):
+            if written is not None:
+                click.echo(f"  {written} is written")
+    if interrupted:
+        click.echo(f"stopped at {summary.end:g} s of {float(seconds):g} s; what was done is kept", err=True)
+        raise click.Abort
+
+
+@contextmanager
+def _progress(total: float, unit: str = "s") -> Iterator[Callable[[float], None]]:
+    """Give a function that shows on a terminal how much is done, once the work takes long."""
+    import time
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("simulate"),
+        BarColumn(),
+        TextColumn(f"{{task.completed:.4g}} of {{task.total:g}} {unit}"),
+        TimeRemainingColumn(),
+    )
+    bar = Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty())
+    task = bar.add_task("simulate", total=total)
+    begun, shown = time.monotonic(), False
+
+    def progress(done: float) -> None:
+        nonlocal shown
+        if not shown and time.monotonic() - begun > LONG:
+            bar.start()
+            shown = True
+        bar.update(task, completed=done)
+
+    try:
+        yield progress
+    finally:
+        if shown:
+            bar.stop()

@@ -1,0 +1,319 @@
+"""Where in a rectangle a boundary runs: a grid, made finer where it may hide something.
+
+Takes: a function that tells the logarithms of the largest eigenvalue magnitudes at many points of the unit
+square at once.
+Gives: `Survey`, `Crossing`, `survey`.
+Guarantees: every cell whose corners disagree, and every cell that could, by the second differences measured
+around it, hide a component, is divided, all cells of a level as one batch, down to the finest size; every
+crossing of a cell's edge is linked to the one that follows it with the stable side on its left.
+Does not: find a component that lies inside one cell and leaves no trace in the values around it, nor say
+where on its edge a crossing is (see `boundary`).
+
+Between the corners of a cell of size h a smooth g differs from its bilinear interpolant by at most
+½ (D_x s(1−s) + D_y t(1−t)), 0 ≤ s, t ≤ 1, where D_x = h² max|g_xx|; second differences stand for D_x, D_y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Node = tuple[int, int]  # lattice coordinates
+Edge = tuple[Node, Node]  # the stable node first
+
+# Measured second differences are multiplied by this before they count as bounds: the third derivative may
+# raise them between the samples.
+CAUTION = 1.5
+
+# Signs at the rectangle's own edges are taken so far inside: a stiffness of exactly zero
+# frees what it held and leaves an eigenvalue 1 that says nothing about the points beside it.
+INSIDE_RIM = 1e-9
+
+# How far inside a cell its envelope is looked at.
+_INNER = np.array([0.125, 0.375, 0.625, 0.875])
+
+# A cell is divided into four until its corners tell how the boundary runs; the finest is this many halvings
+# of the coarse cell.
+HALVINGS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """A stretch of a cell's edge that the boundary crosses: from a stable to an unstable point (2,) each."""
+
+    stable: Floats
+    unstable: Floats
+    growth: tuple[float, float]  # log of the spectral radius at both
+    rim: bool  # on the rectangle's own edge
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """The crossings and how they follow one another, the stable side on the left.
+
+    `chains` are lists of crossings by number, `closed` says which of them come back to their first. `corners`
+    says of the rectangle's corners (0, 0), (1, 0), (0, 1), (1, 1) whether they are stable. `cell` is the side
+    of the coarse cells, `finest` of the smallest looked at. `lattice` and `growth` are the coarse samples:
+    coordinates (n,) and log of the spectral radius (n, n), rows y.
+    """
+
+    crossings: tuple[Crossing, ...]
+    chains: tuple[tuple[int, ...], ...]
+    closed: tuple[bool, ...]
+    corners: tuple[bool, bool, bool, bool]
+    cell: float
+    finest: float
+    samples: int
+
+
+def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: int = HALVINGS) -> Survey:
+    """Find the crossings of the boundary with the cells' edges, and link them.
+
+    Parameters
+    ----------
+    log_magnitudes
+        The logarithms (k, m) of the m largest magnitudes at points (k, 2), descending.
+    cells
+        Coarse cells along each side.
+    halvings
+        How many times a cell may be halved.
+    """
+    lattice = _Lattice(log_magnitudes, cells, halvings)
+    step = 2**halvings
+    axis = np.arange(cells + 1) * step
+    grid = lattice.sample([(int(i), int(j)) for j in axis for i in axis]).reshape(cells + 1, cells + 1, -1)
+    suspect = _suspect(grid)
+    leaves: dict[Node, int] = {}
+    divided = [(int(i) * step, int(j) * step, step) for j, i in np.argwhere(suspect)]
+    stable = grid[..., 0] < 0
+    mixed = _mixed(stable)
+    near = suspect.copy()
+    near[1:] |= suspect[:-1]
+    near[:-1] |= suspect[1:]
+    near[:, 1:] |= suspect[:, :-1]
+    near[:, :-1] |= suspect[:, 1:]
+    # A coarse cell whose corners agree, beside none that was divided, has nothing to tell.
+    for j, i in np.argwhere((mixed | near) & ~suspect):
+        leaves[int(i) * step, int(j) * step] = step
+    while divided:
+        leaves, divided = _divide(lattice, leaves, divided)
+        if not divided:
+            divided = [(*corner, size) for corner, size in leaves.items() if _tangled(lattice, corner, size)]
+            for i, j, _ in divided:
+                del leaves[i, j]
+    return _linked(lattice, leaves, cells)
+
+
+class _Lattice:
+    """The samples taken so far, by lattice coordinates."""
+
+    def __init__(self, function: Callable[[Floats], Floats], cells: int, halvings: int) -> None:
+        self.function = function
+        self.cells = cells
+        self.side = cells * 2**halvings
+        self.values: dict[Node, Floats] = {}
+
+    def point(self, nodes: Iterable[Node]) -> Floats:
+        """Return where nodes are in the unit square (k, 2), a hair inside its edges."""
+        return np.clip(np.array(list(nodes), np.float64) / self.side, INSIDE_RIM, 1 - INSIDE_RIM)
+
+    def sample(self, nodes: Iterable[Node]) -> Floats:
+        """Return the values at nodes (k, m), computing those that are new in one batch."""
+        listed = list(nodes)
+        new = [node for node in dict.fromkeys(listed) if node not in self.values]
+        if new:
+            self.values |= zip(new, self.function(self.point(new)), strict=True)
+        return np.array([self.values[node] for node in listed])
+
+    def stable(self, node: Node) -> bool:
+        """Say whether a node that was sampled is stable."""
+        return bool(self.values[node][0] < 0)
+
+    def along(self, a: Node, b: Node) -> Iterator[Node]:
+        """Yield the sampled nodes from a, included, to b, excluded, on a straight edge."""
+        middle = ((a[0] + b[0]) // 2, (a[1] + b[1]) // 2)
+        if max(abs(a[0] - b[0]), abs(a[1] - b[1])) > 1 and middle in self.values:
+            yield from self.along(a, middle)
+            yield from self.along(middle, b)
+        else:
+            yield a
+
+    def around(self, corner: Node, size: int) -> list[Node]:
+        """Return the sampled nodes of a cell's rim, counter-clockwise."""
+        i, j = corner
+        ring = [(i, j), (i + size, j), (i + size, j + size), (i, j + size), (i, j)]
+        return [node for a, b in pairwise(ring) for node in self.along(a, b)]
+
+
+def _divide(
+    lattice: _Lattice, leaves: dict[Node, int], divided: list[tuple[int, int, int]]
+) -> tuple[dict[Node, int], list[tuple[int, int, int]]]:
+    """Divide cells into four each; return all leaves, and which of the new cells must be divided again."""
+    halves = [(i, j, size // 2) for i, j, size in divided]
+    nodes = [(i + a * h, j + b * h) for i, j, h in halves for b in range(3) for a in range(3)]
+    blocks = lattice.sample(nodes).reshape(len(halves), 3, 3, -1)
+    again = []
+    for (i, j, h), block in zip(halves, blocks, strict=True):
+        suspect = _suspect(block) & (h > 1)
+        for b in range(2):
+            for a in range(2):
+                corner = (i + a * h, j + b * h)
+                if suspect[b, a]:
+                    again.append((*corner, h))
+                else:
+                    leaves[corner] = h
+    return leaves, again
+
+
+def _mixed(stable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Say of each cell of a grid (n + 1, m + 1) of nodes whether its corners disagree."""
+    corners = stable[:-1, :-1].astype(int) + stable[1:, :-1] + stable[:-1, 1:] + stable[1:, 1:]
+    mixed: NDArray[np.bool_] = (corners > 0) & (corners < 4)
+    return mixed
+
+
+def _suspect(values: Floats) -> NDArray[np.bool_]:
+    """Say of each cell of a grid of nodes (n + 1, m + 1, branches), rows y, whether it may hide something.
+
+    A cell with stable corners hides something when a branch may rise above zero inside; one with unstable
+    corners when the first branch may sink below zero; one whose corners disagree when the boundary passes
+    through all of its edges, or bends more than it slopes.
+    """
+    along_x = CAUTION * _second(values, axis=1)  # (n + 1, m, branches): at the ends of each cell, row by row
+    along_y = CAUTION * _second(values, axis=0)
+    corners = np.stack([values[:-1, :-1], values[:-1, 1:], values[1:, :-1], values[1:, 1:]])
+    bend = np.stack([along_x[:-1], along_x[1:]]).max(axis=0) + np.stack(
+        [along_y[:, :-1], along_y[:, 1:]]
+    ).max(axis=0)
+    top, first = corners[..., 0], bend[..., 0]
+    stable, unstable = (top < 0).all(axis=0), (top >= 0).all(axis=0)
+    span = top.max(axis=0) - top.min(axis=0)
+    crossed = (top[0] < 0) == (top[3] < 0)
+    crossed &= ((top[1] < 0) == (top[2] < 0)) & ((top[0] < 0) != (top[1] < 0))
+    suspect = ~stable & ~unstable & (crossed | (first > 2 * span))
+    # At most 1/8 of both second differences: the envelope is looked at only where that reaches zero.
+    rising = stable & (corners.max(axis=0) + bend / 8 >= 0).any(axis=-1)
+    sinking = unstable & (top.min(axis=0) - first / 8 <= 0)
+    for looked_at, sign, branches in ((rising, 1.0, slice(None)), (sinking, -1.0, slice(0, 1))):
+        j, i = np.nonzero(looked_at)
+        if len(j):
+            four = sign * corners[:, j, i, branches]
+            x = np.stack([along_x[j, i, branches], along_x[j + 1, i, branches]])
+            y = np.stack([along_y[j, i, branches], along_y[j, i + 1, branches]])
+            suspect[j, i] = (_envelope(four, x, y) >= 0).any(axis=(0, 1, 3))
+    return suspect
+
+
+def _envelope(corners: Floats, along_x: Floats, along_y: Floats) -> Floats:
+    """Return an upper bound of each branch on points inside cells (4, 4, cells, branches).
+
+    Parameters
+    ----------
+    corners
+        The values at (0, 0), (1, 0), (0, 1), (1, 1), (4, cells, branches).
+    along_x
+        Bounds of the second differences along x at the lower and upper edge (2, cells, branches).
+    along_y
+        The same along y at the left and right edge.
+    """
+    s = _INNER[None, :, None, None]
+    t = _INNER[:, None, None, None]
+    interpolant = (1 - t) * ((1 - s) * corners[0] + s * corners[1]) + t * (
+        (1 - s) * corners[2] + s * corners[3]
+    )
+    x = (1 - t) * along_x[0] + t * along_x[1]
+    y = (1 - s) * along_y[0] + s * along_y[1]
+    bound: Floats = interpolant + 0.5 * (x * s * (1 - s) + y * t * (1 - t))
+    return bound
+
+
+def _second(values: Floats, *, axis: int) -> Floats:
+    """Return for each cell along an axis the larger of the second differences at its two ends."""
+    moved = np.moveaxis(values, axis, 0)
+    bends = np.abs(moved[2:] - 2 * moved[1:-1] + moved[:-2])
+    bends = np.concatenate([bends[:1], bends, bends[-1:]])
+    return np.moveaxis(np.maximum(bends[:-1], bends[1:]), 0, axis)
+
+
+def _changes(lattice: _Lattice, corner: Node, size: int) -> list[tuple[Edge, bool]]:
+    """Return a cell's crossed stretches counter-clockwise, each with whether it leaves the stable side."""
+    ring = lattice.around(corner, size)
+    found = []
+    for a, b in zip(ring, [*ring[1:], ring[0]], strict=True):
+        if lattice.stable(a) != lattice.stable(b):
+            leaving = lattice.stable(a)
+            found.append(((a, b) if leaving else (b, a), leaving))
+    return found
+
+
+def _tangled(lattice: _Lattice, corner: Node, size: int) -> bool:
+    """Say whether a leaf that can be divided is crossed by more than one piece of the boundary."""
+    return size > 1 and len(_changes(lattice, corner, size)) > 2
+
+
+def _linked(lattice: _Lattice, leaves: Mapping[Node, int], cells: int) -> Survey:
+    """Link the crossings of all leaves: with the stable side on the left, a piece of the boundary enters a
+    cell where its rim, counter-clockwise, leaves the stable side, and goes where it comes back to it.
+    """
+    follows: dict[Edge, Edge] = {}
+    for corner, size in sorted(leaves.items()):
+        changes = _changes(lattice, corner, size)
+        leaving = [edge for edge, out in changes if out]
+        back = [edge for edge, out in changes if not out]
+        if len(changes) > 2 and _centre_is_stable(lattice, corner, size):
+            # Two pieces in a finest cell: each cuts off an unstable corner, its crossings side by side.
+            follows |= zip(leaving, back if changes[0][1] else [*back[1:], back[0]], strict=True)
+        else:
+            follows |= zip(
+                leaving, [back[-1], *back[:-1]] if changes and changes[0][1] else back, strict=True
+            )
+    number = {edge: place for place, edge in enumerate(dict.fromkeys([*follows, *follows.values()]))}
+    entered = set(follows.values())
+    starts = [edge for edge in follows if edge not in entered]
+    chains, closed = [], []
+    left = dict(follows)
+    for start in [*starts, *follows]:
+        if start not in left:
+            continue
+        chain = [start]
+        while chain[-1] in left:
+            chain.append(left.pop(chain[-1]))
+        loop = len(chain) > 1 and chain[-1] == start
+        chains.append(tuple(number[edge] for edge in (chain[:-1] if loop else chain)))
+        closed.append(loop)
+    side = lattice.side
+    rim = [_on_rim(edge, side) for edge in number]
+    corners = ((0, 0), (side, 0), (0, side), (side, side))
+    return Survey(
+        crossings=tuple(
+            Crossing(
+                np.array(stable, np.float64) / side,
+                np.array(unstable, np.float64) / side,
+                (float(lattice.values[stable][0]), float(lattice.values[unstable][0])),
+                on_rim,
+            )
+            for (stable, unstable), on_rim in zip(number, rim, strict=True)
+        ),
+        chains=tuple(chains),
+        closed=tuple(closed),
+        corners=tuple(lattice.stable(corner) for corner in corners),  # type: ignore[arg-type] # four of them
+        cell=1 / cells,
+        finest=min(leaves.values(), default=side // cells) / side,
+        samples=len(lattice.values),
+    )
+
+
+def _centre_is_stable(lattice: _Lattice, corner: Node, size: int) -> bool:
+    """Say whether the middle of a finest cell is stable."""
+    middle = (np.array([corner]) + size / 2) / lattice.side
+    return bool(lattice.function(middle)[0, 0] < 0)
+
+
+def _on_rim(edge: Edge, side: int) -> bool:
+    """Say whether both nodes of a stretch lie on the same edge of the rectangle."""
+    return any(edge[0][axis] == edge[1][axis] in (0, side) for axis in (0, 1))

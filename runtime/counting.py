@@ -1,0 +1,96 @@
+"""How many zeros of a function lie in a circle: the argument principle, on a cover of discs.
+
+Takes: a function that bounds itself in discs, and a circle.
+Gives: `Ball`, `Bounded`, `wind`.
+Guarantees: where the function's bounds hold, the number is right: no zero is missed between samples. None
+says that no cover was found, as when a zero lies on the circle.
+Does not: find zeros (see `characteristic`).
+
+Each arc of the circle lies in a disc about its middle, and within the disc the function differs from its
+value at the middle, f₀, by less than |f₀|: it has no zero there, and its argument keeps within ±π/2 of that
+of f₀. Neighbouring arcs share a point, so their middles' arguments differ by less than π: the sum of these
+differences is the change of the argument along the circle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Ball:
+    """A function at points: `direction` f₀/|f₀| (z,) and `change` (z,), a bound on |f/f₀ − 1| in discs."""
+
+    direction: Complexes
+    change: Floats
+
+
+# A function of points (z,) and the radii of discs about them (z,).
+Bounded = Callable[[Complexes, Floats], Ball]
+
+# Arcs to begin with, all around.
+FIRST_ARCS = 32
+
+# Evaluations after which a cover is given up: a thousand frames of delay need some thousand.
+MOST_POINTS = 60_000
+
+# An arc narrower than this many radians has a zero as good as on it: given up.
+NARROWEST = 1e-14
+
+
+def wind(
+    function: Bounded,
+    centre: float | complex,
+    radius: float,
+    *,
+    arcs: int = FIRST_ARCS,
+    most: int = MOST_POINTS,
+) -> int | None:
+    """Return how often a function goes around 0 along a circle, counter-clockwise; None if it can't be told.
+
+    Parameters
+    ----------
+    function
+        Bounded in discs. It is real on the real axis: about a real centre, half the circle tells all.
+    centre, radius
+        The circle.
+    arcs
+        How many arcs to begin with.
+    most
+        Evaluations after which to give up.
+    """
+    half = not complex(centre).imag
+    edges = np.linspace(0.0, np.pi if half else 2 * np.pi, (arcs // 2 if half else arcs) + 1)
+    starts, ends = edges[:-1], edges[1:]
+    settled: list[tuple[Floats, Complexes]] = []
+    spent = 0
+    while len(starts):
+        spent += len(starts)
+        if spent > most:
+            return None
+        middles = (starts + ends) / 2
+        # The far end of an arc is a chord away from its middle; the point itself is rounded.
+        reach = radius * (2 * np.sin((ends - starts) / 4) + 1e-15) + 4e-16 * abs(centre)
+        ball = function(centre + radius * np.exp(1j * middles), reach)
+        good = ball.change < 1
+        settled.append((middles[good], ball.direction[good]))
+        left, right = starts[~good], ends[~good]
+        if np.any(right - left < NARROWEST):
+            return None
+        cut = (left + right) / 2
+        starts, ends = np.concatenate([left, cut]), np.concatenate([cut, right])
+    order = np.argsort(np.concatenate([angles for angles, _ in settled]))
+    direction = np.concatenate([values for _, values in settled])[order]
+    turned = float(np.angle(direction[1:] / direction[:-1]).sum())
+    if half:  # the other half mirrors it; where they meet, the function is real
+        turned = 2 * turned + float(np.angle(direction[0] ** 2)) + float(np.angle(direction[-1].conj() ** 2))
+    else:
+        turned += float(np.angle(direction[0] / direction[-1]))
+    return round(turned / (2 * np.pi))

@@ -1,0 +1,339 @@
+"""Where the largest eigenvalue magnitude of a family of matrices crosses 1 as one number varies.
+
+Takes: a function that gives the matrices and their derivatives at many points of an interval.
+Gives: `Course`, `Root`, `Scan`, `scan`, `eigenvalues`.
+Guarantees: every cell between samples is either shown clear by the eigenvalues and their derivatives at both
+ends, or divided down to the cell size; every change found is bracketed.
+Does not: prove anything (see `critical`), or choose the interval.
+
+Between two samples an eigenvalue follows the cubic through its values and slopes at both; how far the
+tangents of the two ends miss each other half-way, e, stands for what the cubic doesn't know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+Truths = NDArray[np.bool_]
+
+# Each system's matrices (k, n, n) and their derivatives at points (k,); NaN where there is no matrix.
+Course = Callable[[Floats], Sequence[tuple[Floats, Floats]]]
+
+# A sample with an eigenvalue nearer to the circle than this tells no side: far above the rounding of a few
+# dozen states.
+UNSURE = 1e-11
+
+# A cell is clear when its eigenvalues' cubics keep this much of e away from the circle; the cubic itself is
+# off by far less than e wherever the motion is smooth.
+CAUTION = 0.5
+
+# Places at which a cubic is looked at.
+PLACES = 9
+
+# Cells narrower than this, relative to the value, are divided no further.
+CELL = 1e-3
+
+# An inverse of the eigenvectors is used if it is one to this; derivatives then have half their digits.
+SPOILT = 1e-8
+
+# A derivative of an eigenvalue of worse condition than this is mostly rounding.
+WORST = 1e10
+
+# Cells divided at a time, and levels: an eigenvalue that follows the circle would be sampled for ever.
+MOST_OPEN, MOST_LEVELS = 64, 40
+
+# What is smaller decides nothing; its derivative, one of a defective cluster at zero often, means nothing.
+SMALL = 0.05
+
+# A Newton step so small, relatively, is the last: what is left is about its square.
+SETTLED = 1e-7
+
+# Newton's steps at most, each with a bracket to fall back on.
+MOST_STEPS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Root:
+    """A value at which the largest magnitude crosses 1.
+
+    `low` and `high` bracket it; `rising` says that it grows there; `system` is the one whose `eigenvalue`
+    crosses, and `slope` is d|eigenvalue| over the value.
+    """
+
+    value: float
+    low: float
+    high: float
+    rising: bool
+    system: int
+    eigenvalue: complex
+    slope: float
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """What was found: `points` (k,) with the largest magnitude `radius` (k,), and the `roots` in order.
+
+    `whole` is False where an eigenvalue kept so near to the circle that not every cell could be cleared.
+    """
+
+    points: Floats
+    radius: Floats
+    roots: tuple[Root, ...]
+    whole: bool
+
+
+def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
+    """Return the eigenvalues (k, n) of matrices (k, n, n) and their derivatives, dλ = w dM v / (w v).
+
+    A derivative that means nothing, of an eigenvalue near zero or one that is hardly simple, comes as 0.
+    """
+    values, right = np.linalg.eig(matrix)
+    unit = np.eye(matrix.shape[1])
+    try:
+        left = np.linalg.inv(right)
+        # A defective cluster spoils the inverse for all the others as well.
+        spoilt = ~(np.abs(left @ right - unit) <= SPOILT).all(axis=(1, 2))
+    except np.linalg.LinAlgError:
+        left, spoilt = np.empty_like(right), np.ones(len(matrix), dtype=bool)
+    if spoilt.any():
+        left = left.astype(np.complex128)
+        left[spoilt] = _left_vectors(matrix[spoilt], values[spoilt])
+    with np.errstate(all="ignore"):
+        derivative = np.einsum("kij,kji->ki", left, slope @ right)
+        weight = np.einsum("kij,kji->ki", left, right)
+        derivative = derivative / weight
+    condition = np.linalg.norm(left, axis=2) * np.linalg.norm(right, axis=1)
+    vague = ~(condition < WORST * np.abs(weight)) | ~np.isfinite(derivative) | (np.abs(values) < SMALL)
+    return values.astype(np.complex128), np.where(vague, 0.0, derivative)
+
+
+def _left_vectors(matrix: Floats, values: Complexes) -> Complexes:
+    """Return left eigenvectors as rows, those of the transposed matrix whose eigenvalue is nearest."""
+    found, vectors = np.linalg.eig(matrix.swapaxes(1, 2))
+    nearest = np.argmin(np.abs(values[:, :, None] - found[:, None, :]), axis=2)
+    rows: Complexes = np.take_along_axis(vectors.swapaxes(1, 2), nearest[:, :, None], axis=1)
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class _Samples:
+    """Points in order with each system's eigenvalues (k, n) and slopes (k, n)."""
+
+    points: Floats
+    values: tuple[Complexes, ...]
+    slopes: tuple[Complexes, ...]
+
+    def merged(self, other: _Samples) -> _Samples:
+        points = np.concatenate([self.points, other.points])
+        order = np.argsort(points, kind="stable")
+        return _Samples(
+            points[order],
+            tuple(np.concatenate(pair)[order] for pair in zip(self.values, other.values, strict=True)),
+            tuple(np.concatenate(pair)[order] for pair in zip(self.slopes, other.slopes, strict=True)),
+        )
+
+    def radius(self) -> Floats:
+        sizes = [np.abs(one).max(axis=1) for one in self.values if one.shape[1]]
+        return np.asarray(np.max(sizes, axis=0)) if sizes else np.zeros(len(self.points))
+
+
+def scan(course: Course, points: Floats, *, least: float) -> Scan:
+    """Find every crossing between the first and the last of some points.
+
+    Parameters
+    ----------
+    course
+        The matrices and their derivatives.
+    points
+        Where to begin (k,), in order; cells that aren't clear are divided.
+    least
+        Cells are measured against the value, or against this where the value is smaller.
+    """
+    samples = _sample(course, points)
+    whole = True
+    for _ in range(MOST_LEVELS):
+        if len(samples.points) < 2:
+            break
+        open_ = np.flatnonzero(_open(samples) & (_widths(samples.points, least) > CELL))
+        if not len(open_):
+            break
+        if len(open_) > MOST_OPEN:
+            whole = False
+            break
+        more = _sample(course, _middles(samples.points)[open_])
+        if not len(more.points):
+            whole = False
+            break
+        samples = samples.merged(more)
+    else:
+        whole = False
+    radius = samples.radius()
+    stable = radius < 1
+    changes = np.flatnonzero(stable[1:] != stable[:-1])
+    return Scan(samples.points, radius, _roots(course, samples, changes), whole)
+
+
+def _sample(course: Course, points: Floats) -> _Samples:
+    """Return the samples at points that have matrices and a side."""
+    pairs = course(points)
+    sound = np.ones(len(points), dtype=bool)
+    for matrix, slope in pairs:
+        sound &= np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(slope).all(axis=(1, 2))
+    found = [eigenvalues(matrix[sound], slope[sound]) for matrix, slope in pairs]
+    samples = _Samples(points[sound], tuple(v for v, _ in found), tuple(d for _, d in found))
+    # What lies on the circle within rounding tells no side, unless something is clearly outside.
+    near = samples.radius()
+    sided = np.abs(near - 1) > UNSURE
+    return _Samples(
+        samples.points[sided],
+        tuple(one[sided] for one in samples.values),
+        tuple(one[sided] for one in samples.slopes),
+    )
+
+
+def _widths(points: Floats, least: float) -> Floats:
+    """Return the cells' widths relative to their values."""
+    return np.diff(points) / np.maximum(np.maximum(np.abs(points[1:]), np.abs(points[:-1])), least)
+
+
+def _middles(points: Floats) -> Floats:
+    low, high = points[:-1], points[1:]
+    apart = low * high > 0
+    root = np.sign(high) * np.sqrt(np.abs(low)) * np.sqrt(np.abs(high))
+    return np.where(apart, root, (low + high) / 2)
+
+
+def _open(samples: _Samples) -> Truths:
+    """Say of each cell whether it may hide a crossing beside the one that its ends show, if they do."""
+    width = np.diff(samples.points)[:, None]
+    inside = np.ones(len(width), dtype=bool)
+    outside = np.zeros(len(width), dtype=bool)
+    crossing = np.zeros(len(width), dtype=np.int64)
+    for values, slopes in zip(samples.values, samples.slopes, strict=True):
+        if not values.shape[1]:
+            continue
+        ends = (values[:-1], slopes[:-1] * width, values[1:], slopes[1:] * width)
+        least, most, single, upper = _extremes(*ends)
+        inside &= (most < 1).all(axis=1)
+        outside |= (least > 1).any(axis=1)
+        backward = _extremes(ends[2], -ends[3], ends[0], -ends[1])
+        inside &= (backward[1] < 1).all(axis=1)
+        crossing += ((most >= 1) & ~(single & upper)).sum(axis=1) * 2
+        crossing += ((most >= 1) & single & upper).sum(axis=1)
+        lower = (most >= 1) & single & ~upper
+        crossing -= 2 * lower.sum(axis=1)  # the conjugate of one that is counted
+    stable = samples.radius() < 1
+    simple = (stable[1:] != stable[:-1]) & (crossing == 1)
+    hiding: Truths = ~(inside | outside | simple)
+    return hiding
+
+
+def _extremes(
+    value: Complexes, rise: Complexes, end: Complexes, end_rise: Complexes
+) -> tuple[Floats, Floats, Truths, Truths]:
+    """Follow each eigenvalue across a cell to its partner at the end.
+
+    Returns
+    -------
+    The least and largest magnitude it may have on the way; whether it goes from one side of the circle to
+    the other once, its magnitude rising or falling all the way; whether it is in the upper half plane.
+    """
+    miss = np.abs((value + rise / 2)[:, :, None] - (end - end_rise / 2)[:, None, :])
+    partner = np.argmin(miss, axis=2)
+    off = CAUTION * np.take_along_axis(miss, partner[:, :, None], axis=2)[:, :, 0]
+    end, end_rise = (np.take_along_axis(one, partner, axis=1) for one in (end, end_rise))
+    t = np.linspace(0.0, 1.0, PLACES)[:, None, None]
+    sizes = np.abs(_cubic(t, value, rise, end, end_rise))
+    # Between two places the magnitude bends by an eighth of its second difference.
+    off = off + np.abs(np.diff(sizes, 2, axis=0)).max(axis=0) / 8
+    first, last = sizes[0], sizes[-1]
+    growth, end_growth = (value.conj() * rise).real, (end.conj() * end_rise).real
+    steady = (growth * end_growth > 0) & (growth * (last - first) > 0)
+    single = ((first < 1) != (last < 1)) & steady & (off < np.abs(last - first))
+    return sizes.min(axis=0) - off, sizes.max(axis=0) + off, single, value.imag >= 0
+
+
+def _roots(course: Course, samples: _Samples, cells: NDArray[np.intp]) -> tuple[Root, ...]:
+    """Find the crossing of each cell whose ends lie on different sides: Newton's method with a bracket."""
+    if not len(cells):
+        return ()
+    low, high = samples.points[cells].copy(), samples.points[cells + 1].copy()
+    rising = samples.radius()[cells] < 1
+    value = _starts(samples, cells)
+    system, eigenvalue = np.zeros(len(cells), np.intp), np.zeros(len(cells), np.complex128)
+    slope = np.zeros(len(cells))
+    busy = np.arange(len(cells))
+    for _ in range(MOST_STEPS):
+        here = value[busy]
+        lead = _leading(course, here)
+        system[busy], eigenvalue[busy], slope[busy] = lead
+        size = np.abs(eigenvalue[busy])
+        below = (size < 1) == rising[busy]  # the root is above
+        low[busy], high[busy] = np.where(below, here, low[busy]), np.where(below, high[busy], here)
+        with np.errstate(all="ignore"):
+            after = here - (size - 1) / slope[busy]
+        wild = ~((after > low[busy]) & (after < high[busy]))
+        # The last step may leave the bracket, one end of which is where it started, by a rounding.
+        done = (np.abs(after - here) <= SETTLED * np.abs(here)) | (size == 1)
+        after = np.where(wild & ~done, (low[busy] + high[busy]) / 2, after)
+        done |= high[busy] - low[busy] <= 4 * np.spacing(np.abs(here))
+        value[busy] = after
+        busy = busy[~done]
+        if not len(busy):
+            break
+    return tuple(
+        Root(float(p), float(lo), float(hi), bool(up), int(which), complex(one), float(rate))
+        for p, lo, hi, up, which, one, rate in zip(
+            value, low, high, rising, system, eigenvalue, slope, strict=True
+        )
+    )
+
+
+def _starts(samples: _Samples, cells: NDArray[np.intp]) -> Floats:
+    """Return where in each cell the cubic of the eigenvalue that crosses meets the circle."""
+    low, high = samples.points[cells], samples.points[cells + 1]
+    rising = samples.radius()[cells] < 1
+    values = np.concatenate(samples.values, axis=1)
+    slopes = np.concatenate(samples.slopes, axis=1)
+    # From the unstable end to its partner on the stable one; t runs from there.
+    line, width = np.arange(len(cells)), np.where(rising, low - high, high - low)
+    start, end = np.where(rising, cells + 1, cells), np.where(rising, cells, cells + 1)
+    best = np.argmax(np.abs(values[start]), axis=1)
+    value, rise = values[start, best], slopes[start, best] * width
+    miss = np.abs((value + rise / 2)[:, None] - (values[end] - slopes[end] * width[:, None] / 2))
+    partner = np.argmin(miss, axis=1)
+    last, fall = values[end, partner], slopes[end, partner] * width
+    t = np.linspace(0.0, 1.0, 8 * PLACES)[:, None]
+    sizes = np.abs(_cubic(t, value, rise, last, fall))
+    inside = np.maximum(np.argmax(sizes < 1, axis=0), 1)
+    before, after = sizes[inside - 1, line], sizes[inside, line]
+    with np.errstate(all="ignore"):
+        share = np.clip((before - 1) / (before - after), 0.0, 1.0)
+    place = np.clip(np.where(np.isfinite(share), (inside - 1 + share) / (len(t) - 1), 0.5), 0.01, 0.99)
+    found: Floats = np.where(rising, high, low) + place * width
+    return found
+
+
+def _cubic(t: Floats, value: Complexes, rise: Complexes, end: Complexes, end_rise: Complexes) -> Complexes:
+    """Return the cubic through two values and slopes at shares t of the way."""
+    found: Complexes = (1 + 2 * t) * (1 - t) ** 2 * value + t * (1 - t) ** 2 * rise
+    return found + t * t * (3 - 2 * t) * end + t * t * (t - 1) * end_rise
+
+
+def _leading(course: Course, points: Floats) -> tuple[NDArray[np.intp], Complexes, Floats]:
+    """Return the eigenvalue of largest magnitude at each point: its system, itself, its magnitude's slope."""
+    found = [eigenvalues(matrix, slope) for matrix, slope in course(points)]
+    system = np.repeat(np.arange(len(found)), [values.shape[1] for values, _ in found])
+    values = np.concatenate([values for values, _ in found], axis=1)
+    slopes = np.concatenate([slopes for _, slopes in found], axis=1)
+    # Of a conjugate pair, the one above the real axis.
+    best = np.argmax(np.abs(values) * (1 + 1e-13 * (values.imag > 0)), axis=1)
+    line = np.arange(len(points))
+    one = values[line, best]
+    return system[best], one, (one.conj() * slopes[line, best]).real / np.abs(one)

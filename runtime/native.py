@@ -1,0 +1,116 @@
+"""CasADi functions in machine code, by the C compiler of the machine, where it has one.
+
+Takes: CasADi functions. Gives: `native`, `compiler`.
+Guarantees: the same roundings as CasADi's virtual machine (no contraction, no reordering); what was compiled
+once is found again by a digest of its C text, the compiler and its options; a library is written whole or not
+at all, into a folder of the user's own. Without a compiler, or where it fails, the functions as they were.
+Does not: decide what is worth compiling.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import casadi
+
+# Contracted products and sums would round differently from the virtual machine.
+OPTIONS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+COMPILERS = ("cc", "gcc", "clang")
+PATIENCE = 120.0  # seconds; a frame's straight code takes a fraction of one
+# More instructions than this in one function: optimizing straight code costs more than linear time.
+MOST_INSTRUCTIONS = 100_000
+
+
+def native(functions: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the functions in machine code, or as they are if that can't be had.
+
+    Parameters
+    ----------
+    functions
+        CasADi functions, of any names.
+    """
+    found = compiler()
+    if found is None or not functions or not all(_is_worth_it(one) for one in functions):
+        return tuple(functions)
+    # One library holds them all, each under a name of its own.
+    named = [_renamed(one, f"kernel{place}") for place, one in enumerate(functions)]
+    library = _library(named, found)
+    if library is None:
+        return tuple(functions)
+    try:
+        return tuple(casadi.external(one.name(), str(library)) for one in named)
+    except RuntimeError:  # it can't be loaded: of another machine, or the folder forbids it
+        return tuple(functions)
+
+
+@functools.cache
+def compiler() -> tuple[str, str] | None:
+    """Return the path of the machine's C compiler and what it says of its version, or None."""
+    for name in (os.environ.get("CC", ""), *COMPILERS):
+        path = shutil.which(name) if name else None
+        if path is None:
+            continue
+        try:
+            said = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10, check=True)
+        except (OSError, subprocess.SubprocessError):
+            continue
+        return path, said.stdout
+    return None
+
+
+def cache_folder() -> Path:
+    """Return the folder of what was compiled, as the system's custom has it."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA", "")
+        return Path(base) / "apc" if base else Path.home() / "AppData" / "Local" / "apc"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "apc"
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return Path(base) / "apc" if base and Path(base).is_absolute() else Path.home() / ".cache" / "apc"
+
+
+def _is_worth_it(function: Any) -> bool:
+    return bool(function.is_a("SXFunction")) and function.n_instructions() <= MOST_INSTRUCTIONS
+
+
+def _renamed(function: Any, name: str) -> Any:
+    arguments = function.sx_in()
+    return casadi.Function(name, arguments, function.call(arguments), function.name_in(), function.name_out())
+
+
+def _library(functions: Sequence[Any], found: tuple[str, str]) -> Path | None:
+    """Return the library of some functions, compiled now or before; None if it can't be had."""
+    path, version = found
+    generator = casadi.CodeGenerator("kernels.c")
+    for function in functions:
+        generator.add(function)
+    text = generator.dump()
+    digest = hashlib.sha256("\0".join((text, path, version, *OPTIONS)).encode()).hexdigest()
+    try:
+        folder = cache_folder()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        library = folder / f"{digest}.so"
+        if library.is_file():
+            return library
+        with tempfile.TemporaryDirectory(dir=folder) as name:
+            source, built = Path(name) / "kernels.c", Path(name) / "kernels.so"
+            source.write_text(text, encoding="utf-8")
+            subprocess.run(
+                [path, *OPTIONS, str(source), "-o", str(built), "-lm"],
+                capture_output=True,
+                timeout=PATIENCE,
+                check=True,
+            )
+            built.replace(library)
+    except (OSError, RuntimeError, subprocess.SubprocessError):
+        return None
+    return library

@@ -1,0 +1,169 @@
+"""Quotients of polynomials in a few parameters, as numbers.
+
+Takes: parameters that are left open. Gives: `Ratio`, `Ratios`, `NotRational`.
+Guarantees: exact; two quotients are equal when they are as functions.
+Does not: compare what depends on the parameters, or take a root of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import flint
+
+# Terms a numerator or denominator may have: products of many parameters grow without end.
+MOST_TERMS = 2000
+
+
+class NotRational(Exception):
+    """What was asked is no quotient of polynomials in the open parameters."""
+
+
+def _fraction(value: Any) -> Any:
+    exact = Fraction(value)
+    return flint.fmpq(exact.numerator, exact.denominator)
+
+
+@dataclass(frozen=True, slots=True)
+class Ratios:
+    """The field of quotients in so many open parameters."""
+
+    context: Any  # flint.fmpq_mpoly_ctx
+
+    @classmethod
+    def of(cls, count: int) -> Ratios:
+        """Return the field in `count` parameters."""
+        names = [f"p{place}" for place in range(count)]
+        return cls(flint.fmpq_mpoly_ctx.get(names, flint.Ordering.lex))
+
+    def parameter(self, place: int) -> Ratio:
+        """Return the open parameter of that place itself."""
+        return Ratio(self, self.context.gens()[place], self.constant(1))
+
+    def constant(self, value: Any) -> Any:
+        """Return a rational as a polynomial."""
+        return self.context.constant(_fraction(value))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ratio:
+    """`top`/`bottom`, polynomials over the rationals; computes with whole numbers, fractions and floats."""
+
+    field: Ratios
+    top: Any  # flint.fmpq_mpoly
+    bottom: Any
+
+    def _other(self, value: Any) -> Ratio:
+        if isinstance(value, Ratio):
+            return value
+        return Ratio(self.field, self.field.constant(value), self.field.constant(1))
+
+    def _reduced(self, top: Any, bottom: Any) -> Ratio:
+        if not bottom.is_constant():
+            common = top.gcd(bottom)
+            top, bottom = top / common, bottom / common
+        if max(len(top.to_dict()), len(bottom.to_dict())) > MOST_TERMS:
+            raise NotRational("grows to too many terms")
+        return Ratio(self.field, top, bottom)
+
+    def __add__(self, value: Any) -> Ratio:
+        other = self._other(value)
+        if self.bottom == other.bottom:
+            return self._reduced(self.top + other.top, self.bottom)
+        return self._reduced(self.top * other.bottom + other.top * self.bottom, self.bottom * other.bottom)
+
+    def __mul__(self, value: Any) -> Ratio:
+        other = self._other(value)
+        return self._reduced(self.top * other.top, self.bottom * other.bottom)
+
+    def __truediv__(self, value: Any) -> Ratio:
+        other = self._other(value)
+        if not other:
+            raise ZeroDivisionError
+        return self._reduced(self.top * other.bottom, self.bottom * other.top)
+
+    def __neg__(self) -> Ratio:
+        return Ratio(self.field, -self.top, self.bottom)
+
+    def __sub__(self, value: Any) -> Ratio:
+        return self + -self._other(value)
+
+    def __rsub__(self, value: Any) -> Ratio:
+        return self._other(value) - self
+
+    def __rtruediv__(self, value: Any) -> Ratio:
+        return self._other(value) / self
+
+    def __pow__(self, exponent: int) -> Ratio:
+        if exponent < 0:
+            return self._other(1) / self**-exponent
+        return self._reduced(self.top**exponent, self.bottom**exponent)
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+    def __bool__(self) -> bool:
+        """Say whether it is anything but identically zero."""
+        return bool(self.top != 0)
+
+    def constant(self) -> Fraction:
+        """Return the value of what does not depend on the parameters.
+
+        Raises
+        ------
+        NotRational
+            It does depend on them.
+        """
+        if not (self.top.is_constant() and self.bottom.is_constant()):
+            raise NotRational("decides by the value of a parameter that is left open")
+        value = flint.fmpq(self.top.leading_coefficient() if self else 0) / self.bottom.leading_coefficient()
+        return Fraction(int(value.p), int(value.q))
+
+    __hash__ = None  # type: ignore[assignment] # equal to numbers, as they are not hashed alike
+
+    def __eq__(self, value: object) -> bool:
+        return bool((self - value).constant() == 0)
+
+    def __lt__(self, value: Any) -> bool:
+        return bool((self - value).constant() < 0)
+
+    def __le__(self, value: Any) -> bool:
+        return bool((self - value).constant() <= 0)
+
+    def __gt__(self, value: Any) -> bool:
+        return bool((self - value).constant() > 0)
+
+    def __ge__(self, value: Any) -> bool:
+        return bool((self - value).constant() >= 0)
+
+    def __abs__(self) -> Fraction:
+        return abs(self.constant())
+
+    def __int__(self) -> int:
+        return int(self.constant())
+
+    def __float__(self) -> float:
+        return float(self.constant())
+
+    def slope(self, place: int) -> Ratio:
+        """Return the derivative by a parameter."""
+        top = self.top.derivative(place) * self.bottom - self.top * self.bottom.derivative(place)
+        return self._reduced(top, self.bottom * self.bottom)
+
+    def at(self, point: Sequence[Any]) -> Any:
+        """Return the value at parameters that are balls, as a ball."""
+        return _value(self.top, point) / _value(self.bottom, point)
+
+
+def _value(polynomial: Any, point: Sequence[Any]) -> Any:
+    total = flint.arb(0)
+    for exponents, coefficient in polynomial.to_dict().items():
+        term = flint.arb(coefficient)
+        for one, exponent in zip(point, exponents, strict=True):
+            if exponent:
+                term *= one ** int(exponent)
+        total += term
+    return total

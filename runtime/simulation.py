@@ -1,0 +1,420 @@
+"""A scene played in time: from compiled system to blocks of rows.
+
+Takes: a `CompiledSystem` and the signals wanted. Gives: `Simulation`, `prepare`; `Block`, `blocks`.
+Guarantees: time is counted in whole quanta; a row for time 0 and for every tick of the fastest clock until
+the end, values before the tick; the memory used does not grow with the duration; no number that is not finite
+is given out.
+Does not: keep, write or judge what comes out (see `trajectory`, `recording`, `summary`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.exchange import build_exchange
+from apc.runtime.forcing import SiteForcing, forcing_of, impulses, site_forcing
+from apc.runtime.gathering import Gate, Places, build_gates, kept_links
+from apc.runtime.linearize import jacobians
+from apc.runtime.native import native
+from apc.runtime.parameters import Numbers, resolve
+from apc.runtime.population import (
+    Member,
+    Population,
+    build_member,
+    build_population,
+    exchanges_within,
+    refuse_unheard_of,
+)
+from apc.runtime.program import LocalSignal, Program, build_program, local_signals
+from apc.runtime.propagate import Transitions, rates, transitions
+from apc.runtime.schedule import Schedule, build_schedules
+from apc.runtime.signals import Choice, Signal, choose, signals_of
+from apc.runtime.timetable import Timetable, routes_of
+from apc.runtime.trouble import finite_equations
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# Numbers that one call of the chunked function gives out, at most, if a frame gives fewer: 4 MiB stay in the
+# machine's caches, and CasADi builds the function in a tenth of a second.
+CHUNK = 2**19
+ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
+# Numbers that come into one call, at most: 64 MiB. Of an unreliable link they are one a way and tick, and the
+# packets of many frames are drawn at less cost than those of a few.
+TOLD = 2**23
+MOST_FRAMES = 2000  # of one chunk: the function of a chunk is built in a time that grows with it
+# Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
+MOST_NUMBERS = 2**26
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """A scene ready to be played.
+
+    `signals` are the columns of what comes out; `marks` the instants of a frame's rows, in quanta, of which
+    those not in `ticks` make a row at time 0 only; `forces` are those that change with time, of each group's
+    different sites. `chunk` is the frame of all peers, `length` times in a row;
+    `compiled` says that it runs in machine code. `gates` are the unreliable links, `seed` is what their luck
+    begins from.
+    """
+
+    system: CompiledSystem
+    population: Population
+    choices: tuple[Choice, ...]
+    signals: tuple[Signal, ...]
+    forces: tuple[tuple[SiteForcing, ...], ...]
+    gates: tuple[Gate, ...]
+    seed: int
+    duration: Fraction
+    quantum: Fraction
+    frame: int
+    marks: tuple[int, ...]
+    ticks: frozenset[int]
+    compiled: bool
+    length: int
+    chunk: Any  # casadi.Function
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts whose work is added up."""
+        listed = (part for member in self.population.members for part in member.program.layout.parts)
+        return tuple(dict.fromkeys(listed))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Some rows: `time` (rows,) in seconds, `values` (rows, signals) in SI.
+
+    `work` (parts,) is what the parts have done until the last frame that begins by then, over all peers, in
+    J.
+    `stopped` is the name of what left the range of floats after the last row, at `stopped_at` seconds; empty
+    if nothing did.
+    """
+
+    time: Floats
+    values: Floats
+    work: Floats
+    stopped: str = ""
+    stopped_at: float = 0.0
+
+
+def prepare(
+    system: CompiledSystem,
+    duration: Fraction,
+    *,
+    signals: Sequence[str] = (),
+    jit: bool = True,
+    seed: int | None = None,
+) -> Simulation:
+    """Do what comes before the first instant.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    duration
+        In seconds; the last row is that of the last tick until then.
+    signals
+        Patterns of the signals to record, all if there is none; see `signals.choose`.
+    jit
+        Whether to compile to machine code where there is a C compiler.
+    seed
+        Of what is random; the experiment's if not given.
+
+    Raises
+    ------
+    ApcError
+        E870 a continuous equation is not linear, E871 a reduction looks at each pair of peers, E873 a pattern
+        fits nothing, E874 the peers are too many, E893 a peer has nothing of its own to stand in for a
+        missing packet; and those of `build_schedules`, `build_population` and `routes_of`.
+    """
+    refuse_unheard_of(system)
+    numbers = resolve(system)
+    with finite_equations(system.name):
+        sites = [jacobians(kind) for kind in system.kinds]
+        rates_of = [rates(kind) for kind in system.kinds]
+        patterns = [site.pattern for site in sites]
+        exchange = build_exchange(system, numbers.timings)
+        routes = routes_of(system, numbers.timings, exchange)
+        schedules = build_schedules(system, numbers.timings, patterns)
+        kept = kept_links(routes, schedules[0].frame_s)
+        if kept:
+            schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
+        if not system.clocks:  # then there is one interval, of any length
+            schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
+        available = [
+            local_signals(system.kinds[one.kind], s) for one, s in zip(system.groups, schedules, strict=True)
+        ]
+        _check_size(system, schedules)
+        choices = choose(system, available, signals)
+        _check_size(system, schedules, choices)
+        cuts = exchanges_within(schedules)
+        programs: dict[Any, Program] = {}
+        members = []
+        for group, (one, schedule, choice) in enumerate(zip(system.groups, schedules, choices, strict=True)):
+            rows, vectors = numbers.rows[group], numbers.parameters[group]
+            for peers, recorded in _recorded_and_not(choice):
+                key = (one.kind, id(schedule), recorded)
+                if key not in programs:
+                    programs[key] = build_program(rates_of[one.kind], schedule, recorded, cuts)
+                moves = _transitions(programs[key], vectors)
+                numbered = exchange.starts[group] + peers
+                site = sites[one.kind]
+                members.append(
+                    build_member(group, numbered, site, rows[peers], vectors, programs[key], moves)
+                )
+        compiled: list[bool] = []
+
+        def kernels(functions: Sequence[Any]) -> Sequence[Any]:
+            ready = native(functions) if jit else functions
+            compiled.append(any(new is not old for new, old in zip(ready, functions, strict=True)))
+            return ready
+
+        gates = build_gates(routes, kept, exchange, schedules, members)
+        population = build_population(system, exchange, members, kernels, gates)
+    marks = schedules[0].marks[:-1]
+    length = _chunk_length(population.frame, duration, schedules[0].frame_s)
+    return Simulation(
+        system=system,
+        population=population,
+        choices=choices,
+        signals=signals_of(system, choices),
+        forces=tuple(_forces(member) for member in members),
+        gates=gates,
+        seed=system.experiment.seed if seed is None else seed,
+        duration=duration,
+        quantum=schedules[0].quantum,
+        frame=schedules[0].frame,
+        marks=marks,
+        ticks=frozenset(marks if _ticks_at_zero(system, numbers) else marks[1:]),
+        compiled=compiled[0],
+        length=length,
+        chunk=population.frame.mapaccum("chunk", length, len(population.start)),
+    )
+
+
+def _chunk_length(frame: Any, duration: Fraction, frame_s: Fraction) -> int:
+    """Return how many frames to play at once: equal chunks, none larger than need be."""
+    frames = int(duration / frame_s) + 1
+    told = int(frame.nnz_in())
+    most = max(1, min(MOST_FRAMES, CHUNK // max(1, int(frame.nnz_out())), TOLD // max(1, told), frames))
+    return -(-frames // -(-frames // most))
+
+
+def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
+    """Say whether the fastest clock ticks at time 0."""
+    if not system.clocks:
+        return True
+    fastest = min(system.clocks, key=lambda clock: numbers.timings[clock.period])
+    return numbers.timings[fastest.phase] == 0
+
+
+def _check_size(
+    system: CompiledSystem, schedules: Sequence[Schedule], choices: Sequence[Choice] = ()
+) -> None:
+    """Refuse so many peers, or so many of them recorded, that one frame of them would not fit the memory."""
+    total = sum(
+        int(choice.wanted.any(axis=1).sum()) * len(choice.locals) * len(schedule.marks)
+        for choice, schedule in zip(choices, schedules, strict=bool(choices))
+    )
+    for group, schedule in zip(system.groups, schedules, strict=True):
+        kind = system.kinds[group.kind]
+        lengths = 2  # of intervals, mostly
+        own = len(kind.parameters) + lengths * len(kind.states) * (len(kind.states) + len(kind.holds) + 1)
+        total += group.count * (own + sum(schedule.depths))
+    if total > MOST_NUMBERS:
+        what = (
+            f"{system.peers} peers hold {total} numbers in a frame; at most {MOST_NUMBERS} can be "
+            "simulated at once"
+        )
+        raise ApcError(Mistake("E874", Place(system.name), what, hint="fewer peers, or fewer --signals"))
+
+
+def _recorded_and_not(choice: Choice) -> list[tuple[Integers, tuple[LocalSignal, ...]]]:
+    """Split a group into the peers that are recorded and the others, neither empty."""
+    recorded = choice.wanted.any(axis=1)
+    split = [(np.flatnonzero(recorded), choice.locals), (np.flatnonzero(~recorded), ())]
+    return [(peers, signals) for peers, signals in split if len(peers)]
+
+
+def _transitions(program: Program, vectors: Floats) -> list[Transitions]:
+    """Return what each different site of a group does over every interval; equal ones are one object."""
+    seconds = [length * program.schedule.quantum for length in program.durations]
+    known: dict[bytes, Transitions] = {}
+    found = []
+    for vector in vectors:
+        # Sites that differ in nothing the continuous equations read share a transition.
+        key = np.asarray(program.rates.matrices(vector)).tobytes()
+        if key not in known:
+            known[key] = transitions(program.rates, vector, seconds)
+        found.append(known[key])
+    return found
+
+
+def _forces(member: Member) -> tuple[SiteForcing, ...]:
+    """Return the forces that change with time on each different site of a group; none if none does."""
+    program = member.program
+    if not program.impulse_rows:
+        return ()
+    seconds = [length * program.schedule.quantum for length in program.durations]
+    forcing = forcing_of(program.rates)
+    pairs = zip(member.parameters, member.transitions, strict=True)
+    return tuple(site_forcing(forcing, vector, own.a, seconds) for vector, own in pairs)
+
+
+def blocks(simulation: Simulation, *, run: int = 0) -> Iterator[Block]:
+    """Play a scene from time 0 and yield its rows, block by block.
+
+    Parameters
+    ----------
+    simulation
+        What to play.
+    run
+        Which of many runs with one seed: each has packets of its own.
+
+    Raises
+    ------
+    ApcError
+        E872 an equation has no solution at some instant.
+    """
+    last = int(simulation.duration / simulation.quantum)  # rounds down
+    runner = _Runner(simulation, run)
+    for first in range(0, last // simulation.frame + 1, simulation.length):
+        block = runner.run(first, last)
+        yield block
+        if block.stopped:
+            return
+
+
+def _places(simulation: Simulation, run: int) -> Places | None:
+    """Return what chance says of the packets of a run; None if all links are reliable."""
+    if not simulation.gates:
+        return None
+    system, seed = simulation.system, simulation.seed
+    timings = resolve(system).timings
+    exchange = build_exchange(system, timings)
+    table = Timetable(system, timings, exchange, simulation.quantum, seed=seed, run=run)
+    return Places(simulation.gates, table, simulation.frame)
+
+
+class _Runner:
+    """The chunked function with the memory it reads and writes."""
+
+    def __init__(self, simulation: Simulation, run: int) -> None:
+        self.simulation, self.length = simulation, simulation.length
+        self.places = _places(simulation, run)
+        self.state = [one.copy() for one in simulation.population.start]
+        self.done = np.zeros(len(simulation.parts))
+        function = simulation.chunk
+        self.buffer, self.call = function.buffer()
+        inputs = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
+        self.inputs = [*self.state, *inputs[len(self.state) :]]
+        self.outputs = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
+        for i, one in enumerate(self.inputs):
+            self.buffer.set_arg(i, memoryview(one.reshape(-1).data))
+        for i, one in enumerate(self.outputs):
+            self.buffer.set_res(i, memoryview(one.data))
+
+    def run(self, first: int, last: int) -> Block:
+        """Run the frames from `first` on; rows after the quantum `last` are left out."""
+        simulation, length = self.simulation, self.length
+        self._push(first)
+        try:
+            self.call()
+            failed = bool(self.buffer.ret())
+        except RuntimeError:
+            failed = True
+        if failed:
+            at = float(first * simulation.frame * simulation.quantum)
+            what = f"an equation has no solution, or a loop none that Newton's method finds, after {at:g} s"
+            raise ApcError(Mistake("E872", Place(simulation.system.name), what))
+        instants, kept = self._instants(first, last)
+        values = self._values()[kept]
+        time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
+        finite = np.isfinite(values)
+        rows: NDArray[np.bool_] = np.all(finite, axis=1)
+        stop = len(rows) if rows.all() else int(np.argmin(rows))
+        if stop:  # to the last frame that begins by the last row
+            self.done = self._work(int(np.flatnonzero(kept)[stop - 1]) // len(simulation.marks))
+        for place, one in enumerate(self.state):
+            one.reshape(-1)[:] = self.outputs[place].reshape(length, -1)[-1]
+        if stop < len(rows):
+            name = simulation.signals[int(np.argmin(finite[stop]))].name
+            return Block(time[:stop], values[:stop], self.done, name, float(time[stop]))
+        if instants[-1] <= last and not all(np.isfinite(one).all() for one in self.state):
+            return Block(time, values, self.done, "what is not recorded", float(time[-1]))
+        return Block(time, values, self.done)
+
+    def _push(self, first: int) -> None:
+        """Set the impulses of the frames to come, and their numbers."""
+        simulation, length = self.simulation, self.length
+        members = simulation.population.members
+        numbers = first + np.arange(length)
+        for g, (member, forces) in enumerate(zip(members, simulation.forces, strict=True)):
+            if not forces:
+                continue
+            program = member.program
+            begin = np.array([at for at, _ in program.intervals], dtype=np.int64)
+            which = np.tile(np.array([place for _, place in program.intervals], dtype=np.int64), length)
+            quanta = (numbers[:, None] * simulation.frame + begin).reshape(-1)
+            starts = quanta * simulation.quantum.numerator / simulation.quantum.denominator
+            found = np.array([impulses(one, starts, which)[:, program.rates.g] for one in forces])
+            rows = found.reshape(len(forces), length, -1).transpose(1, 0, 2)
+            self.inputs[len(self.state) + g][:] = rows.reshape(-1)
+        if self.places is not None:
+            first_gate = len(self.state) + len(members)
+            for place, rows in enumerate(self.places.take(length), first_gate):
+                self.inputs[place][:] = rows
+        self.inputs[-1][:] = numbers
+
+    def _instants(self, first: int, last: int) -> tuple[Integers, NDArray[np.bool_]]:
+        """Return every row's instant in quanta, and which rows are kept."""
+        simulation = self.simulation
+        marks = np.array(simulation.marks, dtype=np.int64)
+        is_tick = np.array([mark in simulation.ticks for mark in simulation.marks])
+        instants = ((first + np.arange(self.length))[:, None] * simulation.frame + marks).reshape(-1)
+        kept = (np.tile(is_tick, self.length) | (instants == 0)) & (instants <= last)
+        return instants, kept
+
+    def _values(self) -> Floats:
+        """Return the rows of all signals side by side, in their order."""
+        simulation, length = self.simulation, self.length
+        height = length * len(simulation.marks)
+        values = np.empty((height, len(simulation.signals)))
+        first = np.cumsum([0] + [int(choice.wanted.sum()) for choice in simulation.choices])
+        starts = np.cumsum([0] + [group.count for group in simulation.system.groups])
+        for g, member in enumerate(simulation.population.members):
+            recorded = member.program.recorded
+            if not recorded:
+                continue
+            flat = self.outputs[len(self.state) + g]
+            rows = flat.reshape(length, member.count, len(simulation.marks), len(recorded))
+            side = rows.transpose(0, 2, 1, 3).reshape(height, -1)
+            wanted = simulation.choices[member.group].wanted
+            own = member.peers - starts[member.group]
+            column = first[member.group] + np.cumsum(wanted).reshape(wanted.shape) - 1
+            values[:, column[own][wanted[own]]] = side[:, wanted[own].reshape(-1)]
+        return values
+
+    def _work(self, frame: int) -> Floats:
+        """Return the work of each part, over all peers, until a frame of this chunk begins."""
+        simulation = self.simulation
+        total = np.zeros(len(simulation.parts))
+        for g, member in enumerate(simulation.population.members):
+            layout = member.program.layout
+            if not layout.parts:
+                continue
+            carry = self.state[g]
+            if frame:
+                carry = self.outputs[g].reshape(self.length, *carry.shape)[frame - 1]
+            for part, done in zip(layout.parts, carry[:, layout.work].sum(axis=0), strict=True):
+                total[simulation.parts.index(part)] += done
+        return total

@@ -1,0 +1,290 @@
+"""How large the largest eigenvalue is, from a characteristic function: found by Newton, proved by counting.
+
+Takes: a `Characteristic`, and where its zeros may be.
+Gives: `Zeros`, `find_zeros`.
+Guarantees: `low` and `high` bound the spectral radius, rigid modes left out: within a small circle about the
+largest zero there is one, and beyond a circle just outside of it there is none, both counted by the argument
+principle. Where a count can't be had, the bounds are wide instead.
+Does not: find every zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.characteristic import Characteristic, characteristic_ball, count_around, refine
+from apc.runtime.counting import FIRST_ARCS, MOST_POINTS
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# The smallest circle about a zero that is tried, relative to it, and what the next ones are larger by.
+FIRST_RADIUS, WIDER = 4e-15, 8.0
+
+# A circle about a zero that has to be wider than this shows nothing.
+WIDEST = 1e-3
+
+# The circle just outside of the largest zero is so many times farther from it than its error; if a pole or
+# another zero is in the way, wider ones are tried, so many.
+OUTSIDE, TRIES = 8.0, 10
+
+# A circle about a zero is so many times larger than what the zero is known to: then few arcs do.
+CLEAR = 6.0
+
+# How far aside of a zero, relatively, its slope is looked at, and how much nearer the next time.
+ASIDE, NEARER = 1e-7, 30.0
+
+# Arcs about a zero to begin with, and evaluations after which the circle is too small to tell.
+SMALL_ARCS, SMALL_POINTS = 16, 300
+
+# Zeros nearer to one another than this, relatively, are one that was found twice.
+SAME = 1e-11
+
+# Poles that are eigenvalues themselves, looked at of each structure.
+MOST_HELD = 64
+
+# How often zeros that a count has missed are looked for.
+SEARCHES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Zero:
+    """An eigenvalue (or a pair, with its conjugate) and what it may be off by; held `multiplicity` times.
+
+    `site`, if it is that of sites by themselves, says which: (transfer, place in it).
+    """
+
+    value: complex
+    error: float
+    multiplicity: int
+    site: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Zeros:
+    """Bounds on the spectral radius, and the largest eigenvalues found, the largest first.
+
+    `counted` says that a count proves that nothing lies beyond `high`; `rigid_counted`, that one proves that
+    there are as many eigenvalues at 1 as was said.
+    """
+
+    low: float
+    high: float
+    found: tuple[Zero, ...]
+    counted: bool
+    rigid_counted: bool
+
+
+def find_zeros(
+    function: Characteristic,
+    starts: Complexes,
+    *,
+    rigid: int,
+    listed: int,
+    pole_starts: Complexes | None = None,
+) -> Zeros:
+    """Find the largest eigenvalues and prove that there is none beyond.
+
+    Parameters
+    ----------
+    function
+        f.
+    starts
+        Where zeros may be (z,).
+    rigid
+        How many eigenvalues are exactly 1 for a known reason.
+    listed
+        How many of the largest eigenvalues to report.
+    pole_starts
+        Poles that zeros are expected close to (z,).
+    """
+    rigid_radius = _rigid_radius(function, rigid)
+    exact = [one for one in _held_poles(function) if abs(one.value - 1) > rigid_radius]
+    zeros = _distinct(refine(function, starts), rigid_radius)
+    if pole_starts is not None and len(pole_starts):
+        near = refine(function, pole_starts * (1 + 1e-7), pole_starts)
+        zeros = _distinct(np.concatenate([zeros, near]), rigid_radius)
+    largest, high, beyond = 0.0, 0.0, -1
+    for _ in range(SEARCHES):
+        largest, error = _largest(function, zeros, exact)
+        high, beyond = _outside(function, largest, error, rigid, rigid_radius)
+        if beyond <= 0:
+            break
+        more = _search(function, high, rigid_radius)
+        grown = _distinct(np.concatenate([zeros, more]), rigid_radius)
+        if len(grown) == len(zeros):
+            break
+        zeros = grown
+    found = [Zero(complex(zero), _zero_error(function, complex(zero)), 1) for zero in zeros[:listed]]
+    known = [one for one in (*found, *exact) if np.isfinite(one.error)]
+    every = sorted(known, key=lambda one: -abs(one.value))[:listed]
+    low = max([0.0, *(abs(one.value) - one.error for one in every)])
+    if beyond:
+        high = _enclosing(function, max(high, largest), rigid, rigid_radius)
+    return Zeros(low, high, tuple(every), not beyond, rigid_radius < WIDEST)
+
+
+def _largest(function: Characteristic, zeros: Complexes, exact: Sequence[Zero]) -> tuple[float, float]:
+    """Return the magnitude of the largest eigenvalue so far, and its error."""
+    largest = max(exact, key=lambda one: abs(one.value), default=None)
+    if len(zeros) and (largest is None or abs(zeros[0]) >= abs(largest.value)):
+        return float(abs(zeros[0])), _zero_error(function, complex(zeros[0]))
+    return (abs(largest.value), largest.error) if largest else (0.0, 0.0)
+
+
+def _rigid_radius(function: Characteristic, rigid: int) -> float:
+    """Return the radius of a circle about 1 within which all zeros are the rigid ones, 0 without any."""
+    if not rigid:
+        return 0.0
+    ball = characteristic_ball(function, np.array([1 + 1e-7]), np.zeros(1))
+    radius = max(CLEAR * float(ball.change[0]) * 1e-7, FIRST_RADIUS)
+    while radius < WIDEST:
+        inside = count_around(function, 1.0, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
+        poles = _poles_within(function, 1.0, radius)
+        if inside is not None and poles is not None and inside + poles == rigid:
+            return radius
+        radius *= WIDER
+    return WIDEST
+
+
+def _held_poles(function: Characteristic) -> list[Zero]:
+    """Return the poles that are eigenvalues themselves: of sites that are alike, or that nobody hears.
+
+    Of each structure the largest few.
+    """
+    found = []
+    for which, one in enumerate(function.transfers):
+        unheard = ~one.residues.any(axis=2)
+        times = np.where(unheard, one.counts, one.counts - 1)
+        times = np.where((np.abs(one.poles) > 0) & (one.poles.imag >= 0), times, 0)
+        places, sites = np.nonzero(times)
+        order = np.argsort(-np.abs(one.poles[places, sites]), kind="stable")[:MOST_HELD]
+        for place, site in zip(places[order].tolist(), sites[order].tolist(), strict=True):
+            error = float(one.eigenvalue_errors[site, place])
+            many = int(times[place, site])
+            found.append(Zero(complex(one.poles[place, site]), error, many, (which, site)))
+    return found
+
+
+def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
+    """Return zeros in the upper half plane, the largest first, each once and the rigid ones left out."""
+    zeros = zeros[np.isfinite(zeros)]
+    zeros = np.where(zeros.imag < 0, zeros.conj(), zeros)
+    zeros = np.where(np.abs(zeros.imag) <= SAME * np.abs(zeros), zeros.real, zeros)
+    zeros = zeros[np.abs(zeros - 1) > rigid_radius] if rigid_radius else zeros
+    zeros = zeros[np.argsort(-np.abs(zeros), kind="stable")]
+    kept: list[complex] = []
+    for zero in zeros.tolist():
+        near = (one for one in reversed(kept[-16:]) if abs(one - zero) <= SAME * abs(zero))
+        if next(near, None) is None:
+            kept.append(zero)
+    return np.array(kept, dtype=np.complex128)
+
+
+def _zero_error(function: Characteristic, zero: complex) -> float:
+    """Return the radius of a circle about an estimate that has a zero in it, inf if none is shown.
+
+    Nearby, at ζ + h, |f| ≈ |f′| h is known to a share c of it: the zero is known to about c h.
+    """
+    aside = ASIDE * abs(zero)
+    for _ in range(SEARCHES):
+        ball = characteristic_ball(function, np.array([zero + aside]), np.zeros(1))
+        radius = max(CLEAR * float(ball.change[0]) * aside, FIRST_RADIUS * abs(zero))
+        for _ in range(SEARCHES):
+            if not radius < WIDEST * abs(zero):
+                break
+            inside = count_around(function, zero, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
+            poles = _poles_within(function, zero, radius)
+            if inside is not None and poles is not None and inside + poles > 0:
+                return radius
+            radius *= WIDER
+        aside /= NEARER  # a pole or another zero may be that close
+    return float(np.inf)
+
+
+def _poles_within(function: Characteristic, centre: complex, radius: float) -> int | None:
+    """Return how many poles are within a circle, each as often as f has it; None: no telling."""
+    total = 0
+    for one in function.transfers:
+        distance = np.abs(one.eigenvalues - centre)
+        if np.any(np.abs(distance - radius) <= one.eigenvalue_errors):
+            return None
+        total += int((distance < radius).sum())
+    return total
+
+
+def _poles_beyond(function: Characteristic, radius: float) -> int | None:
+    """Return how many of the sites' eigenvalues are larger, multiplicities counted; None: no telling."""
+    total = 0
+    for one in function.transfers:
+        size = np.abs(one.eigenvalues)
+        if np.any(np.abs(size - radius) <= one.eigenvalue_errors):
+            return None
+        total += int(((size > radius).sum(axis=1) * one.counts).sum())
+    return total
+
+
+def _beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
+    """Return how many eigenvalues lie beyond a circle about zero, the rigid ones left out, or None."""
+    poles = _poles_beyond(function, radius)
+    turns = (
+        None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function), most=MOST_POINTS)
+    )
+    if poles is None or turns is None:
+        return None
+    return poles - turns - (rigid if radius < 1 else 0)
+
+
+def _arcs(function: Characteristic) -> int:
+    """Return how many arcs to begin with: f turns as often as its longest delay has frames, at least."""
+    return max(FIRST_ARCS, 8 * max(function.lags, default=0))
+
+
+def _outside(
+    function: Characteristic, largest: float, error: float, rigid: int, rigid_radius: float
+) -> tuple[float, int]:
+    """Return a circle just outside of the largest zero and how many eigenvalues are beyond; −1: no telling."""
+    width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
+    for _ in range(TRIES):
+        radius = max(largest + width, function.innermost * (1 + 1e-9))
+        if (
+            rigid and abs(radius - 1) <= rigid_radius
+        ):  # between the largest zero and the rigid ones, or beyond
+            radius = 1 + 2 * rigid_radius
+        beyond = _beyond(function, radius, rigid)
+        if beyond is not None:
+            return radius, beyond
+        width *= WIDER
+    return largest + width, -1
+
+
+def _enclosing(function: Characteristic, radius: float, rigid: int, rigid_radius: float) -> float:
+    """Return the radius of some circle beyond which there is no eigenvalue, inf if none is found."""
+    width = max(radius * 1e-6, 1e-9)
+    while radius < 1e3:
+        radius += width
+        if not (rigid and abs(radius - 1) <= rigid_radius) and _beyond(function, radius, rigid) == 0:
+            return radius
+        width *= WIDER
+    return float(np.inf)
+
+
+def _search(function: Characteristic, radius: float, rigid_radius: float) -> Complexes:
+    """Return zeros found from all over a wider ring."""
+    angles = np.linspace(0.0, np.pi, 48)
+    starts = np.concatenate([scale * radius * np.exp(1j * angles) for scale in (1.0, 1.03, 1.3)])
+    return _distinct(refine(function, starts), rigid_radius)
+
+
+def near_poles(function: Characteristic, most: int) -> Complexes:
+    """Return the largest poles of f in the upper half plane (z,), no more than `most` of each structure."""
+    found = [np.zeros(0, np.complex128)]
+    for one in function.transfers:
+        heard = one.residues.any(axis=2) & (one.poles.imag >= 0) & (np.abs(one.poles) > 0)
+        part = one.poles[heard]
+        found.append(part[np.argsort(-np.abs(part), kind="stable")[:most]])
+    return np.concatenate(found)

@@ -1,0 +1,201 @@
+# ruff: noqa: E501 -- tables are printed by long lines
+"""The map of the paper's scene over K_C and K_T, every verdict against 60 digits: `python -m tests.bench.map`.
+
+Four maps: P (no damping in the couplers) and PD (2 N·s/m), mean and mesh; then the points at the boundary of
+each column times 1 ± 1e-9. Wrong verdicts must be none; an error beside its bound must be below 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import flint
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis import Prepared, analyze_modes, prepare
+from apc.runtime.balls import precision
+from apc.runtime.parameters import Override, apply
+from apc.runtime.threads import single_threaded
+from tests.bruteforce import Scene, frame_matrix
+from tests.topologies import AVERAGE, MESH, compiled
+
+DIGITS_60 = 200  # bits
+K_C, K_T = 5000.0, 1500.0  # the limits of the scene's own study; with dampers, twice that holds
+TICKS, TICK = 8, Fraction(1, 1000)
+DEVICE, CUBE = Fraction(0.1), Fraction(0.6) / 3  # the numbers a compiled scene holds
+
+
+@dataclass(frozen=True)
+class Truth:
+    """All eigenvalues of a point, and the radius without the one that is 1."""
+
+    values: list[flint.acb]
+    radius: flint.arb
+
+
+def truth(mesh: bool, k_c: float, k_t: float, damping: float) -> Truth:
+    """Return the truth at a point, by propagating one user who hears its own packets times an eigenvalue of W."""
+    own = 2 if mesh else 1
+    values: list[flint.acb] = []
+    radius = flint.arb(0)
+    for share, rigid in ((flint.arb(own), True), (-flint.arb(own) / 2, False)):
+        matrix = _frame(own, share, flint.arb(k_c), flint.arb(k_t), flint.arb(damping))
+        found = flint.acb_mat(flint.arb_mat(matrix).mid()).eig(algorithm="approx")
+        found.sort(key=lambda value: float(abs(value - 1).mid()))
+        values += found
+        assert not rigid or float(abs(found[0] - 1).mid()) < 1e-40
+        radius = max([radius, *(abs(value).mid() for value in found[1 if rigid else 0 :])])
+    return Truth(values, radius)
+
+
+def _frame(
+    own: int, share: flint.arb, k_c: flint.arb, k_t: flint.arb, damping: flint.arb
+) -> list[list[flint.arb]]:
+    """Return one user's frame over (x, v, x_O, v_O, F_C, F_T, packet x_O, packet v_O), as rows."""
+    steps = [_step(DEVICE), _step(CUBE)]
+    columns = []
+    for column in range(8):
+        x, v, x_o, v_o, f_c, f_t, p_x, p_v = (flint.arb(int(column == row)) for row in range(8))
+        sent = x_o, v_o
+        heard = share * (k_t * p_x + damping * p_v)
+        for _ in range(TICKS):
+            contact = k_c * (x - x_o) + damping * (v - v_o)
+            pull = own * (k_t * x_o + damping * v_o) - heard
+            x, v = _coast(steps[0], x, v, -f_c)
+            x_o, v_o = _coast(steps[1], x_o, v_o, f_c - f_t)
+            f_c, f_t = contact, pull
+        columns.append((x, v, x_o, v_o, f_c, f_t, *sent))
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _step(kilograms: Fraction) -> tuple[flint.arb, ...]:
+    """Return what of x and v a millisecond leaves and what a force adds to them, with 5 N·s/m."""
+    mass, t = _arb(kilograms), _arb(TICK)
+    b = flint.arb(5)
+    decay = (-b * t / mass).exp()
+    rise = (1 - decay) / b  # ∫₀ᵗ e^(−b s/m)/m ds
+    return decay, rise, mass * rise, (t - mass * rise) / b
+
+
+def _coast(
+    step: Sequence[flint.arb], x: flint.arb, v: flint.arb, force: flint.arb
+) -> tuple[flint.arb, flint.arb]:
+    decay, rise, carried, pushed = step
+    return x + carried * v + pushed * force, decay * v + rise * force
+
+
+def check_truth() -> None:
+    """Assert that the truth of one user is that of three, event by event."""
+    for mesh in (False, True):
+        scene = Scene(operator="sum" if mesh else "mean", kc=1500.0, kt=800.0, bt=2.0, bc=2.0, cube=CUBE)  # type: ignore[arg-type] # any number will do
+        rows = frame_matrix(scene, number=_arb, exp=lambda value: value.exp())
+        whole = flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
+        whole.sort(key=lambda value: float(abs(value - 1).mid()))
+        radius = max(abs(value).mid() for value in whole[1:])
+        assert float(abs(radius - truth(mesh, 1500.0, 800.0, 2.0).radius)) < 1e-40
+
+
+def _arb(value: object) -> flint.arb:
+    if isinstance(value, Fraction):
+        return flint.arb(flint.fmpq(value.numerator, value.denominator))
+    return flint.arb(value)
+
+
+@dataclass
+class Tally:
+    """What came out of some points."""
+
+    points: int = 0
+    wrong: int = 0
+    undecided: int = 0
+    proved: int = 0
+    seconds: float = 0.0
+    radius: float = 0.0  # the worst error of the radius beside its bound
+    mode: float = 0.0  # and of an eigenvalue
+    bound: float = 0.0
+
+    def add(self, system: CompiledSystem, shared: Prepared, values: dict[str, float], known: Truth) -> None:
+        """Analyse a point and compare."""
+        began = time.perf_counter()
+        changed = apply(system, [Override(name, None, Fraction(value)) for name, value in values.items()])
+        found = analyze_modes(changed, prepared=shared)
+        self.seconds += time.perf_counter() - began
+        self.points += 1
+        self.undecided += found.stable is None
+        self.wrong += found.stable is not None and found.stable != bool(known.radius < 1)
+        self.proved += bool(found.proof)
+        off = float(abs(known.radius - flint.arb(found.spectral_radius)).mid())
+        self.radius = max(self.radius, off / found.spectral_radius_error)
+        self.bound = max(self.bound, found.spectral_radius_error)
+        for mode in found.modes:
+            place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
+            distance = min(float(abs(place - value).mid()) for value in known.values)
+            self.mode = max(self.mode, distance / mode.error if mode.error else math.inf * bool(distance))
+
+    def __str__(self) -> str:
+        each = 1e3 * self.seconds / max(self.points, 1)
+        return (
+            f"{self.points:6} points  {self.wrong} wrong  {self.undecided} undecided  {self.proved} proved in balls  "
+            f"error/bound {self.radius:.2g} (radius) {self.mode:.2g} (modes)  largest bound {self.bound:.1e}  {each:.1f} ms a point"
+        )
+
+
+def one_map(text: str, mesh: bool, damping: float, side: int) -> tuple[Tally, Tally]:
+    """Compare a map of side² points, and the points next to its boundary."""
+    system = compiled(text)
+    shared = prepare(system)
+    inner, edge = Tally(), Tally()
+    grid = (np.arange(side) + 1) / side
+    most = 2 * K_T if damping else K_T
+
+    def values(k_c: float, k_t: float) -> dict[str, float]:
+        return {
+            "contact.stiffness": k_c,
+            "coordination.stiffness": k_t,
+            "contact.damping": damping,
+            "coordination.damping": damping,
+        }
+
+    for k_c in (grid * K_C).tolist():
+        stable = []
+        for k_t in (grid * most).tolist():
+            known = truth(mesh, k_c, k_t, damping)
+            stable.append(bool(known.radius < 1))
+            inner.add(system, shared, values(k_c, k_t), known)
+        for place in np.flatnonzero(np.diff(stable)).tolist():
+            low, high = (float(grid[place + more] * most) for more in (0, 1))
+            while high - low > 1e-12 * high:
+                middle = (low + high) / 2
+                same = bool(truth(mesh, k_c, middle, damping).radius < 1) == stable[place]
+                low, high = (middle, high) if same else (low, middle)
+            for k_t in (low * (1 - 1e-9), low * (1 + 1e-9)):
+                edge.add(system, shared, values(k_c, k_t), truth(mesh, k_c, k_t, damping))
+    return inner, edge
+
+
+def main() -> None:
+    """Print one line a map."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.map", description=__doc__)
+    parser.add_argument("--points", type=int, default=10_000, help="of all four maps together")
+    side = max(2, math.isqrt(parser.parse_args().points // 4))
+    failed = 0
+    with single_threaded(), precision(DIGITS_60):
+        check_truth()
+        for text, mesh in ((AVERAGE, False), (MESH, True)):
+            for damping in (0.0, 2.0):
+                inner, edge = one_map(text, mesh, damping, side)
+                print(f"{'mesh' if mesh else 'mean'} {'PD' if damping else 'P '}  {inner}")
+                print(f"  boundary·(1 ± 1e-9)  {edge}", flush=True)
+                failed += inner.wrong + edge.wrong + inner.undecided + edge.undecided
+                failed += max(inner.radius, inner.mode, edge.radius, edge.mode) > 1
+    print("every verdict right, every bound holds" if not failed else "FAILED")
+
+
+if __name__ == "__main__":
+    main()

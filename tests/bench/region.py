@@ -1,0 +1,166 @@
+"""Exact boundary curves against the obvious program, error beside time: `python -m tests.bench.region`.
+
+The obvious program (`tests.bench.naive_region`) decides a grid of 100 × 100 points of the paper's scene by
+max |λ| < 1. Both run on one BLAS thread; times are CPU seconds, the best of some runs in a warm process, from
+a compiled model to curves. Errors are against 50 digits (`tests.paper_limit`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from apc.runtime.analysis import prepare
+from apc.runtime.boundary import relative_to
+from apc.runtime.curves import between
+from apc.runtime.evaluator import evaluator
+from apc.runtime.parameters import Free, apply, parse_override
+from apc.runtime.region import Region, parse_axes, region
+from apc.runtime.threads import single_threaded
+from tests.bench.naive_region import stable_grid
+from tests.paper_limit import limit
+from tests.topologies import AVERAGE, MESH, ROOT, compiled
+
+LOW, HIGH, COUNT = 10.0, 3000.0, 100
+X = f"contact.stiffness={LOW} N/m:{HIGH} N/m"
+Y = f"coordination.stiffness={LOW} N/m:{HIGH} N/m"
+TARGET = 50.0
+
+# For factors of curves: where these are steep, an error across is a larger one in height.
+SPANS = (("contact", 5000), ("coordination", 9000))
+FINE = 1e-12
+
+Found = TypeVar("Found")
+
+
+def best(function: Callable[[], Found], runs: int) -> tuple[float, Found]:
+    """Return the CPU seconds of the fastest of some runs, and what it returned."""
+    function()
+    least, found = np.inf, None
+    for _ in range(runs):
+        began = time.process_time()
+        found = function()
+        least = min(least, time.process_time() - began)
+    assert found is not None
+    return least, found
+
+
+def true_error(found: Region, every: int) -> float:
+    """Return the curves' largest distance from the boundary in 50 digits, relative as their `error` is."""
+    worst = 0.0
+    low, width = found.rectangle.low, found.rectangle.width
+    for curve in found.curves:
+        knots = (curve.points - low) / width
+        normal = np.stack([curve.tangents[:-1, 1], -curve.tangents[:-1, 0]], axis=1)
+        for share in (0.0, 0.25, 0.5, 0.75):
+            places = between(knots[:-1], knots[1:], curve.tangents[:-1], curve.tangents[1:], share)[1::every]
+            values = found.rectangle.values(places)
+            away = values[:, 1] - [limit(float(x), float(y)) for x, y in values]
+            away = np.abs(away) / width[1] * np.abs(normal[1::every, 1])
+            worst = max(worst, float((away / relative_to(places, normal[1::every], low / width)).max()))
+    return worst
+
+
+def paper(quick: bool) -> None:
+    """Time the paper's boundary against the obvious program."""
+    system = compiled(AVERAGE)
+    axes = parse_axes(system, X, Y)
+    exact, found = best(lambda: region(system, axes), 5 if quick else 30)
+    shared = prepare(system)
+    free = tuple(Free(axis.name, axis.group) for axis in axes)
+    set_up, _ = best(lambda: prepare(system), 10)
+    set_up += best(lambda: evaluator(system, free, prepared=shared), 10)[0]
+    count = 30 if quick else COUNT
+    began = time.process_time()
+    stable = stable_grid(LOW, HIGH, count)
+    naive = (time.process_time() - began) * (COUNT / count) ** 2
+    grid = np.linspace(LOW, HIGH, count)
+    truth = found.contains(*np.meshgrid(grid, grid))
+    points = sum(len(curve.points) for curve in found.curves)
+    told, off = found.curves[0].error, true_error(found, 40 if quick else 7)
+    wrong = f"{np.sum(truth != stable)} of {count**2} points wrong"
+    print("the paper's scene, K_C and K_T in 10 to 3000 N/m")
+    print(f"  exact curves      {1e3 * exact:8.1f} ms   {points} points, error ≤ {told:.1e} as told")
+    print(f"    of it set-up    {1e3 * set_up:8.1f} ms   equations of one peer, whatever is asked of them")
+    print(f"    true error      {off:11.1e}   against 50 digits, at the points and between")
+    print(f"  obvious program   {1e3 * naive:8.1f} ms   {wrong}")
+    print(
+        f"  ratio             {naive / exact:8.1f}      {naive / (exact - set_up):.1f} with set-up not counted"
+    )
+    print(f"  target            {TARGET:8.1f}")
+
+
+def crossing(found: Region, x: float) -> float | None:
+    """Return the highest stable y over x, None where there is none."""
+    heights = []
+    for curve in found.curves:
+        knots = (curve.points - found.rectangle.low) / found.rectangle.width
+        over = np.flatnonzero((curve.points[:-1, 0] - x) * (curve.points[1:, 0] - x) <= 0)
+        for place in over[:1]:
+            ends = [one[place : place + 1] for one in (knots, knots[1:], curve.tangents, curve.tangents[1:])]
+            low, high = 0.0, 1.0
+            rising = curve.points[place + 1, 0] > x
+            for _ in range(60):
+                middle = (low + high) / 2
+                value = found.rectangle.values(between(*ends, middle))[0]
+                low, high = (low, middle) if (value[0] > x) == rising else (middle, high)
+            heights.append(float(value[1]))
+    return max(heights, default=None)
+
+
+def factors() -> None:
+    """Print how much more gain the mean allows than the sum, along the curves of Figs. 3 and 4."""
+    delays = {
+        "(a) no delay": ("contact.delay=0 ms", "coordination.delay=0 ms", "lan.delay=0 ms"),
+        "(b) both delays": ("contact.delay=1 ms", "coordination.delay=1 ms", "lan.delay=8 ms"),
+    }
+    print("\nlargest K_T of the mean over that of the sum, along the curves")
+    for figure, damping in (("Fig. 3, B = 0", "0 N*s/m"), ("Fig. 4, B = 2", "2 N*s/m")):
+        for panel, settings in delays.items():
+            texts = [f"{name}.damping={damping}" for name in ("contact", "coordination")] + list(settings)
+            found = []
+            for text in (AVERAGE, MESH):
+                system = compiled(text)
+                system = apply(system, [parse_override(system, one) for one in texts])
+                wide = [f"{name}.stiffness=0 N/m:{high} N/m" for name, high in SPANS]
+                found.append(region(system, parse_axes(system, *wide), tolerance=FINE))
+            ratios = {}
+            for x in np.linspace(25, 4975, 199).tolist():
+                mean, total = (crossing(one, x) for one in found)
+                if mean is not None and total is not None:
+                    ratios[x] = mean / total
+            low, high = min(ratios.values()), max(ratios.values())
+            first = next((x for x, ratio in ratios.items() if ratio <= 1), None)
+            note = f", at most 1 from K_C = {first:.0f} N/m on" if first else ""
+            print(f"  {figure} {panel:<16} {low:.10f} to {high:.10f} ({len(ratios)} values of K_C{note})")
+
+
+def islands() -> None:
+    """Time scenes with an island and a hole, whose boundaries are circles."""
+    print("\nan island and a hole, circles by construction")
+    for name in ("island", "hole"):
+        system = compiled((ROOT / "tests" / "scenes" / f"{name}.yaml").read_text(encoding="utf-8"))
+        axes = parse_axes(system, "u=0 N/m:1000 N/m", "v=0 N/m:1000 N/m")
+        seconds, found = best(lambda system=system, axes=axes: region(system, axes), 5)  # type: ignore[misc]
+        radii = np.hypot(*(found.curves[0].points - [620, 410]).T)
+        spread = float(np.ptp(radii) / radii.mean())
+        print(f"  {name:<7} {1e3 * seconds:8.1f} ms   radius {radii.mean():.6f} N/m, spread {spread:.1e}")
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.region", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a coarser grid, fewer runs")
+    quick = parser.parse_args().quick
+    with single_threaded():
+        paper(quick)
+        factors()
+        islands()
+
+
+if __name__ == "__main__":
+    main()

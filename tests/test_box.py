@@ -1,0 +1,172 @@
+"""Claims about `apc.runtime.box` and `apc.runtime.box_proof`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from apc.compiler.compiled import CompiledSystem, Parameter
+from apc.compiler.errors import ApcError
+from apc.runtime.analysis import analyze_modes
+from apc.runtime.box import parse_range
+from apc.runtime.box_proof import BoxProof, prove_box
+from apc.runtime.parameters import Override, apply
+from tests.sites import columned, grouped, paper
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
+
+TRANSLATING = "stable up to a common translation"
+
+
+def _proof(system: CompiledSystem, *texts: str) -> BoxProof:
+    return prove_box(system, [parse_range(system, text) for text in texts])
+
+
+def _message(system: CompiledSystem, *texts: str) -> str:
+    with pytest.raises(ApcError) as caught:
+        _proof(system, *texts)
+    [mistake] = caught.value.mistakes
+    return f"{mistake.code} {mistake.sentence}"
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ["contact.stiffness=±1%"],
+        ["contact.stiffness=±10%", "coordination.stiffness=+-10 %"],
+        ["coordination.stiffness=100 N/m:1 N/mm"],
+        ["device.mass=±2%", "cube.mass=±2%", "cube.damping=±5%"],
+        ["couplers.contact.damping=0 N*s/m:0.5 N*s/m"],
+    ],
+)
+def test_a_box_is_proved_and_every_point_of_it_is_stable(texts: list[str]) -> None:
+    system = compiled(AVERAGE)
+    ranges = [parse_range(system, text) for text in texts]
+    found = prove_box(system, ranges)
+    assert (found.stable, found.verdict, found.open_share) == (True, TRANSLATING, 0.0)
+    generator = np.random.default_rng(5)
+    for _ in range(5):
+        shares = [Fraction(float(one)) for one in generator.choice([0.0, 1.0, 0.3, 0.77], len(ranges))]
+        point = [
+            Override(one.name, one.group, one.low + share * (one.high - one.low))
+            for one, share in zip(ranges, shares, strict=True)
+        ]
+        assert analyze_modes(apply(system, point)).stable
+
+
+def test_a_box_beyond_the_limit_is_unstable_at_a_point_and_one_below_it_is_stable() -> None:
+    """The limit of K_T at K_C = 1000 is 1096.411 N/m."""
+    system = compiled(AVERAGE)
+    below = _proof(system, "coordination.stiffness=1050 N/m:1096.4 N/m")
+    assert below.stable is True
+    above = _proof(system, "coordination.stiffness=1050 N/m:1096.5 N/m")
+    assert above.stable is False
+    [point] = above.point
+    assert 1096.41 < point <= 1096.5
+    assert (
+        analyze_modes(apply(system, [Override("coordination.stiffness", None, Fraction(point))])).stable
+        is False
+    )
+    assert "proved unstable at" in str(above)
+
+
+def test_an_instability_inside_the_box_is_found() -> None:
+    """The contact alone allows 1865 N/m: the point is found between the middle and the end."""
+    found = _proof(compiled(AVERAGE), "contact.stiffness=1 N/m:3000 N/m")
+    assert found.stable is False
+    assert found.point[0] > 1800
+
+
+def test_what_can_not_be_proved_is_left_open_and_says_where(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At K_T = 0 nothing ties the copies: no box that holds this point is stable in the same sense."""
+    monkeypatch.setattr("apc.runtime.box_proof.MOST_CELLS", 100)
+    found = _proof(compiled(AVERAGE), "coordination.stiffness=0 N/m:200 N/m")
+    assert (found.stable, found.verdict) == (None, "undecided")
+    assert 0 < found.open_share < 0.1
+    assert 0 < found.point[0] < 20
+    assert max(len(line) for line in str(found).splitlines()) <= 80
+    assert found.to_dict()["open_around"] == list(found.point)
+
+
+def test_what_depends_on_a_parameter_by_an_expression_follows() -> None:
+    text = replaced(
+        AVERAGE,
+        ("peers:", "parameters: {kt: 500 N/m, unit: 2 N/m}\npeers:"),
+        ("stiffness: 500 N/m", "stiffness: kt*kt/unit/(peers + 247)"),
+    )
+    system = compiled(text)
+    [value] = [one.value for one in system.parameters if one.name == "coordination.stiffness"]
+    assert value == 500
+    assert _proof(system, "kt=490 N/m:510 N/m").stable is True
+    limit = (1096.411 * 500) ** 0.5  # kt²/500 = 1096.411
+    assert _proof(system, f"kt={limit * 0.99} N/m:{limit * 0.9999} N/m").stable is True
+    assert _proof(system, f"kt={limit * 0.99} N/m:{limit * 1.0001} N/m").stable is False
+
+
+def test_a_group_of_its_own_is_opened_alone_even_if_it_is_alike_in_the_middle() -> None:
+    system = grouped(
+        paper(), ("left", 2, {"contact.stiffness": 1000.0}), ("right", 1, {"contact.stiffness": 1000.0})
+    )
+    found = _proof(system, "left.contact.stiffness=±5%")
+    assert found.stable is True
+    assert found.ranges[0].group == "left"
+    unstable = _proof(system, "left.contact.stiffness=1000 N/m:2500 N/m")
+    assert unstable.stable is False
+
+
+def test_peers_that_differ_in_other_things_are_proved_together() -> None:
+    system = columned(paper(), device__mass=[0.1, 0.2, 0.15])
+    assert _proof(system, "contact.stiffness=±1%").stable is True
+
+
+def test_drifts_and_jumping_directions_are_left_open_with_a_reason() -> None:
+    system = paper(kt=0.0, bt=0.0)
+    loose = grouped(system, ("user", 3, {"device.damping": 0.0, "cube.damping": 0.0}))
+    found = _proof(loose, "contact.stiffness=±1%")
+    assert found.stable is not True
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("contact.stiffness", "E830"),
+        ("contact.stiffness=900 N/m", "E830"),
+        ("contact.stiffness=±1", "E830"),
+        ("contact.stiffness=±x%", "E830"),
+        ("contact.stiffness=±0%", "E833"),
+        ("contact.damping=±1%", "E833 contact.damping is 0, and any share of it is 0 as well"),
+        ("contact.stiffness=5 N/m:1 N/m", "E833"),
+        ("contact.stiffness=-5 N/m:1 N/m", "E833"),
+        ("device.mass=0 kg:1 kg", "E833"),
+        ("lan.delay=±1%", "E831 lan.delay is a time"),
+        ("peers=±1%", "E623"),
+        ("contact.stiffnes=±1%", "E622"),
+        ("contact.stiffness=900:1100", "E204"),
+        ("contact.stiffness=900 kg:1100 kg", "E204"),
+    ],
+)
+def test_a_box_that_can_not_be_is_refused_in_one_message(text: str, message: str) -> None:
+    assert _message(compiled(AVERAGE), text).startswith(message)
+
+
+def test_a_parameter_opened_twice_or_of_many_values_is_refused() -> None:
+    system = compiled(AVERAGE)
+    assert _message(system, "contact.stiffness=±1%", "contact.stiffness=±2%").startswith("E831")
+    many = columned(paper(), device__mass=[0.1, 0.2, 0.15])
+    assert _message(many, "device.mass=±1%").startswith("E831 device.mass is not the same for all")
+    assert _message(many, "user.device.mass=±1%").startswith("E831 device.mass differs from peer to peer")
+
+
+def test_scenes_that_are_no_rational_function_of_the_parameter_are_refused() -> None:
+    bent = compiled((SCENES / "experiment-average.yaml").read_text(encoding="utf-8"))
+    assert _message(bent, "contact.stiffness=±1%").startswith("E832")
+    system = paper()
+    parameters = tuple(
+        replace(one, expression="sqrt(kt)") if one.name == "coordination.stiffness" else one
+        for one in (Parameter("kt", "N/m", 250000.0), *system.parameters)
+    )
+    assert _message(replace(system, parameters=parameters), "kt=±1%").startswith(
+        "E832 coordination.stiffness"
+    )

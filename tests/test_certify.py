@@ -1,0 +1,195 @@
+"""Claims about `apc.runtime.certify` and what `apc.runtime.spectrum` makes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import casadi
+import flint
+import numpy as np
+import pytest
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis import Analysis, analyze_dense, analyze_modes, lifted_groups
+from apc.runtime.balls import precision
+from apc.runtime.certify import prove, root_discs, schur_cohn
+from apc.runtime.modes import split
+from apc.runtime.rigid import find_rigid_modes, independent_places
+from tests.sites import MS, alone, columned, grouped, linked, paper
+
+TRANSLATING = "stable up to a common translation"
+
+
+def _polynomial(*roots: complex) -> list[flint.arb]:
+    """Return the coefficients of a real polynomial by its roots, lowest first."""
+    exact = flint.acb_poly.from_roots([flint.acb(root.real, root.imag) for root in map(complex, roots)])
+    return [coefficient.real for coefficient in exact.coeffs()]
+
+
+@pytest.mark.parametrize(
+    ("roots", "inside"),
+    [
+        ((0.5, -0.9, 0.3 + 0.4j, 0.3 - 0.4j), True),
+        ((0.5, -1.25), False),
+        ((0.5 + 0.875j, 0.5 - 0.875j, 0.0, 0.0, 0.0), False),  # |z|² = 1 + 2⁻⁶
+        ((2.0, 0.125), False),  # their product is small: the second step shows it
+        ((1 - 2.0**-50, 1 - 2.0**-49), True),
+        ((1 + 2.0**-50, 0.5), False),
+        ((1.0, 0.5), None),  # on the circle: nobody can tell
+        ((0.5, 0.5, 0.5), True),
+        ((), True),
+    ],
+)
+def test_schur_and_cohn_tell_where_the_roots_are(roots: tuple[complex, ...], inside: bool | None) -> None:
+    with precision(256):
+        assert schur_cohn(_polynomial(*roots)) is inside
+
+
+def test_random_polynomials_are_decided_as_their_roots_say() -> None:
+    generator = np.random.default_rng(3)
+    with precision(256):
+        for _ in range(300):
+            sizes = generator.uniform(0.8, 1.02, 3)
+            angles = generator.uniform(0, np.pi, 3)
+            pairs = [complex(r * np.cos(a), r * np.sin(a)) for r, a in zip(sizes, angles, strict=True)]
+            roots = [*pairs, *(root.conjugate() for root in pairs), float(generator.uniform(-1.01, 1.01))]
+            assert schur_cohn(_polynomial(*roots)) is (max(abs(root) for root in roots) < 1)
+
+
+def test_discs_hold_multiple_and_nearly_equal_roots() -> None:
+    """Triple 0.5, double 0.5 + 2⁻³⁰, and 0.25 once; what is found of them is off by 1e-40 and more."""
+    roots = [0.5, 0.5, 0.5, 0.5 + 2.0**-30, 0.5 + 2.0**-30, 0.25]
+    with precision(512):
+        polynomial = flint.arb_poly(_polynomial(*roots))
+        found = [flint.acb(root) + flint.acb(0, 1e-40 * place) for place, root in enumerate(roots)]
+        centres, radii = root_discs(polynomial, found, 512)
+    assert all(np.min(np.abs(centres - root) - radii) <= 0 for root in roots)
+    assert radii.max() < 1e-15
+
+
+def test_discs_keep_a_root_that_vanishes_many_times() -> None:
+    with precision(256):
+        polynomial = flint.arb_poly(_polynomial(*[0.0] * 9, 0.75))
+        centres, radii = root_discs(polynomial, [flint.acb(0)] * 9 + [flint.acb(0.75)], 256)
+    zeros = np.abs(centres) < 0.1
+    assert zeros.sum() == 9
+    assert (np.abs(centres[zeros]) + radii[zeros]).max() < 1e-3
+    assert abs(centres[~zeros][0] - 0.75) <= radii[~zeros][0] < 1e-15
+
+
+def _certified(system: CompiledSystem) -> Analysis:
+    return analyze_modes(system, certify=True)
+
+
+@pytest.mark.parametrize(
+    ("system", "verdict", "proof"),
+    [
+        (paper(), TRANSLATING, "proved stable with 256 bits"),
+        (paper(kt=1200.0), "unstable", "proved unstable with 256 bits"),
+        (paper(peers=1, operator="sum"), TRANSLATING, "proved stable with 256 bits"),
+        (linked(paper(peers=8), "ring"), TRANSLATING, "proved stable with 256 bits"),  # cos 45° is irrational
+        (linked(paper(peers=6), "star"), TRANSLATING, "proved stable with 256 bits"),
+        (alone(), "stable", "proved stable with 256 bits"),
+    ],
+)
+def test_a_verdict_that_floats_know_is_proved_when_asked_for(
+    system: CompiledSystem, verdict: str, proof: str
+) -> None:
+    plain, certified = analyze_modes(system), _certified(system)
+    assert plain.proof == ""
+    assert plain.verdict == certified.verdict == verdict
+    assert certified.proof == proof
+    assert abs(plain.spectral_radius - certified.spectral_radius) <= plain.spectral_radius_error
+    assert certified.spectral_radius_error < 1e-15
+
+
+def test_proved_modes_are_the_modes() -> None:
+    for system in (paper(bt=2.0), linked(paper(peers=7), "ring")):
+        plain, certified = analyze_modes(system), _certified(system)
+        for one in certified.modes:
+            near = min(
+                plain.modes, key=lambda mode: (mode.shape != one.shape, abs(mode.eigenvalue - one.eigenvalue))
+            )
+            assert abs(near.eigenvalue - one.eigenvalue) <= near.error + one.error
+            if one.magnitude > 0.1:
+                assert near.frequency_hz == pytest.approx(one.frequency_hz, abs=1e-6)
+                shares = zip(near.participation, one.participation, strict=True)
+                assert max(abs(a[1] - b[1]) for a, b in shares) < 1e-6
+
+
+def _undamped(**values: object) -> CompiledSystem:
+    system = paper(**values)  # type: ignore[arg-type]
+    return grouped(system, ("user", system.peers, {"device.damping": 0.0, "cube.damping": 0.0}))
+
+
+def test_a_drift_is_told_from_a_translation_by_proof() -> None:
+    found = _certified(_undamped(kt=0.0, bt=0.0, kc=0.0))
+    assert found.verdict == "drifts"
+    assert found.proof.startswith("proved to drift")
+    assert found.rigid_modes == 6
+
+
+def test_what_lies_on_the_circle_stays_undecided() -> None:
+    """A mass on an undamped spring: its eigenvalues have magnitude one, exactly."""
+
+    def swing(x: object, u: object) -> object:
+        return casadi.vertcat(x[1], -4 * x[0])  # type: ignore[index]
+
+    system = alone()
+    [kind] = system.kinds
+    x, u, p, t = casadi.SX.sym("x", 2), casadi.SX.sym("u", 0), casadi.SX.sym("p", 1), casadi.SX.sym("t")
+    states = (kind.states[0], dataclasses.replace(kind.states[0], name="v"))
+    rate = casadi.Function("derivative", [x, u, p, t], [swing(x, u)])
+    system = dataclasses.replace(system, kinds=(dataclasses.replace(kind, states=states, derivative=rate),))
+    found = analyze_modes(system)
+    assert found.verdict == "undecided: |ρ−1| below the error bound"
+    assert found.proof == "undecided at 4096 bits"
+    assert abs(found.spectral_radius - 1) <= found.spectral_radius_error < 1e-15
+
+
+def test_what_is_rounded_is_not_called_proved() -> None:
+    found = _certified(alone(lambda x, u: -casadi.sin(x)))
+    assert found.proof == ""
+    assert found.notes == (
+        "single: not proved, as the equations of peer hold functions whose values are rounded",
+    )
+
+
+def test_all_peers_as_one_system_are_proved_as_the_few_small_ones_are() -> None:
+    for system in (paper(bt=2.0), columned(paper(), device__mass=[0.1, 0.2, 0.15])):
+        whole, small = analyze_dense(system, certify=True), _certified(system)
+        assert whole.verdict == small.verdict == TRANSLATING
+        assert whole.proof == small.proof == "proved stable with 256 bits"
+        assert whole.spectral_radius == pytest.approx(small.spectral_radius, abs=1e-14)
+
+
+def test_a_frame_of_thousand_ticks_is_decided() -> None:
+    """1 ms and 7.99 ms: all clocks stand as before after 0.799 s; float bounds multiply up to 1e23."""
+    found = analyze_modes(paper(network=MS * 799 / 100, comm=8 * MS))
+    assert found.verdict == TRANSLATING
+    assert found.proof.startswith("proved stable with")
+    assert found.spectral_radius_error < 1e-14
+
+
+def test_more_bits_are_taken_as_long_as_they_decide() -> None:
+    """At the last float below a boundary, 1 − ρ is 1e-16 or less: too near for floats, not for a proof."""
+    low, high = 900.0, 1200.0
+    while np.nextafter(low, high) < high:
+        middle = (low + high) / 2
+        low, high = (middle, high) if analyze_modes(paper(kc=1000.0, kt=middle)).stable else (low, middle)
+    below, above = (analyze_modes(paper(kc=1000.0, kt=kt)) for kt in (low, high))
+    assert (below.stable, above.stable) == (True, False)
+    assert below.proof.startswith("decided with") or below.proof.startswith("proved stable")
+    assert above.proof.startswith("proved unstable")
+    assert abs(low - 1096.411) < 6e-4  # the reference limit of K_T at K_C = 1000
+
+
+def test_a_proof_names_where_the_discs_are() -> None:
+    [common, difference] = split(*lifted_groups(paper())).systems
+    for system in (common, difference):
+        free = find_rigid_modes(system, with_drifts=False)
+        proof = prove(system, free, independent_places(free.basis.T).tolist())
+        assert proof.inside is True
+        assert proof.values is not None
+        assert len(proof.values) == len(system.names) - len(free.names)
+        assert (np.abs(proof.values) + proof.radii).max() < 1

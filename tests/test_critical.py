@@ -1,0 +1,251 @@
+"""Claims about `apc.runtime.critical` and what it searches with: limits, islands, jumps, errors."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+
+from apc.__main__ import run
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.runtime.analysis import analyze_modes
+from apc.runtime.critical import critical
+from apc.runtime.crossings import scan
+from apc.runtime.parameters import Override, apply
+from tests.bruteforce import Scene, frame_matrix
+from tests.topologies import AVERAGE, MESH, compiled, replaced
+
+TEXTS = {"AP": AVERAGE, "VC": MESH}
+NONE = {"contact.delay": "0", "coordination.delay": "0", "lan.delay": "0"}
+
+
+def scene(
+    scheme: str, *, delayed: bool = True, delays: str = "all", b: str = "0", k_c: str = "1000"
+) -> CompiledSystem:
+    system = compiled(replaced(TEXTS[scheme], ("link: lan", f"link: lan, delays: {delays}")))
+    values = {"contact.stiffness": k_c, "contact.damping": b, "coordination.damping": b}
+    if not delayed:
+        values |= NONE
+    return with_values(system, values)
+
+
+def with_values(system: CompiledSystem, values: dict[str, str]) -> CompiledSystem:
+    return apply(system, [Override(name, None, Fraction(value)) for name, value in values.items()])
+
+
+def stable_at(system: CompiledSystem, name: str, value: float) -> bool | None:
+    return analyze_modes(apply(system, [Override(name, None, Fraction(value))])).stable
+
+
+@pytest.mark.parametrize(
+    ("delayed", "delays", "b", "k_c", "average", "mesh"),
+    [
+        (False, "all", "0", "100", 2127.449, 1063.725),
+        (False, "all", "0", "2000", 2868.148, 1434.074),
+        (False, "all", "2", "100", 4488.004, 2959.062),
+        (False, "all", "2", "2000", 5869.746, 3479.811),
+        (True, "all", "0", "100", 708.186, 354.093),
+        (True, "all", "0", "1000", 1096.411, 548.205),
+        (True, "all", "2", "100", 1493.128, 962.734),
+        (True, "all", "2", "1000", 2477.935, 1378.111),
+        (True, "own", "0", "100", 743.165, 371.582),
+    ],
+)
+def test_the_largest_stable_stiffness_is_the_reference_one(
+    delayed: bool, delays: str, b: str, k_c: str, average: float, mesh: float
+) -> None:
+    for scheme, limit in (("AP", average), ("VC", mesh)):
+        found = critical(
+            scene(scheme, delayed=delayed, delays=delays, b=b, k_c=k_c), "coordination.stiffness"
+        )
+        assert found.value == pytest.approx(limit, abs=6e-4)
+        assert found.stable_side == "below"
+        assert found.error is not None
+        assert found.error <= 1e-12 * limit
+        assert found.crossings[0].proof.startswith("proved")
+        assert found.whole
+
+
+@pytest.mark.parametrize(("b", "limit"), [("0", 1865.424), ("2", 3175.018)])
+def test_the_contact_alone_has_its_reference_limit(b: str, limit: float) -> None:
+    system = with_values(scene("AP"), {"coordination.stiffness": "0", "contact.damping": b})
+    assert critical(system, "contact.stiffness").value == pytest.approx(limit, abs=6e-4)
+
+
+def test_the_error_holds_against_the_full_map_in_50_digits() -> None:
+    """At value ± error the largest eigenvalue of all peers' own map lies on either side of the circle."""
+    found = critical(scene("AP"), "coordination.stiffness")
+    assert found.value is not None
+    assert found.error is not None
+    with mpmath.workdps(50):
+        sizes = []
+        for sign in (-1, 1):
+            k_t = mpmath.mpf(found.value) + sign * mpmath.mpf(found.error)
+            rows = frame_matrix(Scene(kt=k_t, kc=mpmath.mpf(1000)), number=mpmath.mpf, exp=mpmath.exp)  # type: ignore[arg-type] # a scene of long floats
+            mode = mpmath.exp(2j * mpmath.pi * found.crossings[0].frequency_hz * mpmath.mpf("0.008"))
+            sizes.append(abs(_eigenvalue_near(mpmath.matrix(rows), mode)))
+    assert sizes[0] < 1 < sizes[1]
+
+
+def _eigenvalue_near(matrix: mpmath.matrix, guess: mpmath.mpc) -> mpmath.mpc:
+    """Return the eigenvalue nearest to a guess, by inverse iteration with the Rayleigh quotient."""
+    n = matrix.rows
+    vector = mpmath.matrix([mpmath.mpc(1, place % 3) / (1 + place) for place in range(n)])
+    value = guess * (1 + mpmath.mpf("1e-6"))
+    for step in range(10):
+        shifted = matrix - value * mpmath.eye(n)
+        try:
+            vector = mpmath.lu_solve(shifted, vector)
+        except ZeroDivisionError:  # the value is an eigenvalue to the last digit
+            return value
+        place = max(range(n), key=lambda row: abs(vector[row]))
+        vector = vector / vector[place]
+        after = (matrix[place, :] * vector)[0]
+        if step > 1 and abs(after - value) < mpmath.mpf("1e-40"):
+            return after
+        value = after if step > 1 else value
+    return value
+
+
+def test_both_sides_of_every_crossing_are_what_an_analysis_says() -> None:
+    system = compiled(AVERAGE)
+    for name in ("coordination.damping", "device.mass", "device.damping", "contact.delay"):
+        found = critical(system, name)
+        assert found.crossings
+        for one in found.crossings:
+            below = stable_at(system, name, one.value * (1 - 1e-6))
+            above = stable_at(system, name, one.value * (1 + 1e-6))
+            assert (below, above) == ((True, False) if one.stable_side == "below" else (False, True))
+
+
+def test_an_island_of_stability_is_found() -> None:
+    """Coordination damping of the paper's scene: stable, unstable, stable again, unstable for good."""
+    found = critical(compiled(AVERAGE), "coordination.damping")
+    assert [one.stable_side for one in found.crossings] == ["below", "above", "below"]
+    assert found.value == found.crossings[0].value
+
+
+def test_islands_of_any_width_above_the_cell_are_found_by_construction() -> None:
+    """|λ| = 1 + c ((p − a)² − w²): stable between a − w and a + w and nowhere else."""
+    centre = 7.3
+    for width in (0.3, 0.03, 0.003):
+
+        def course(p: np.ndarray, width: float = width) -> list[tuple[np.ndarray, np.ndarray]]:
+            size = 1 + 0.05 * ((p - centre) ** 2 - width**2)
+            slope = 0.1 * (p - centre)
+            turn = np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
+            return [(size[:, None, None] * turn, slope[:, None, None] * turn)]
+
+        found = scan(course, np.geomspace(0.01, 100, 25), least=0.01)
+        assert [root.rising for root in found.roots] == [False, True]
+        expected = [centre - width, centre + width]
+        assert [root.value for root in found.roots] == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
+    system = with_values(compiled(AVERAGE), {"coordination.stiffness": "690", "contact.stiffness": "100"})
+    found = critical(system, "lan.delay", upper="16 ms")
+    assert found.crossings
+    first = found.crossings[0]
+    assert first.kind == "jump"
+    assert first.error == 0.0
+    ticks = first.value / 1e-3
+    assert ticks == pytest.approx(round(ticks), abs=1e-9)
+    sides = [
+        analyze_modes(
+            apply(system, [Override("lan.delay", None, Fraction(round(ticks), 1000) + shift)])
+        ).stable
+        for shift in (Fraction(-1, 10**7), Fraction(1, 10**7))
+    ]
+    assert sides == ([True, False] if first.stable_side == "below" else [False, True])
+
+
+def test_what_follows_by_an_expression_moves_along() -> None:
+    text = replaced(
+        MESH,
+        ("masses:", "parameters: {kt: 500 N/m}\nmasses:"),
+        (
+            "type: FullMesh, object: cube, stiffness: 500 N/m",
+            "type: FullMesh, object: cube, stiffness: kt/(peers - 1)",
+        ),
+    )
+    # (N − 1) times less each is the average's limit.
+    assert critical(compiled(text), "kt").value == pytest.approx(1096.410868365630, rel=1e-12)
+
+
+def test_groups_alike_at_present_only_are_kept_apart() -> None:
+    """One group's own stiffness, equal to the others' now: its limit is not everybody's."""
+    text = replaced(
+        AVERAGE,
+        ("  user: {count: 3}", "  one: {count: 1, set: {contact.stiffness: 1000 N/m}}\n  two: {count: 2}"),
+    )
+    system = compiled(text)
+    alone = critical(system, "one.contact.stiffness")
+    assert alone.parameter == "one.contact.stiffness"
+    assert alone.value is not None
+    for shift, stable in ((1 - 1e-9, True), (1 + 1e-9, False)):
+        changed = apply(system, [Override("contact.stiffness", "one", Fraction(alone.value * shift))])
+        assert analyze_modes(changed).stable is stable
+    together = critical(system, "contact.stiffness")
+    assert together.value == pytest.approx(1645.35314612339, rel=1e-12)
+    assert abs(alone.value - together.value) > 1
+
+
+def test_no_crossing_is_an_answer_in_words() -> None:
+    found = critical(compiled(AVERAGE), "coordination.stiffness", upper="900 N/m")
+    assert (found.value, found.error, found.stable_side) == (None, None, None)
+    assert found.verdict == "stable at every value scanned"
+    assert found.scanned == (0.0, 900.0)
+    above = critical(compiled(AVERAGE), "coordination.stiffness", lower="1200 N/m", upper="2000 N/m")
+    assert above.verdict == "unstable at every value scanned"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["peers"], "E623 peers is the number of peers"),
+        (["contact.stifness"], "E622 contact.stifness is no parameter"),
+        (["haptic.period"], "E844 haptic.period sets the rhythm of a clock"),
+        (["contact.stiffness", "--upper", "3 kg"], "E204 contact.stiffness wants N/m, got 3 kg"),
+        (
+            ["contact.stiffness", "--lower", "9 N/m", "--upper", "3 N/m"],
+            "E842 contact.stiffness needs a range",
+        ),
+        (["contact.stiffness", "--lower", "-5 N/m"], "E843 a limit of contact.stiffness wants at least 0"),
+    ],
+)
+def test_a_mistake_is_one_message(words: list[str], message: str, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["critical", *words]) == 1
+    written = capsys.readouterr()
+    assert message in written.err
+    assert written.out == ""
+
+
+def test_the_command_prints_one_document_or_lines_of_80_columns(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["critical", "coordination.stiffness", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["value"] == pytest.approx(1096.410868365630, rel=1e-12)
+    assert document["unit"] == "N/m"
+    assert document["crossings"][0]["stable_side"] == "below"
+    assert run(["critical", "coordination.stiffness", "--set", "contact.stiffness=2000 N/m"]) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_scene_that_is_not_linear_has_estimates_and_says_so() -> None:
+    from tests.topologies import SCENES
+
+    text = (SCENES / "finger.yaml").read_text(encoding="utf-8").partition("\n")[2]
+    found = critical(compiled(text), "wall.stiffness", lower="2000 N/m", upper="9000 N/m")
+    assert found.crossings
+    assert found.crossings[0].proof == "estimated in floats"
+    with pytest.raises(ApcError, match="E845"):
+        critical(compiled(text), "wall.delay")

@@ -1,0 +1,101 @@
+"""Claims about `apc.runtime.ensemble`."""
+
+from __future__ import annotations
+
+import json
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+
+from apc.__main__ import run
+from apc.compiler.errors import ApcError
+from apc.runtime.ensemble import PART, Ensemble, Run, play_many, share_interval
+from apc.runtime.simulation import prepare
+from apc.runtime.trajectory import play
+from tests.test_gathering import apart
+from tests.topologies import AVERAGE, compiled
+
+SHAKY = apart(AVERAGE, "loss: {p: 10 %, r: 20 %}, jitter: 8 ms")
+
+
+def many(*settled: float | None) -> Ensemble:
+    runs = [
+        Run(number, "moves on" if at is None else "settles", at, 2.0 * number, 0.001)
+        for number, at in enumerate(settled)
+    ]
+    return Ensemble("scene", Fraction(3), 7, tuple(runs))
+
+
+def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it() -> None:
+    system = compiled(SHAKY)
+    few = play_many(system, Fraction(1, 2), runs=4, seed=3, jit=False)
+    assert play_many(system, Fraction(1, 2), runs=2, seed=3, jit=False).runs == few.runs[:2]
+    shared = play_many(system, Fraction(1, 2), runs=PART + 4, seed=3, jobs=2, jit=False)
+    assert [one.number for one in shared.runs] == list(range(PART + 4))
+    assert shared.runs[:4] == few.runs
+    assert len({one.settled for one in shared.runs}) > 3, "they are different runs"
+
+
+def test_run_0_is_the_run_that_is_played_alone() -> None:
+    system = compiled(SHAKY)
+    [alone] = play_many(system, Fraction(1, 2), runs=1, seed=3, jit=False).runs
+    summary, _ = play(prepare(system, Fraction(1, 2), seed=3, jit=False), [])
+    assert summary.largest_force is not None
+    assert (alone.verdict, alone.settled, alone.largest_force) == (
+        summary.verdict,
+        summary.settled,
+        summary.largest_force[1],
+    )
+
+
+def test_the_seed_is_the_experiments_if_none_is_given() -> None:
+    system = compiled(SHAKY + "experiment: {seed: 5}\n")
+    assert play_many(system, Fraction(1, 10), runs=1, jit=False).seed == 5
+
+
+def test_statistics_are_those_of_the_runs_that_have_the_number() -> None:
+    found = many(0.1, 0.4, None, 0.2)
+    one = found.statistics("settled")
+    assert one is not None
+    assert (one.count, one.low, one.high) == (3, 0.1, 0.4)
+    assert one.mean == pytest.approx(0.7 / 3)
+    assert one.standard_error == pytest.approx(math.sqrt((0.01 + 0.16 + 0.04 - 0.49 / 3) / 2 / 3))
+    assert one.quantiles[1] == pytest.approx(0.2)
+    assert many(None).statistics("settled") is None
+    assert found.verdicts == (("settles", 3), ("moves on", 1))
+
+
+def test_a_shares_interval_is_wilsons() -> None:
+    """Newcombe (1998, Statist. Med. 17), table I: 81 of 263, 0 of 20 and 1 of 29."""
+    assert share_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
+    assert share_interval(0, 20) == pytest.approx((0, 0.1611), abs=5e-5)
+    assert share_interval(1, 29) == pytest.approx((0.0061, 0.1718), abs=5e-5)
+
+
+def test_a_scene_without_chance_is_not_played_many_times() -> None:
+    with pytest.raises(ApcError, match="E894 nothing in three-users-average is left to chance"):
+        play_many(compiled(AVERAGE), Fraction(1), runs=10)
+
+
+def test_its_words_fit_a_terminal() -> None:
+    text = str(many(0.1, 0.4, None, 0.2))
+    assert max(map(len, text.splitlines())) <= 80
+    assert text.splitlines()[0] == "scene: 4 runs of 3 s, seed 7"
+    assert "settles           3   75 % (95 % sure: 30.1 % to 95.4 %)" in text
+    assert "of the 3 runs that settle" in text
+
+
+def test_the_command_prints_it_and_keeps_no_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("scene.yaml").write_text(SHAKY + "experiment: {duration: 200 ms}\n", encoding="utf-8")
+    assert run(["simulate", "--runs", "3", "--seed", "4", "--no-jit"]) == 0
+    assert capsys.readouterr().out.startswith("three-users-average: 3 runs of 0.2 s, seed 4\n")
+    assert run(["simulate", "--runs", "3", "--seed", "4", "--no-jit", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["runs"], document["seed"]) == (3, 4)
+    assert run(["simulate", "--runs", "3", "--out", "rows.csv"]) == 2
+    assert "--runs keeps no rows" in capsys.readouterr().err

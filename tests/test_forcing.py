@@ -1,0 +1,95 @@
+"""`forcing`: hand forces that change with time are exact, wherever they switch."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import mpmath
+import numpy as np
+import pytest
+
+from apc.compiler.pipeline import compile_topology
+from apc.runtime.trajectory import simulate
+from tests.topologies import ONE_MASS
+
+CLOCK = "clocks: {haptic: 10 ms}\n"
+
+
+def moved(tmp_path: Path, hand: str, duration: str = "1/2") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate a mass of 2 kg with damping 3 N s/m under a hand, sampled every 10 ms; return t, x, v."""
+    text = f"{ONE_MASS}{CLOCK}hands: {{hand: {{{hand}, flange: device}}}}\n"
+    path = tmp_path / "scene.yaml"
+    path.write_text(text, encoding="utf-8")
+    found = simulate(compile_topology(path), duration=Fraction(duration))
+    return found.time, found["user[1].device.x"], found["user[1].device.v"]
+
+
+def exact(force: object, corners: list[float], t: float) -> tuple[float, float]:
+    """Return x and v by quadrature in 30 digits."""
+    with mpmath.workdps(30):
+        edges = [mpmath.mpf(0), *(mpmath.mpf(c) for c in corners if c < t), mpmath.mpf(t)]
+        b, m = mpmath.mpf(3), mpmath.mpf(2)
+        v = mpmath.quad(lambda s: mpmath.exp(-b / m * (t - s)) / m * force(s), edges)  # type: ignore[operator]
+        x = mpmath.quad(lambda s: -mpmath.expm1(-b / m * (t - s)) / b * force(s), edges)  # type: ignore[operator]
+        return float(x), float(v)
+
+
+@pytest.mark.parametrize(
+    ("hand", "force", "corners"),
+    [
+        ("type: ConstantForce, force: 4 N", lambda s: 4, []),
+        ("type: StepForce, force: 4 N, start: 123.4 ms", lambda s: 4 * (s >= mpmath.mpf("0.1234")), [0.1234]),
+        ("type: StepForce, force: 4 N, start: 120 ms", lambda s: 4 * (s >= mpmath.mpf("0.12")), [0.12]),
+        (
+            "type: RampForce, force: 4 N, start: 101 ms, rise: 133 ms",
+            lambda s: 4 * max(0, min(1, (s - mpmath.mpf("0.101")) / mpmath.mpf("0.133"))),
+            [0.101, 0.234],
+        ),
+        (
+            "type: SineForce, force: 4 N, frequency: 47 Hz, phase: 1 rad",
+            lambda s: 4 * mpmath.sin(94 * mpmath.pi * s + 1),
+            [0.02 * i for i in range(25)],
+        ),
+    ],
+)
+def test_a_force_over_time_is_integrated_to_rounding(
+    tmp_path: Path, hand: str, force: object, corners: list[float]
+) -> None:
+    time, x, v = moved(tmp_path, hand)
+    for row in (5, 13, 24):
+        expected = exact(force, corners, float(time[row]))
+        assert (x[row], v[row]) == pytest.approx(expected, rel=2e-14, abs=1e-16)
+
+
+def test_a_table_is_integrated_row_by_row(tmp_path: Path) -> None:
+    (tmp_path / "push.csv").write_text("time [ms],force [N]\n3,0\n4.5,2\n17,-1\n33,5\n", encoding="utf-8")
+    times, forces = [0.003, 0.0045, 0.017, 0.033], [0.0, 2.0, -1.0, 5.0]
+    time, x, v = moved(tmp_path, "type: TableForce, force: push.csv", "1/10")
+
+    def force(s: mpmath.mpf) -> mpmath.mpf:
+        if s >= times[-1]:
+            return forces[-1]
+        for (a, f), (b, g) in zip(zip(times, forces), zip(times[1:], forces[1:])):  # noqa: B905 -- shifted
+            if a <= s < b:
+                return f + (g - f) * (s - a) / (mpmath.mpf(b) - a)
+        return forces[0]
+
+    for row in (1, 2, 3, 4, 10):
+        assert (x[row], v[row]) == pytest.approx(exact(force, times, float(time[row])), rel=1e-13, abs=1e-17)
+
+
+def test_a_pulse_within_one_interval_is_not_missed(tmp_path: Path) -> None:
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "tap.yaml").write_text(
+        "component: Tap\nabout: A short push.\nsource: a test\nconnectors: {flange: Flange}\nparameters:\n"
+        "  begin: {unit: s}\n  width: {unit: s}\n  force: {unit: N}\nequations:\n"
+        "  - flange.f = if time < begin then 0 else if time < begin + width then -force else 0\n",
+        encoding="utf-8",
+    )
+    tap = "{type: Tap, begin: 124.3 ms, width: 0.1 ms, force: 1 kN, flange: device}"
+    path = tmp_path / "scene.yaml"
+    path.write_text(f"{ONE_MASS}{CLOCK}library: ./parts\nhands: {{hand: {tap}}}\n", encoding="utf-8")
+    found = simulate(compile_topology(path), duration=Fraction(1, 2))
+    expected = exact(lambda s: 1000 * (0.1243 <= s < 0.1244), [0.1243, 0.1244], 0.5)
+    assert found["user[1].device.x"][-1] == pytest.approx(expected[0], rel=1e-11)

@@ -1,0 +1,41 @@
+"""Claims about `apc.runtime.margins`."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+from apc.runtime.analysis import analyze_modes
+from apc.runtime.margins import margins, margins_report
+from apc.runtime.parameters import Override, apply
+from tests.topologies import AVERAGE, compiled, replaced
+
+
+def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_margin_that_holds() -> None:
+    system = compiled(AVERAGE)
+    found = {one.parameter: one for one in margins(system).rows}
+    assert list(found) == [
+        *("contact.stiffness", "contact.damping", "coordination.stiffness", "coordination.damping"),
+        *("contact.delay", "coordination.delay", "lan.delay"),
+    ]
+    for name, one in found.items():
+        if one.value is None or one.error is None:
+            assert one.scanned > one.present
+            continue
+        assert one.value > one.present
+        assert one.error <= 1e-12 * one.value
+        for side, stable in ((-1e-9, True), (1e-9, False)):
+            value = Fraction(one.value * (1 + side))
+            assert analyze_modes(apply(system, [Override(name, None, value)])).stable is stable
+        assert one.factor == (one.value / one.present if one.present else None)
+
+
+def test_a_scene_that_is_not_stable_has_no_margins_and_says_so() -> None:
+    found = margins(compiled(replaced(AVERAGE, ("stiffness: 500 N/m", "stiffness: 2000 N/m"))))
+    assert found.rows == ()
+    assert "not stable" in margins_report(found)
+
+
+def test_the_table_fits_80_columns() -> None:
+    text = margins_report(margins(compiled(AVERAGE), pieces=1))
+    assert max(map(len, text.splitlines())) <= 80
+    assert "no limit up to" in text

@@ -1,0 +1,263 @@
+"""Stable regions of scenes: against the paper's limits, 50 digits, closed forms, and single analyses."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+import apc
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.runtime.analysis import analyze_modes
+from apc.runtime.boundary import relative_to
+from apc.runtime.curves import between
+from apc.runtime.parameters import Override, apply
+from apc.runtime.region import Region, parse_axes, region
+from tests.paper_limit import limit
+from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced
+
+X = "contact.stiffness=10 N/m:3000 N/m"
+Y = "coordination.stiffness=10 N/m:3000 N/m"
+NO_DELAY = ("delay: 1 ms", "delay: 0 ms")
+DAMPED = (
+    ("contact:      {type: SampledSpringDamper,", "contact: {type: SampledSpringDamper, damping: 2 N*s/m,"),
+    ("object: cube,", "object: cube, damping: 2 N*s/m,"),
+)
+
+
+@pytest.fixture(scope="module")
+def average() -> CompiledSystem:
+    return compiled(AVERAGE)
+
+
+@pytest.fixture(scope="module")
+def paper(average: CompiledSystem) -> Region:
+    return region(average, parse_axes(average, X, Y))
+
+
+def height(found: Region, x: float) -> float:
+    """Return the one y of the boundary over x, from the curves."""
+    curve = next(one for one in found.curves if np.ptp(np.sign(one.points[:, 0] - x)))
+    width = found.rectangle.width
+    knots = (curve.points - found.rectangle.low) / width
+    over = np.flatnonzero((curve.points[:-1, 0] - x) * (curve.points[1:, 0] - x) <= 0)[:1]
+    low, high = 0.0, 1.0
+    ends = (knots[over], knots[over + 1], curve.tangents[over], curve.tangents[over + 1])
+    side = np.sign(curve.points[over[0] + 1, 0] - x)
+    for _ in range(60):
+        middle = (low + high) / 2
+        place = found.rectangle.values(between(*ends, middle))[0]
+        low, high = (low, middle) if (place[0] - x) * side > 0 else (middle, high)
+    return float(place[1])
+
+
+def test_the_papers_boundary_is_right_to_one_part_in_a_billion(paper: Region) -> None:
+    [curve] = paper.curves
+    assert curve.error <= 1e-9
+    width, low = paper.rectangle.width, paper.rectangle.low
+    knots = (curve.points - low) / width
+    ends = (knots[:-1], knots[1:], curve.tangents[:-1], curve.tangents[1:])
+    normal = np.stack([curve.tangents[:-1, 1], -curve.tangents[:-1, 0]], axis=1)
+    for share in (0.0, 0.5):
+        places = between(*ends, share)[1::29]
+        values = paper.rectangle.values(places)
+        truth = [limit(float(x), float(y)) for x, y in values]
+        away = np.abs(values[:, 1] - truth) / width[1] * np.abs(normal[1::29, 1])
+        assert np.all(away <= curve.error * relative_to(places, normal[1::29], low / width))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        # reference cases ktmax_3user_nodelay_B0 and comp1_all_comm1, B = 0 and B = 2
+        (
+            replaced(AVERAGE, NO_DELAY, NO_DELAY, ("delay: 8 ms", "delay: 0 ms")),
+            {100: 2127.449, 2000: 2868.148},
+        ),
+        (AVERAGE, {100: 708.186, 1000: 1096.411}),
+        (MESH, {100: 354.093, 1000: 548.205}),
+        (replaced(AVERAGE, *DAMPED), {100: 1493.128, 1000: 2477.935}),
+        (replaced(MESH, *DAMPED), {100: 962.734, 1000: 1378.111}),
+    ],
+)
+def test_the_published_limits_lie_on_the_curves(text: str, expected: dict[float, float]) -> None:
+    system = compiled(text)
+    found = region(system, parse_axes(system, X, Y))
+    for stiffness, most in expected.items():
+        assert height(found, stiffness) == pytest.approx(most, rel=1e-6)
+
+
+def test_the_contact_alone_limits_the_region_where_nothing_coordinates(average: CompiledSystem) -> None:
+    axes = parse_axes(average, "contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:3000 N/m")
+    [curve] = region(average, axes).curves
+    ends = curve.points[[0, -1]]
+    assert ends[0] == pytest.approx([1865.424, 0], abs=1e-3)  # kcmax_contact_only_B0_comp1
+    assert ends[1, 0] == 0
+
+
+def test_a_mean_of_three_allows_twice_the_gain_of_their_sum_all_along_the_curve(paper: Region) -> None:
+    mesh = compiled(MESH)
+    half = "coordination.stiffness=5 N/m:1500 N/m"
+    other = region(mesh, parse_axes(mesh, X, half))
+    for stiffness in np.linspace(30, 1800, 25):
+        assert height(paper, stiffness) / height(other, stiffness) == pytest.approx(2, rel=3e-9)
+    assert paper.stable_area / other.stable_area == pytest.approx(2, rel=1e-9)
+
+
+def test_what_is_inside_is_what_an_analysis_calls_stable(paper: Region, average: CompiledSystem) -> None:
+    random = np.random.default_rng(7)
+    for x, y in random.uniform(10, 3000, (25, 2)).tolist():
+        overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((paper.x, x), (paper.y, y))]
+        assert paper.contains(x, y) == analyze_modes(apply(average, overrides)).stable
+    grid = np.linspace(10, 3000, 60)
+    share = paper.contains(*np.meshgrid(grid, grid)).mean()
+    assert share == pytest.approx(paper.stable_area / 2990**2, abs=0.02)
+
+
+def test_nearer_to_a_curve_than_its_error_the_eigenvalues_decide(paper: Region) -> None:
+    truth = limit(1000.0, 1096.4)
+    assert paper.contains(1000.0, truth * (1 - 1e-11)) is True
+    assert paper.contains(1000.0, truth * (1 + 1e-11)) is False
+
+
+def test_a_point_outside_the_rectangle_is_refused(paper: Region) -> None:
+    with pytest.raises(ApcError, match=r"E904 a point wants contact\.stiffness in 10 to 3000 N/m"):
+        paper.contains(5.0, 100.0)
+
+
+@pytest.mark.parametrize(("name", "sign"), [("island", 1), ("hole", -1)])
+def test_an_island_and_a_hole_made_by_construction_are_circles(name: str, sign: int) -> None:
+    system = compiled((ROOT / "tests" / "scenes" / f"{name}.yaml").read_text(encoding="utf-8"))
+    found = region(system, parse_axes(system, "u=0 N/m:1000 N/m", "v=0 N/m:1000 N/m"))
+    [curve] = found.curves
+    assert curve.closed
+    radii = np.hypot(*(curve.points - [620, 410]).T)
+    assert radii == pytest.approx(radii.mean(), rel=1e-8)
+    # The contact is stable up to 1865.424 N/m (kcmax_contact_only_B0_comp1).
+    top, steepness = (1500, 0.02) if name == "island" else (2100, 0.002)
+    assert radii.mean() == pytest.approx(np.sqrt(sign * (1865.424 - top) / steepness), rel=1e-6)
+    disc = np.pi * radii.mean() ** 2
+    assert found.stable_area == pytest.approx(disc if sign > 0 else 1e6 - disc, rel=1e-8)
+    assert found.contains(620, 410) is (sign > 0)
+    assert found.contains(5, 5) is (sign < 0)
+
+
+def test_everything_stable_and_nothing_stable_are_answers(average: CompiledSystem) -> None:
+    low = region(
+        average,
+        parse_axes(average, "contact.stiffness=10 N/m:50 N/m", "coordination.stiffness=10 N/m:50 N/m"),
+    )
+    high = region(
+        average,
+        parse_axes(average, "contact.stiffness=4 N/mm:5 N/mm", "coordination.stiffness=4 N/mm:5 N/mm"),
+    )
+    assert (low.curves, low.stable_area, low.contains(20, 20)) == ((), 1600.0, True)
+    assert (high.curves, high.stable_area, high.contains(4500, 4500)) == ((), 0.0, False)
+    assert "stable in the whole rectangle" in str(low)
+    assert "stable nowhere in the rectangle" in str(high)
+
+
+def test_a_mass_and_a_damping_can_be_axes(average: CompiledSystem) -> None:
+    axes = parse_axes(average, "device.mass=20 g:300 g", "device.damping=0.5 N*s/m:8 N*s/m")
+    found = region(average, axes)
+    assert found.curves
+    assert all(curve.error <= 1e-9 for curve in found.curves)
+    random = np.random.default_rng(3)
+    for x, y in zip(random.uniform(0.02, 0.3, 15), random.uniform(0.5, 8, 15), strict=True):
+        overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
+        assert found.contains(x, y) == analyze_modes(apply(average, overrides)).stable
+
+
+def test_over_a_delay_the_boundary_is_known_to_a_cell(average: CompiledSystem) -> None:
+    axes = parse_axes(average, "lan.delay=0 ms:16 ms", "coordination.stiffness=10 N/m:2000 N/m")
+    found = region(average, axes, cells=4)
+    assert found.curves
+    assert not any(curve.smooth for curve in found.curves)
+    assert "right to a cell only" in str(found)
+
+
+def test_the_document_is_the_contract(paper: Region) -> None:
+    document = json.loads(json.dumps(paper.to_dict(), allow_nan=False))
+    assert document["x"] == {"parameter": "contact.stiffness", "unit": "N/m", "range": [10.0, 3000.0]}
+    [curve] = document["boundary"]
+    assert curve["mode"] == "difference"
+    assert curve["closed"] is False
+    assert len(curve["points"][0]) == 2
+    low, high = curve["frequency_hz"]
+    assert 10 < low < high < 30
+    assert document["stable_area"] == paper.stable_area
+
+
+def test_the_frequency_is_that_of_the_mode_on_the_boundary(paper: Region, average: CompiledSystem) -> None:
+    [curve] = paper.curves
+    x, y = curve.knots[len(curve.knots) // 2]
+    overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((paper.x, x), (paper.y, y))]
+    mode = analyze_modes(apply(average, overrides)).modes[0]
+    low, high = curve.frequency_hz
+    assert low <= mode.frequency_hz * (1 + 1e-9)
+    assert mode.frequency_hz <= high * (1 + 1e-9)
+
+
+def test_the_points_are_a_table(paper: Region) -> None:
+    pytest.importorskip("pandas")
+    table = paper.to_dataframe()
+    assert list(table.columns[4:6]) == ["contact.stiffness [N/m]", "coordination.stiffness [N/m]"]
+    assert len(table) == len(paper.curves[0].points)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "message"),
+    [
+        (None, None, "--x: E622 gone is no parameter"),
+        ("contact.stifness=0 N/m:1 N/m", Y, "--x: E622 contact.stifness is no parameter"),
+        ("contact.stiffness", Y, "E901 --x wants PATH=LOW:HIGH, got contact.stiffness"),
+        ("contact.stiffness=1 N/m", Y, "E901 --x wants PATH=LOW:HIGH"),
+        (
+            "contact.stiffness=5 N/m:5 N/m",
+            Y,
+            "--x: E881 the range of contact.stiffness wants its",
+        ),
+        (
+            "contact.stiffness=9 N/m:5 N/m",
+            Y,
+            "--x: E881 the range of contact.stiffness wants its",
+        ),
+        ("contact.stiffness=1 kg:5 kg", Y, "--x: E204 contact.stiffness wants N/m"),
+        ("contact.stiffness=-1 N/m:5 N/m", Y, "--x: E624 contact.stiffness wants at least 0 N/m"),
+        ("peers=2:5", Y, "--x: E882 peers is a number of peers, which can't vary"),
+        ("user.count=2:5", Y, "--x: E882 user.count is a number of peers, which can't vary"),
+        ("haptic.period=1 ms:2 ms", Y, "E903 haptic.period can't be an axis"),
+        (Y, Y, "E902 coordination.stiffness is on both axes"),
+    ],
+)
+def test_an_axis_that_cannot_be_is_told(
+    average: CompiledSystem, x: str | None, y: str | None, message: str
+) -> None:
+    system = average
+    if x is None:
+        from dataclasses import replace
+
+        system = replace(average, region=tuple(replace(one, parameter="gone") for one in average.region))
+    with pytest.raises(ApcError) as caught:
+        parse_axes(system, x, y)
+    assert message in str(caught.value)
+
+
+def test_the_scenes_own_axes_are_taken_when_none_are_given(average: CompiledSystem) -> None:
+    x, y = parse_axes(average, None, None)
+    assert (x.label, x.low, x.high) == ("contact.stiffness", 0, 5000)
+    assert (y.label, y.low, y.high) == ("coordination.stiffness", 0, 1500)
+
+
+def test_a_scene_without_studies_asks_for_axes() -> None:
+    system = compiled(AVERAGE.partition("studies:")[0])
+    with pytest.raises(ApcError, match="E901 the scene has no studies: region:, so that --x must be given"):
+        parse_axes(system, None, None)
+
+
+def test_regions_of_saved_models_are_those_of_fresh_ones(average: CompiledSystem, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    apc.save(average, tmp_path / "model.apc")
+    assert apc.load(tmp_path / "model.apc").region == average.region

@@ -1,0 +1,106 @@
+"""Claims about `apc.runtime.sensitivity`."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from apc.runtime.analysis import analyze_modes
+from apc.runtime.balls import precision
+from apc.runtime.batch import BatchEvaluator
+from apc.runtime.evaluator import evaluator
+from apc.runtime.parameters import Free, Override, apply
+from apc.runtime.sensitivity import sensitivities, sensitivity_report
+from tests.topologies import AVERAGE, compiled, replaced
+
+
+def test_derivatives_are_central_differences_in_50_digits() -> None:
+    """Eigenvalues in balls at p ± h, h = 2^−20 p: what a difference cuts off is below 1e-12."""
+    import flint
+
+    from apc.runtime.balls import frame_balls, reduced_balls
+
+    system = compiled(replaced(AVERAGE, ("contact:      {", "contact:      {damping: 1 N*s/m, ")))
+    found = sensitivities(system)
+    ((value, _),) = found.active
+    for row in found.rows:
+        if not row.value:
+            continue
+        family = evaluator(system, [Free(row.parameter)])
+        assert isinstance(family, BatchEvaluator)
+        sizes = []
+        ends = row.value * (1 - 2.0**-20), row.value * (1 + 2.0**-20)
+        with precision(300):
+            for end in ends:
+                size = None
+                for closed, wiring in zip(family.exact_at([end]), family.wirings, strict=True):
+                    held, rest = wiring.held.tolist(), wiring.rest.tolist()
+                    reduced, _ = reduced_balls(frame_balls(closed), wiring.rigid.exact, held, rest)
+                    n = len(reduced)
+                    square = flint.arb_mat(n, n, [flint.arb(e) for e in reduced.ravel()])
+                    roots = flint.acb_mat(square.mid()).eig(algorithm="approx")
+                    near = min(roots, key=lambda r: abs(complex(r.mid()) - value))
+                    if abs(complex(near.mid()) - value) < 1e-6:
+                        size = abs(near)
+                assert size is not None
+                sizes.append(size)
+            rate = float(((sizes[1] - sizes[0]) / (ends[1] - ends[0])).mid())
+        assert row.derivative == pytest.approx(rate, rel=1e-9, abs=0)
+        assert abs(row.derivative - rate) <= row.error + 1e-10 * abs(rate)
+        assert row.relative == pytest.approx(rate * row.value, rel=1e-9)
+
+
+def test_everybody_s_value_reaches_those_who_have_none_of_their_own() -> None:
+    one = "  one: {count: 1, set: {device.mass: 0.14 kg}}\n"
+    text = replaced(AVERAGE, ("  user: {count: 3}", one + "  two: {count: 2}"))
+    own = replaced(AVERAGE, ("  user: {count: 3}", one + "  two: {count: 2, set: {device.mass: 0.1 kg}}"))
+    found = {row.parameter: row.derivative for row in sensitivities(compiled(text)).rows}
+    other = {row.parameter: row.derivative for row in sensitivities(compiled(own)).rows}
+    assert other["device.mass"] == 0.0
+    assert found["device.mass"] == pytest.approx(other["two.device.mass"], rel=1e-9)
+    assert found["one.device.mass"] == pytest.approx(other["one.device.mass"], rel=1e-9)
+
+
+def test_equal_groups_have_an_active_set_and_no_single_gradient() -> None:
+    """The difference modes of three equal users are two; changing one user alone moves them apart."""
+    text = replaced(
+        AVERAGE,
+        (
+            "  user: {count: 3}",
+            "  one: {count: 1, set: {contact.stiffness: 1000 N/m}}\n  two: {count: 2}",
+        ),
+    )
+    system = compiled(text)
+    found = sensitivities(system)
+    assert len(found.active) == 2
+    assert "share the radius" in found.note
+    rates = sorted(row.derivative for row in found.rows if row.parameter == "one.contact.stiffness")
+    step = 1e-3
+    radius = [
+        analyze_modes(
+            apply(system, [Override("contact.stiffness", "one", Fraction(1000.0 + side))])
+        ).spectral_radius
+        for side in (-step, 0.0, step)
+    ]
+    assert (radius[2] - radius[1]) / step == pytest.approx(max(rates), rel=1e-4, abs=1e-9)
+    assert (radius[1] - radius[0]) / step == pytest.approx(min(rates), rel=1e-4, abs=1e-9)
+
+
+def test_the_table_names_what_moves_most_in_80_columns() -> None:
+    found = sensitivities(compiled(AVERAGE))
+    text = sensitivity_report(found)
+    assert "device.damping" in text.splitlines()[1]
+    assert max(map(len, text.splitlines())) <= 80
+    relative = [abs(row.relative) for row in found.rows]
+    assert relative == sorted(relative, reverse=True)
+    assert not np.isnan(relative).any()
+
+
+def test_time_and_start_values_and_the_number_of_peers_are_left_out() -> None:
+    names = {row.parameter for row in sensitivities(compiled(AVERAGE)).rows}
+    assert names == {
+        *("device.mass", "device.damping", "cube.mass", "cube.damping"),
+        *("contact.stiffness", "contact.damping", "coordination.stiffness", "coordination.damping"),
+    }

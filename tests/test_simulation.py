@@ -1,0 +1,247 @@
+"""`simulation` (with `program` and `population`): the motion is the scene's, event by event."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import casadi
+import numpy as np
+import pytest
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.runtime.analysis import analyze_dense, lifted_groups
+from apc.runtime.modes import dense
+from apc.runtime.simulation import blocks, prepare
+from apc.runtime.trajectory import Trajectory, simulate
+from tests.eventwise import MS, Play, User, experiment, play
+from tests.sites import alone, edged, paper
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, told
+
+MOVED = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm], cube.x: [2 mm, 0 mm, 1 mm]}}"
+USERS = (User(0.01, cube_x=0.002), User(), User(-0.005, cube_x=0.001))
+
+
+def users(trajectory: Trajectory, n: int) -> np.ndarray:
+    """Return the rows as (rows, users, [x, v, x_O, v_O, F_C, F_T])."""
+    kept = [i for i, one in enumerate(trajectory.signals) if not one.local.endswith(" acting")]
+    return trajectory.values[:, kept].reshape(len(trajectory.time), n, 6)
+
+
+def by_hand(scene: Play, duration: Fraction) -> tuple[np.ndarray, np.ndarray]:
+    rows = np.array(play(scene, duration))
+    return rows[:, 0], rows[:, 1:].reshape(len(rows), len(scene.users), 6)
+
+
+def scene_file(name: str) -> str:
+    return (SCENES / name).read_text(encoding="utf-8").partition("\n")[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "operator", "tolerance"), [("average", "mean", 1e-11), ("mesh", "sum", 1e-9)]
+)
+def test_the_papers_experiment_is_what_stepping_it_by_hand_gives(
+    name: str, operator: str, tolerance: float
+) -> None:
+    # The mesh shakes: each contact made or lost multiplies the roundings.
+    found = simulate(compiled(scene_file(f"experiment-{name}.yaml")))
+    time, expected = by_hand(experiment(operator), Fraction(3))
+    expected[:, 0, 4] *= -1  # a push is positive on either side
+    assert (found.time == time).all()
+    assert np.abs(users(found, 3) - expected).max() < tolerance
+
+
+@pytest.mark.parametrize(
+    ("comp", "comm"),
+    [
+        (Fraction(0), Fraction(0)),  # heard at the very tick it is sent
+        (MS, 8 * MS),
+        (Fraction(3, 10) * MS, Fraction(5, 2) * MS),  # within the frame, between ticks
+        (Fraction(9, 4) * MS, 21 * MS),  # over more than one tick, and over frames
+        (9 * MS, Fraction(1, 1000) * MS),
+    ],
+)
+@pytest.mark.parametrize(("text", "operator"), [(AVERAGE, "mean"), (MESH, "sum")])
+def test_delays_of_any_length_act_when_they_should(
+    text: str, operator: str, comp: Fraction, comm: Fraction
+) -> None:
+    pairs = (("{count: 3}", MOVED), ("delay: 8 ms}", f"delay: {float(comm * 1000)!r} ms}}"))
+    text = replaced(text, *pairs).replace("delay: 1 ms", f"delay: {float(comp * 1000)!r} ms")
+    text = text.replace("stiffness: 500 N/m", "stiffness: 200 N/m, damping: 1 N*s/m")
+    text = text.replace("stiffness: 1000 N/m,", "stiffness: 300 N/m, damping: 0.5 N*s/m,")
+    found = simulate(compiled(text), duration=Fraction(1, 10))
+    scene = Play(USERS, operator, kc=300.0, bc=0.5, kt=200.0, bt=1.0, comp=comp, comm=comm)
+    time, expected = by_hand(scene, Fraction(1, 10))
+    assert (found.time == time).all()
+    assert np.abs(users(found, 3) - expected).max() < 1e-12
+
+
+def frame_powers(system: CompiledSystem, start: dict[str, float], frames: int) -> np.ndarray:
+    """Return the continuous states after each frame by powers of the analysis' map of all peers."""
+    closed = dense(*lifted_groups(system))
+    state = np.zeros(len(closed.names))
+    for site, value in start.items():
+        state[[name.endswith(site) for name in closed.names].index(True)] = value
+    rows = [state]
+    for _ in range(frames):
+        rows.append(closed.matrix @ rows[-1])
+    return np.array(rows)[:, list(closed.motion)]
+
+
+def test_ten_seconds_are_the_powers_of_the_analysis_frame_map() -> None:
+    text = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [10 mm, 0 mm, 0 mm]}}"))
+    system = compiled(text)
+    found = simulate(system, duration=Fraction(10), signals=["device.*", "cube.*"])
+    expected = frame_powers(system, {"device.x": 0.01}, 1250)
+    assert np.abs(found.values[::8] - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_an_unstable_motion_grows_by_the_spectral_radius() -> None:
+    text = replaced(AVERAGE, ("{count: 3}", MOVED), ("stiffness: 500 N/m", "stiffness: 1400 N/m"))
+    system = compiled(text)
+    radius = analyze_dense(system).spectral_radius
+    assert radius > 1.01
+    found = simulate(system, duration=Fraction(8), signals=["cube.v"])
+    size = np.linalg.norm(found.values[::8], axis=1)
+    growth = np.log(size[-100:].max() / size[-600:-500].max()) / 500
+    assert growth == pytest.approx(np.log(radius), rel=0.01)
+
+
+@pytest.mark.parametrize(("text", "added"), [(AVERAGE, 2.3), (MESH, 4.6)])
+@pytest.mark.parametrize("delay", ["0 ms", "1 ms"])
+def test_a_late_network_drags_a_moved_cube_as_the_viscosity_formula_says(
+    text: str, added: float, delay: str
+) -> None:
+    # K_eff ((T_n − T_c)/2 + T_d); with a computational delay of the whole force nothing changes.
+    hand = "hands: {hand: {type: ConstantForce, flange: device, force: 1 N}}\nstudies:"
+    text = replaced(text, ("stiffness: 500 N/m", "stiffness: 200 N/m"), ("studies:", hand))
+    text = text.replace("delay: 1 ms", f"delay: {delay}")
+    found = simulate(compiled(text), duration=Fraction(4), signals=["cube.x"])
+    speed = (found.values[-1] - found.values[-1 - 80]) / 0.080
+    assert 1 / speed - 10 == pytest.approx(np.full(3, added), rel=1e-3)
+
+
+def test_machine_code_and_the_virtual_machine_give_the_same() -> None:
+    system = compiled(scene_file("experiment-average.yaml"))
+    one, two = (simulate(system, jit=jit, duration=Fraction(1)) for jit in (True, False))
+    assert np.abs(one.values - two.values).max() < 1e-12
+
+
+def test_time_is_counted_and_rows_end_with_the_last_tick() -> None:
+    found = simulate(compiled(AVERAGE), duration=Fraction(123456, 10**7))
+    assert found.time.tolist() == [k / 1000 for k in range(13)]
+
+
+def test_a_clock_with_a_phase_ticks_late_and_the_first_row_is_at_time_0() -> None:
+    system = paper(haptic_phase=Fraction(1, 4000))
+    found = simulate(system, duration=3 * MS)
+    assert found.time.tolist() == [0.0, 0.00025, 0.00125, 0.00225]
+
+
+def test_what_is_remembered_starts_at_its_start_value_and_acts_as_zero_before_it_is_computed() -> None:
+    # y counts up by one a tick from its start value; what is held is y, late by one tick and a half.
+    system = alone(lambda x, u: 0 * x + u[0], lambda x, u, m: m + 1, memories=(0,), delay=Fraction(3, 2) * MS)
+    found = simulate(system, duration=5 * MS)
+    assert found["peer[1].f"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert found["peer[1].f acting"].tolist() == [0, 0, 1, 2, 3, 4]
+    expected = np.array([0, 0, 0.5, 2, 4.5, 8]) * 1e-3
+    assert found["peer[1].x"] == pytest.approx(expected, abs=1e-18)
+
+
+@pytest.mark.parametrize(
+    ("scene", "shared"),
+    [
+        ("ring-of-eight", "cube"),
+        ("star-lecture", "object"),
+        ("users-table", "cube"),
+        ("mixed-clocks", "cube"),
+    ],
+)
+def test_graphs_groups_and_clocks_follow_the_frame_map(scene: str, shared: str) -> None:
+    from apc.compiler.pipeline import compile_topology
+    from apc.runtime.parameters import apply, parse_override
+
+    system = compile_topology(SCENES / f"{scene}.yaml")
+    group = system.groups[0].name
+    start = system.groups[0].values or system.parameters
+    first = next((one.value for one in start if one.name == "device.x"), 0.0)
+    pushed = apply(system, [parse_override(system, f"{group}.device.x={first + 0.01!r} m")])
+    signals = ["device.*", f"{shared}.*"]
+    still = simulate(system, duration=Fraction(2, 5), signals=signals)
+    moved = simulate(pushed, duration=Fraction(2, 5), signals=signals)
+    found = moved.values - still.values  # what is constant, such as an arm's rest, cancels
+    closed = dense(*lifted_groups(system))
+    state = np.zeros(len(closed.names))
+    size = len(closed.motion) // system.peers
+    for peer in range(system.groups[0].count):
+        state[closed.motion[peer * size]] = 0.01
+    every = round(closed.frame_s * 1000)
+    for row in found[::every]:
+        assert np.abs(row - state[list(closed.motion)]).max() < 1e-13
+        state = closed.matrix @ state
+
+
+def test_recording_some_peers_changes_nothing_for_them() -> None:
+    system = compiled(replaced(AVERAGE, ("{count: 3}", MOVED)))
+    whole = simulate(system, duration=Fraction(1, 10))
+    part = simulate(system, duration=Fraction(1, 10), signals=["user[2].cube.x", "user[3].contact.f"])
+    assert [one.name for one in part.signals] == ["user[2].cube.x", "user[3].contact.f"]
+    for one in part.signals:
+        assert np.abs(part[one.name] - whole[one.name]).max() < 1e-15
+
+
+def test_a_long_run_comes_in_blocks_of_bounded_size() -> None:
+    system = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 100}")))
+    sizes = [block.values.nbytes for block in blocks(prepare(system, Fraction(2)))]
+    assert len(sizes) > 3
+    assert max(sizes) < 2**22
+
+
+def test_what_diverges_is_kept_while_it_is_finite() -> None:
+    text = replaced(AVERAGE, ("{count: 3}", MOVED), ("stiffness: 500 N/m", "stiffness: 50 kN/m"))
+    found = simulate(compiled(text), duration=Fraction(10))
+    assert np.isfinite(found.values).all()
+    assert found.summary.verdict == "diverges"
+    assert found.summary.stopped in [one.name for one in found.signals]
+    assert found.summary.stopped_at is not None
+    assert found.time[-1] == pytest.approx(found.summary.stopped_at - 0.001)
+    assert np.abs(found.values[-1]).max() > 1e290
+
+
+def test_what_cant_be_simulated_is_refused_by_name() -> None:
+    crossley = replaced(
+        AVERAGE,
+        ("SampledSpringDamper", "HuntCrossleyContact"),
+        ("1000 N/m, clock: haptic, delay: 1 ms", "1000 N/m^(3/2)"),
+    ).partition("studies:")[0]
+    assert told(simulate, compiled(AVERAGE)) == [
+        "three-users-average: E877 the scene says no duration. Write: experiment: {duration: 3 s}  "
+        '(or --duration "3 s")'
+    ]
+    with pytest.raises(ApcError, match=r"E870 the motion of device\.v, cube\.v is not linear .* contact:"):
+        simulate(compiled(crossley), duration=Fraction(1))
+    with pytest.raises(ApcError, match="E871 pull looks at each pair of peers"):
+        simulate(edged(paper()), duration=Fraction(1))
+    with pytest.raises(ApcError, match="E874"):
+        simulate(compiled(replaced(AVERAGE, ("count: 3", "count: 100000000"))), duration=Fraction(1))
+
+
+def test_a_loop_that_newtons_method_solves_at_each_tick_is_played() -> None:
+    # y = cos(x − y) at each tick; x' = −x + y, y held.
+    system = alone(lambda x, u: -x + u[0], lambda x, u, m: 0 * x)
+    [kind] = system.kinds
+    [partition] = kind.clocks
+    y, x = casadi.SX.sym("y"), casadi.SX.sym("x")
+    solver = casadi.rootfinder("loop", "newton", {"x": y, "p": x, "g": y - casadi.cos(x - y)})
+    arguments = [casadi.MX.sym(f"a{i}", *partition.tick.size_in(i)) for i in range(6)]
+    tick = casadi.Function("tick", arguments, [solver(x0=0.5, p=arguments[0])["x"]])
+    loops = replace(system, kinds=(replace(kind, clocks=(replace(partition, tick=tick),)),))
+    found = simulate(loops, duration=20 * MS)
+    x_now = 0.0
+    for row in range(20):
+        assert found["peer[1].x"][row] == pytest.approx(x_now, abs=1e-12)
+        y_now = 0.5
+        for _ in range(50):
+            y_now -= (y_now - np.cos(x_now - y_now)) / (1 - np.sin(x_now - y_now))
+        x_now = x_now * np.exp(-1e-3) - np.expm1(-1e-3) * y_now
