@@ -22,8 +22,11 @@ from apc.runtime.crowds import crowds
 from apc.runtime.determinant_spectrum import solve_crowds, solve_loops
 from apc.runtime.discretize import TOO_LARGE
 from apc.runtime.exchange import Exchange, build_exchange
+from apc.runtime.krylov import solve_sparse
+from apc.runtime.large_graph import large_graph, with_the_rest
 from apc.runtime.linearize import SiteJacobians, jacobians
 from apc.runtime.modes import Arrangement, Loop, arrange, close_loop, dense_loop
+from apc.runtime.packets import nominal_notes
 from apc.runtime.parameters import Numbers, resolve
 from apc.runtime.peers import (
     MOST_STATES,
@@ -37,7 +40,7 @@ from apc.runtime.peers import (
 from apc.runtime.schedule import ORDER, Schedule, build_schedules
 from apc.runtime.spectrum import Mode, Spectrum, solve_spectrum
 from apc.runtime.threads import single_threaded
-from apc.runtime.translation import count_translations
+from apc.runtime.translation import common_translation, count_translations
 from apc.runtime.trouble import finite_equations
 
 METHODS = ("auto", "modes", "dense", "determinant", "krylov")
@@ -45,6 +48,12 @@ METHODS = ("auto", "modes", "dense", "determinant", "krylov")
 # Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
 # says more.
 FEW_STATES = 200
+
+# Up to so many peers a complete graph is written out as arcs.
+MOST_FULL = 500
+
+# Equal peers on a graph without a closed form: of so many, its eigenvalues are not computed.
+MANY_PEERS = 1500
 
 # From so many packets on their way on, leaving them out of the state is quicker.
 LONG_LINES = 120
@@ -181,7 +190,8 @@ def analyze(
             if not reason and (method == "krylov" or _many(system, prepared, numbers, exchange)):
                 return _analyze_crowds(system, prepared, numbers, exchange, method)
         groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
-        found = _arranged(system, groups, exchange, method)
+        large = large_graph(groups, exchange) if method in ("auto", "modes") else None
+        found = large.arrangement if large else _arranged(system, groups, exchange, method)
         if found.method == "determinant":
             spectrum = solve_loops(found.loops)
         else:
@@ -189,6 +199,8 @@ def analyze(
             if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
                 raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
             spectrum = solve_spectrum(closed, certify=certify)
+        if large:
+            spectrum = with_the_rest(spectrum, large)
         states = max(states_of(group.schedule, group.jacobians) for group in groups)
         affine = all(group.site.affine for group in groups)
         return _answer(system, exchange, prepared, found.method, spectrum, states, affine, found.notes)
@@ -218,7 +230,7 @@ def _answer(
         rigid_modes=spectrum.rigid_modes,
         modes=spectrum.modes,
         linearized=not affine,
-        notes=(*notes, *spectrum.notes),
+        notes=(*notes, *spectrum.notes, *nominal_notes(system)),
         proof=spectrum.proof,
     )
 
@@ -241,6 +253,12 @@ def _not_crowds(system: CompiledSystem, prepared: Prepared) -> str:
 
 def _many(system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange) -> bool:
     """Say whether so many peers differ that they are not worth an object each."""
+    closed_form = all(
+        exchange.links[way.link].graph.shape in ("complete", "ring", "star")
+        for way in used_ways(prepared.schedules)
+    )
+    if not closed_form and exchange.peers > MANY_PEERS:
+        return True
     states = sum(
         len(rows) * len(system.kinds[group.kind].states)
         for rows, group in zip(numbers.parameters, system.groups, strict=True)
@@ -294,12 +312,28 @@ def _analyze_crowds(
     listed = crowds(system, prepared.jacobians, prepared.schedules, numbers)
     different = sum(len(crowd.parameters) for crowd in listed)
     states = max(states_of(crowd.schedule, crowd.jacobians) for crowd in listed)
-    rigid = count_translations(listed, exchange)
-    notes = [f"{different:,} peers of different numbers, by one determinant of what is sent in a frame"]
-    if rigid is None:
-        notes.append("the first peer moves freely in a way that not all others do: left open")
-    spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
+    if method == "krylov":
+        _refuse_full_graphs(system, exchange, prepared)
+        motions = common_translation(listed, exchange)
+        notes = [f"{different:,} peers of different numbers, as one sparse matrix"]
+        if motions is None:
+            notes.append("peers move freely one by one, or the first as not all others do: left open")
+        spectrum = solve_sparse(listed, exchange, motions)
+    else:
+        rigid = count_translations(listed, exchange)
+        notes = [f"{different:,} peers of different numbers, by one determinant of what is sent in a frame"]
+        if rigid is None:
+            notes.append("the first peer moves freely in a way that not all others do: left open")
+        spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
     return _answer(system, exchange, prepared, method, spectrum, states, True, tuple(notes))
+
+
+def _refuse_full_graphs(system: CompiledSystem, exchange: Exchange, prepared: Prepared) -> None:
+    """Refuse complete graphs of so many peers that their arcs are no sparse matrix."""
+    full = [way.link for way in used_ways(prepared.schedules) if exchange.is_complete(way.link)]
+    if full and exchange.peers > MOST_FULL:
+        reason = f"all of {exchange.peers:,} peers hear each other over {full[0]}: nothing is sparse"
+        raise _cannot(system, "krylov", reason)
 
 
 def lifted_groups(
@@ -329,6 +363,18 @@ def _scheduled(
     """Add the schedules of these timings to the Jacobians."""
     schedules = build_schedules(system, timings, [site.pattern for site in built], order=order)
     return Prepared(built, schedules, timings, order)
+
+
+def analyze_modes(
+    system: CompiledSystem, *, prepared: Prepared | None = None, certify: bool = False
+) -> Analysis:
+    return analyze(system, prepared=prepared, certify=certify)
+
+
+def analyze_dense(
+    system: CompiledSystem, *, prepared: Prepared | None = None, certify: bool = False
+) -> Analysis:
+    return analyze(system, method="dense", prepared=prepared, certify=certify)
 
 
 def analyze_modes(

@@ -51,7 +51,8 @@ class Answer:
         """Return the answer as plain data, ready for JSON: the analysis with more keys."""
         found = self.analysis.to_dict() | {
             "sensitivities": self.sensitivities.to_dict(),
-            "margins": self.margins.to_dict(),
+            "margins": [one.to_dict() for one in self.margins.rows],
+            "margins_note": self.margins.note,
             "contact_modes": self.contact_modes.to_dict() if self.contact_modes else None,
             "warnings": [self.conventions.warning] if self.conventions.warning else [],
         }

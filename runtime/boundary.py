@@ -172,13 +172,16 @@ def _apart(knots: _Knots, intervals: Integers) -> Integers:
     apart = np.linalg.norm(knots.points[b] - knots.points[a], axis=1) > COINCIDENT
     meeting = intervals[~apart]
     knots.last[meeting[~_on_one_branch(knots, meeting), 0]] = True
-    return intervals[apart]
+    left: Integers = intervals[apart]
+    return left
 
 
 def _tangents(gradient: Floats) -> Floats:
     """Return unit tangents (k, 2) with the side towards which log|λ| falls on their left."""
     turned = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1)
-    return turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    length = np.linalg.norm(turned, axis=1, keepdims=True)
+    unit: Floats = turned / np.maximum(length, np.finfo(np.float64).tiny)
+    return unit
 
 
 def _cross(family: Family, stable: Floats, unstable: Floats, growth: Floats) -> tuple[Floats, Pairs]:
@@ -245,7 +248,8 @@ def _quadratic_root(growth: Floats, slope: Floats) -> Floats:
     # The root next to t = 1, in the form that cancels nothing.
     found = 1 - 2 * high / np.where(slope + root > 0, slope + root, np.inf)
     fits = (found > 0) & (found < 1) & (slope > 0)
-    return np.where(fits, found, low / (low - high))
+    guess: Floats = np.where(fits, found, low / (low - high))
+    return guess
 
 
 def _put(pairs: Pairs, places: Integers, new: Pairs) -> None:
@@ -268,7 +272,7 @@ def _rounded(points: Floats, gradient: Floats) -> Floats:
 
 def _clear(family: Family, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
     """Say of each point of the boundary whether no other eigenvalue has left the unit circle there."""
-    clear = np.isfinite(points).all(axis=1)
+    clear: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
     if clear.any():
         top = log_magnitudes(family, _inside(points[clear]), 1)[:, 0]
         clear[clear] = top <= _rounded(points[clear], pairs.gradient[clear])

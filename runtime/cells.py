@@ -120,7 +120,9 @@ class _Lattice:
 
     def point(self, nodes: Iterable[Node]) -> Floats:
         """Return where nodes are in the unit square (k, 2), a hair inside its edges."""
-        return np.clip(np.array(list(nodes), np.float64) / self.side, INSIDE_RIM, 1 - INSIDE_RIM)
+        points = np.array(list(nodes), np.float64) / self.side
+        inside: Floats = np.clip(points, INSIDE_RIM, 1 - INSIDE_RIM)
+        return inside
 
     def sample(self, nodes: Iterable[Node]) -> Floats:
         """Return the values at nodes (k, m), computing those that are new in one batch."""
@@ -195,7 +197,7 @@ def _suspect(values: Floats) -> NDArray[np.bool_]:
     span = top.max(axis=0) - top.min(axis=0)
     crossed = (top[0] < 0) == (top[3] < 0)
     crossed &= ((top[1] < 0) == (top[2] < 0)) & ((top[0] < 0) != (top[1] < 0))
-    suspect = ~stable & ~unstable & (crossed | (first > 2 * span))
+    suspect: NDArray[np.bool_] = ~stable & ~unstable & (crossed | (first > 2 * span))
     # At most 1/8 of both second differences: the envelope is looked at only where that reaches zero.
     rising = stable & (corners.max(axis=0) + bend / 8 >= 0).any(axis=-1)
     sinking = unstable & (top.min(axis=0) - first / 8 <= 0)

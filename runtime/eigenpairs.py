@@ -87,7 +87,8 @@ def log_magnitudes(family: Family, points: Floats, count: int) -> Floats:
     """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""
     found = np.hstack([np.abs(np.linalg.eigvals(one)) for one in family.matrices(points)])
     largest = -np.sort(-found, axis=1)[:, :count]
-    return np.log(np.maximum(largest, LEAST_MAGNITUDE))
+    logarithms: Floats = np.log(np.maximum(largest, LEAST_MAGNITUDE))
+    return logarithms
 
 
 def leading(family: Family, points: Floats) -> Pairs:

@@ -134,7 +134,7 @@ def _enclose(
             if len(cluster) > 1:
                 rows[cluster] = np.linalg.qr(rows[cluster].T)[0].T
         held = independent_places(rows)
-        free = np.setdiff1d(free, held)
+        free = np.delete(free, held)
         try:
             basis[np.ix_(held, np.arange(large, n))] = -np.linalg.solve(rows[:, held], rows[:, free])
         except np.linalg.LinAlgError:
@@ -208,7 +208,7 @@ def _close(values: Complexes) -> list[NDArray[np.intp]]:
     """Return the places of eigenvalues that are nearly equal, chain by chain."""
     near = np.abs(values[:, None] - values[None, :]) <= CLOSE * np.abs(values)[:, None]
     label = _connected(near)
-    return [np.flatnonzero(label == one) for one in np.unique(label)]
+    return [np.flatnonzero(label == one) for one in sorted(set(label.tolist()))]
 
 
 def _connected(touching: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -233,5 +233,5 @@ def discs(values: Complexes, centres: Complexes, radii: Floats) -> Enclosure:
     reach = np.abs(values[:, None] - centres[None, :]) + radii[None, :]
     errors = np.where(label[:, None] == label[None, :], reach, 0.0).max(axis=1)
     inner = np.abs(centres) - radii
-    low = max(0.0, *(float(inner[label == one].min()) for one in np.unique(label)))
+    low = max(0.0, *(float(inner[label == one].min()) for one in set(label.tolist())))
     return Enclosure(low, float((np.abs(centres) + radii).max()), errors)

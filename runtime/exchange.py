@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem` and its timings.
 Gives: `Exchange`, `build_exchange`, `arcs`, `check_mean`; `GraphMode`, `Surd`, `graph_modes`,
-`ring_mode`.
+`ring_mode`, `ring_values`.
 Guarantees: a complete graph, a ring and a star cost no more than their arcs; an eigenvalue that equal row
 sums make exact is exact, any other comes with a bound on its error.
 Does not: know what is sent, or when (see `schedule`).
@@ -233,6 +233,11 @@ def ring_mode(k: int, n: int, *, mean: bool) -> GraphMode:
     times = 1 if 2 * k in (0, n) else 2
     value = 2 * scale * _cosine(k, n)
     return GraphMode(value, Fraction(0), times, _cosine_doubt(k, n), k == 0, Surd(2 * scale, Fraction(k, n)))
+
+
+def ring_values(n: int, *, mean: bool) -> Floats:
+    """Return the values of all `ring_mode`s (n // 2 + 1,), to rounding."""
+    return np.cos(2 * np.pi * np.arange(n // 2 + 1) / n) * (1.0 if mean else 2.0)
 
 
 def _cosine(k: int, n: int) -> Fraction:

@@ -42,6 +42,9 @@ ALIKE = 1e-9
 # How much the leading eigenvalue's row is made to outweigh, against the others', in turn.
 EMPHASES = (1.0, 30.0, 1000.0)
 
+# Roundings charged to a graph's eigenvalue: those of a cosine's argument, up to π, twice, and its own.
+GRAPH_ROUNDINGS = 32
+
 # Systems that are solved, the largest by estimate; matrices looked at together.
 MOST_SOLVED, TOGETHER = 64, 4096
 
@@ -146,7 +149,9 @@ class _Family:
 
     def below(self, low: Floats, high: Floats, bound: float) -> NDArray[np.bool_]:
         """Say of intervals of graph eigenvalues whether all radii in them are proved below a bound."""
-        middle, half = (low + high) / 2, (high - low) / 2 + 2 * UNIT * np.maximum(np.abs(low), np.abs(high))
+        # The values themselves are rounded, a cosine of an angle up to π a few times.
+        rounding = GRAPH_ROUNDINGS * UNIT * np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)
+        middle, half = (low + high) / 2, (high - low) / 2 + rounding
         matrices = self.still + middle[:, None, None] * self.slope
         values, vectors = (part.astype(np.complex128) for part in np.linalg.eig(matrices))
         order = np.argsort(-np.abs(values), axis=1, kind="stable")

@@ -1,7 +1,8 @@
 """Where an equation is not smooth: what changes sign there.
 
 Takes: CasADi expressions. Gives: `guards_of`.
-Guarantees: every comparison, max, min, abs, sign, floor and ceil that hangs on what moves is found, each once.
+Guarantees: every comparison, max, min, abs, sign, floor and ceil that hangs on what moves is
+found, each once.
 Does not: find when (see `forcing`, `integrate`).
 """
 

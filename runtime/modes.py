@@ -164,7 +164,7 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
     if not graphs:
         return Arrangement("modes", complete_loops(groups, exchange), ())
     named = " and ".join(f"{link} ({exchange.links[link].graph.shape})" for link in graphs)
-    reason = f"the peers on {named} differ" if len(groups) > 1 else _no_common_graph(ways, exchange)
+    reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(ways, exchange)
     if not reason:
         scale = graph_scale(groups[0], ways, exchange)
         found = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
@@ -310,8 +310,8 @@ def _couple(
     return coupling
 
 
-def _no_common_graph(ways: Sequence[Way], exchange: Exchange) -> str:
-    """Return why the links' W have not the same eigenvectors, or "" if they are one graph."""
+def common_graph(ways: Sequence[Way], exchange: Exchange) -> str:
+    """Return "" if the links' W are one graph, or else why they have not the same eigenvectors."""
     links = list(dict.fromkeys(way.link for way in ways))
     shapes = {exchange.links[link].graph.shape for link in links}
     listed = [exchange.links[link].graph for link in links]

@@ -26,12 +26,14 @@ import casadi
 OPTIONS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
 COMPILERS = ("cc", "gcc", "clang")
 PATIENCE = 120.0  # seconds; a frame's straight code takes a fraction of one
+# Kinds of functions that are written as C whole; solvers are calls into libraries.
+STRAIGHT = ("SXFunction", "MXFunction", "Map", "MapSum")
 # More instructions than this in one function: optimizing straight code costs more than linear time.
 MOST_INSTRUCTIONS = 100_000
 
 
 def native(functions: Sequence[Any]) -> tuple[Any, ...]:
-    """Return the functions in machine code, or as they are if that can't be had.
+    """Return the functions in machine code, each as it is if that can't be had.
 
     Parameters
     ----------
@@ -39,17 +41,18 @@ def native(functions: Sequence[Any]) -> tuple[Any, ...]:
         CasADi functions, of any names.
     """
     found = compiler()
-    if found is None or not functions or not all(_is_worth_it(one) for one in functions):
-        return tuple(functions)
-    # One library holds them all, each under a name of its own.
-    named = [_renamed(one, f"kernel{place}") for place, one in enumerate(functions)]
-    library = _library(named, found)
+    # One library holds all that can be compiled, each under a name of its own.
+    named = {
+        place: _renamed(one, f"kernel{place}") for place, one in enumerate(functions) if _is_worth_it(one)
+    }
+    library = _library(list(named.values()), found) if found is not None and named else None
     if library is None:
         return tuple(functions)
     try:
-        return tuple(casadi.external(one.name(), str(library)) for one in named)
+        ready = {place: casadi.external(one.name(), str(library)) for place, one in named.items()}
     except RuntimeError:  # it can't be loaded: of another machine, or the folder forbids it
         return tuple(functions)
+    return tuple(ready.get(place, one) for place, one in enumerate(functions))
 
 
 @functools.cache
@@ -79,11 +82,15 @@ def cache_folder() -> Path:
 
 
 def _is_worth_it(function: Any) -> bool:
-    return bool(function.is_a("SXFunction")) and function.n_instructions() <= MOST_INSTRUCTIONS
+    """Say whether a function, with all that it calls, is straight code that is not too long."""
+    called = [function, *function.find_functions(-1)]
+    if not all(one.class_name() in STRAIGHT for one in called):
+        return False
+    return sum(one.n_instructions() for one in called if one.class_name() in STRAIGHT[:2]) <= MOST_INSTRUCTIONS
 
 
 def _renamed(function: Any, name: str) -> Any:
-    arguments = function.sx_in()
+    arguments = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
     return casadi.Function(name, arguments, function.call(arguments), function.name_in(), function.name_out())
 
 

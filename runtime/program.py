@@ -1,6 +1,6 @@
 """One frame of one site as compiled steps: the schedule's events written out with the kind's own functions.
 
-Takes: a `Kind`, its `Rates`, its `Schedule`, the signals to record.
+Takes: a `Kind`, its `Rates`, its `Flow` if it has one, its `Schedule`, the signals to record.
 Gives: `LocalSignal`, `local_signals`, `Layout`, `Segment`, `Program`, `build_program`.
 Guarantees: the tick functions themselves are evaluated, not their slopes; a value acts and is heard exactly
 when the schedule says; what was never computed acts as zero.
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
+from apc.runtime.flow import Flow
 from apc.runtime.propagate import Rates, Transitions
 from apc.runtime.schedule import Act, Event, Propagate, Schedule, Send, Sent, Tick, Value
 
@@ -167,7 +168,11 @@ def _late_holds(schedule: Schedule) -> set[int]:
 
 
 def build_program(
-    rates: Rates, schedule: Schedule, recorded: Sequence[LocalSignal], cuts: Sequence[int]
+    rates: Rates,
+    schedule: Schedule,
+    recorded: Sequence[LocalSignal],
+    cuts: Sequence[int],
+    flow: Flow | None = None,
 ) -> Program:
     """Write a site's frame.
 
@@ -181,8 +186,10 @@ def build_program(
         The signals to record at every mark of the schedule.
     cuts
         The instants, in quanta, after whose sends packets are exchanged within the frame.
+    flow
+        What moves the states that have no exact transition.
     """
-    writer = _Writer(rates, schedule, tuple(recorded))
+    writer = _Writer(rates, schedule, tuple(recorded), flow)
     segments = tuple(writer.segment(events, last) for events, last in _cut(schedule.events, cuts))
     return Program(
         kind=rates.kind,
@@ -221,8 +228,10 @@ def _cut(events: Sequence[Event], cuts: Sequence[int]) -> Iterator[tuple[list[tu
 class _Writer:
     """Writes one segment after the other; what is known at the end of one is the carry into the next."""
 
-    def __init__(self, rates: Rates, schedule: Schedule, recorded: tuple[LocalSignal, ...]) -> None:
-        self.rates, self.schedule, self.recorded = rates, schedule, recorded
+    def __init__(
+        self, rates: Rates, schedule: Schedule, recorded: tuple[LocalSignal, ...], flow: Flow | None
+    ) -> None:
+        self.rates, self.schedule, self.recorded, self.flow = rates, schedule, recorded, flow
         self.kind = kind = rates.kind
         self.functions = [
             kind.derivative,
@@ -230,10 +239,11 @@ class _Writer:
             *(one.send for one in kind.sends),
             *([kind.ports.port] if kind.ports else []),
         ]
-        plain = all(function.is_a("SXFunction") for function in self.functions)
+        plain = flow is None and all(function.is_a("SXFunction") for function in self.functions)
         self.type_: Any = casadi.SX if plain else casadi.MX
         lengths = [event.duration for event in schedule.events if isinstance(event, Propagate)]
         self.durations = tuple(sorted(set(lengths)))
+        self.moves = [flow.over(length * schedule.quantum) for length in self.durations] if flow else []
         self.intervals: list[tuple[int, int]] = []
         outputs = tuple((p, o) for p in _ticking(schedule) for o in range(len(kind.clocks[p].outputs)))
         parts = tuple(dict.fromkeys(kind.ports.parts)) if kind.ports else ()
@@ -365,7 +375,7 @@ class _Writer:
         return everything[sending.channels.index(sent.channel)]
 
     def _propagate(self, now: int, place: int) -> None:
-        """Move x by one transition, and add up the work that held values do meanwhile."""
+        """Move x over one interval, and add up the work that held values do meanwhile."""
         rates, type_ = self.rates, self.type_
         e_size, f_size, g_size = int(rates.e.sum()), int(rates.f.sum()), int(rates.g.sum())
         at = len(self.kind.parameters) + place * (e_size + f_size + g_size)
@@ -382,6 +392,11 @@ class _Writer:
             for row in np.flatnonzero(rates.g):
                 after[row] = after[row] + impulses[self.taken]
                 self.taken += 1
+        if self.flow is not None:
+            moved = [before[row] for row in self.flow.rows]
+            moved = self.moves[place](_column(type_, moved), u, self._p(), self._time(now))
+            for i, row in enumerate(self.flow.rows):
+                after[row] = moved[i]
         self.intervals.append((now, place))
         ports = self.kind.ports
         if ports:

@@ -1,9 +1,9 @@
 """What a site's continuous states do from event to event: the exact transition of a linear partition.
 
-Takes: a `Kind` and parameter vectors. Gives: `Rates`, `rates`, `Transitions`, `transitions`.
+Takes: a `Kind` and parameter vectors.
+Gives: `Rates`, `rates`, `Transitions`, `transitions`, `shaken`; `nonlinear_rows`.
 Guarantees: no step size; every entry of a transition is right to the last digit but one.
-Does not: integrate a nonlinear partition: it is refused by name (whoever integrates it takes its place in
-`program`, where an interval is passed); or know what changes with time alone (see `forcing`).
+Does not: integrate what is not linear (see `flow`), or know what changes with time alone (see `forcing`).
 
     dx/dt = A x + B u + g(t)        x(t + T) = E x(t) + F u + c,  u held
 """
@@ -34,7 +34,8 @@ class Rates:
 
     `matrices(p)` is [A B g] (n_x, n_x + n_u + 1), column-major, with the part of g that does not change;
     `timed` says that g changes with time: then g is zero there, and `rate(p, t)` gives it. `e`, `f` and `g`
-    are where E, F and c can differ from zero, whatever the numbers.
+    are where E, F and c can differ from zero, whatever the numbers. States that are moved otherwise have
+    no entries.
     """
 
     kind: Kind
@@ -54,39 +55,98 @@ class Transitions:
     a: NDArray[Any]
 
 
-def rates(kind: Kind) -> Rates:
-    """Take the continuous equations of a kind apart.
+def nonlinear_rows(kind: Kind) -> tuple[int, ...]:
+    """Return the states whose equations are not linear, and all that equations tie to them."""
+    moving, p, t, speed = _symbols(kind)
+    slopes = casadi.jacobian(speed, moving)
+    curved = [row for row in range(slopes.size1()) if _is_curved(slopes[row, :], moving, t)]
+    if not curved:
+        return ()
+    n_x = len(kind.states)
+    tied = _structure(slopes)[:, :n_x]
+    together = _closure(tied | tied.T)
+    return tuple(np.flatnonzero(together[:, curved].any(axis=1)).tolist())
+
+
+def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
+    """Take the linear continuous equations of a kind apart.
+
+    Parameters
+    ----------
+    kind
+        The kind.
+    moved
+        States that are moved otherwise, with all that equations tie to them.
 
     Raises
     ------
     ApcError
-        E870 they are not linear.
+        E870 the others' equations are not linear.
     """
-    type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
-    x, u = type_.sym("x", len(kind.states)), type_.sym("u", len(kind.holds))
-    p, t = type_.sym("p", len(kind.parameters)), type_.sym("t")
-    moving = casadi.vertcat(x, u)
-    speed = kind.derivative(x, u, p, t)
+    moving, p, t, speed = _symbols(kind)
+    n_x, rest = len(kind.states), sorted(set(range(len(kind.states))) - set(moved))
     slopes = casadi.jacobian(speed, moving)
-    if slopes.nnz() and casadi.depends_on(slopes, casadi.vertcat(moving, t)):
+    if rest and _is_curved(slopes[rest, :], moving, t):
         raise _nonlinear(kind, slopes, moving, p, t)
-    still = casadi.densify(kind.derivative(type_.zeros(*x.shape), type_.zeros(*u.shape), p, t))
+    type_ = type(moving)
+    at_rest = kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
+    kept = casadi.diag(casadi.DM([float(row in rest) for row in range(n_x)]))
+    # A product with a structural zero is one, whatever an equation gives at the origin.
+    still = casadi.densify(casadi.sparsify(kept) @ casadi.sparsify(at_rest))
+    slopes = casadi.sparsify(kept) @ slopes
     timed = bool(still.numel() and casadi.depends_on(still, t))
     constant = type_.zeros(*still.shape) if timed else still
     structure = _structure(slopes)
-    n_x = len(kind.states)
     reach = _closure(structure[:, :n_x])
     pushed = np.ones(n_x, dtype=bool) if type_ is casadi.MX else _structure(casadi.sparsify(still))[:, 0]
     flat = casadi.vec(casadi.horzcat(casadi.densify(slopes), constant))
+    own: Pattern = np.isin(np.arange(n_x), rest)
     return Rates(
         kind=kind,
         matrices=casadi.Function("matrices", [p], [flat]),
         rate=casadi.Function("rate", [p, t], [still]),
         timed=timed,
-        e=reach,
-        f=(reach.astype(int) @ structure[:, n_x:].astype(int)) > 0,
-        g=(reach.astype(int) @ pushed.astype(int)) > 0,
+        e=reach & own[:, None],
+        f=((reach.astype(int) @ structure[:, n_x:].astype(int)) > 0) & own[:, None],
+        g=((reach.astype(int) @ pushed.astype(int)) > 0) & own,
     )
+
+
+def shaken(exact: Transitions, seed: int) -> Transitions:
+    """Return the same transitions with every number off by one rounding, up or down by chance.
+
+    Parameters
+    ----------
+    exact
+        The transitions.
+    seed
+        Of the chance.
+    """
+    chance = np.random.default_rng(seed)
+
+    def moved(matrix: Floats) -> Floats:
+        towards = np.where(chance.random(matrix.shape) < 0.5, -np.inf, np.inf)
+        return np.where(matrix == 0, 0.0, np.nextafter(matrix, towards))
+
+    return Transitions(tuple(moved(one) for one in exact.matrices), exact.a)
+
+
+def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:
+    """Return (x, u), p and t as symbols, and the rates of change."""
+    type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
+    x, u = type_.sym("x", len(kind.states)), type_.sym("u", len(kind.holds))
+    p, t = type_.sym("p", len(kind.parameters)), type_.sym("t")
+    speed = kind.derivative(x, u, p, t)
+    if type_ is casadi.SX:
+        return casadi.vertcat(x, u), p, t, speed
+    # A derivative is taken with respect to a symbol, which a column of two is not.
+    both = type_.sym("moving", x.numel() + u.numel())
+    speed = kind.derivative(both[: x.numel()], both[x.numel() :], p, t)
+    return both, p, t, speed
+
+
+def _is_curved(slopes: Any, moving: Any, t: Any) -> bool:
+    return bool(slopes.nnz() and casadi.depends_on(slopes, casadi.vertcat(moving, t)))
 
 
 def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fraction]) -> Transitions:

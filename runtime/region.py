@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.analysis import Prepared, prepare
+from apc.runtime.analysis import Prepared, analyze, prepare
 from apc.runtime.batch import BatchEvaluator, matrix_errors
 from apc.runtime.boundary import Arc, relative_to, trace
 from apc.runtime.cells import Survey, survey
@@ -37,7 +37,6 @@ from apc.runtime.trouble import finite_equations
 
 if TYPE_CHECKING:
     import pandas
-    from matplotlib.axes import Axes
 
 Floats = NDArray[np.float64]
 
@@ -198,8 +197,8 @@ class Region:
 
         return pandas.DataFrame(list(region_rows(self)), columns=headings(self))
 
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the region into `ax`, or into a figure of its own (needs matplotlib); return the axes."""
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the region into a matplotlib Axes, or a figure of its own; return the Axes."""
         from apc.runtime.region_figure import draw_region
 
         return draw_region(self, ax)
@@ -513,8 +512,6 @@ def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], ND
 
 def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
     """Say of parameter values (k, 2) whether they are stable, each by an analysis of its own."""
-    from apc.runtime.analysis import analyze_modes
-
     prepared = prepare(found.system)
     decided = []
     for value in values.tolist():
@@ -522,7 +519,7 @@ def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
             Override(axis.name, axis.group, Fraction(number))
             for axis, number in zip((found.x, found.y), value, strict=True)
         ]
-        answer = analyze_modes(apply(found.system, overrides), prepared=prepared)
+        answer = analyze(apply(found.system, overrides), prepared=prepared)
         decided.append(bool(answer.stable))
     return np.array(decided, dtype=bool)
 

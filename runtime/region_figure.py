@@ -35,7 +35,7 @@ STYLES = (
 OVERLAY_LINES = ((0, (1, 2)), (0, (3, 1, 1, 1, 1, 1)), (0, (8, 3)))
 HATCH = 0.25  # how dark hatches are: curves and words must stand out
 PANEL = 3.5  # inches: the side of a panel, one column of a paper
-PIECES = 4  # straight lines drawn an interval of a curve
+DRAWN = 240  # straight lines a curve is drawn by at least: fewer show their corners
 SEARCHED = 48  # points along each side among which the widest place for a word is looked for
 NO_BREAK = "\N{NO-BREAK SPACE}"
 LETTERS = "abcdefghijklmnopqrstuvwxyz"
@@ -70,7 +70,7 @@ def draw_panels(found: Panels) -> Any:
     count = len(found.panels)
     columns = min(count, 3)
     rows = -(-count // columns)
-    figure = figures.Figure(figsize=(PANEL * columns + 0.6, (PANEL + 0.4) * rows + 0.5), layout="constrained")
+    figure = figures.Figure(figsize=(PANEL * columns + 0.6, PANEL * rows + 0.6), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
     for place, (ax, panel) in enumerate(zip(axes, found.panels, strict=False)):
         _panel(ax, panel, found.normalized)
@@ -85,7 +85,13 @@ def draw_panels(found: Panels) -> Any:
     handles, labels = axes[0].get_legend_handles_labels()
     if len(labels) > 1 or found.normalized:
         figure.legend(
-            handles, labels, loc="outside lower center", frameon=False, fontsize=8.5, ncols=2, handlelength=3
+            handles,
+            labels,
+            loc="outside lower center",
+            frameon=False,
+            fontsize=8.5,
+            ncols=min(columns, 2),
+            handlelength=3,
         )
     return figure
 
@@ -100,13 +106,14 @@ def _panel(ax: Any, panel: Panel, normalized: bool) -> None:
     first, gain = panel.regions[0], panel.gains[0]
     _frame(ax, first.x, first.y, gain)
     if normalized:
-        ax.set_ylabel(f"effective gain of {_label(first.y)}")
+        ax.set_ylabel(f"effective gain of\n{_label(first.y)}")
     for place, (region, factor) in enumerate(zip(panel.regions, panel.gains, strict=True)):
         _draw(ax, region, factor, place)
     _name_stable_side(ax, panel.regions, panel.gains)
     for place, (label, points) in enumerate(panel.overlays):
         line = OVERLAY_LINES[place % len(OVERLAY_LINES)]
-        ax.plot(points[:, 0], points[:, 1], color="0.35", linestyle=line, linewidth=1.1, label=label)
+        where = "" if len(points) else " (no boundary here)"
+        ax.plot(*points.T, color="0.35", linestyle=line, linewidth=1.1, label=f"{label}{where}")
 
 
 def _frame(ax: Any, x: RegionAxis, y: RegionAxis, gain: int = 1) -> None:
@@ -166,10 +173,9 @@ def drawn_points(found: Region, number: int) -> Floats:
         return curve.points
     rectangle = found.rectangle
     knots = (curve.points - rectangle.low) / rectangle.width
-    a, b = knots[:-1], knots[1:]
-    parts = [
-        between(a, b, curve.tangents[:-1], curve.tangents[1:], share / PIECES) for share in range(PIECES)
-    ]
+    ends = (knots[:-1], knots[1:], curve.tangents[:-1], curve.tangents[1:])
+    pieces = -(-DRAWN // (len(knots) - 1))
+    parts = [between(*ends, share / pieces) for share in range(pieces)]
     points = np.stack(parts, axis=1).reshape(-1, 2)
     return rectangle.values(np.concatenate([points, knots[-1:]]))
 

@@ -8,6 +8,7 @@ Does not: compute.
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -131,7 +132,7 @@ def answer_report(found: Answer) -> str:
     if found.detailed:
         parts.append(str(found.conventions))
     elif found.conventions.warning:
-        parts.append(f"Warning: {found.conventions.warning}")
+        parts.append(textwrap.fill(f"Warning: {found.conventions.warning}", WIDTH))
     if found.box is not None:
         parts.append(str(found.box))
     return "\n\n".join(parts)

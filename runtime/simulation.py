@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.exchange import build_exchange
+from apc.runtime.flow import Flow, Tolerance, flow_of, rows_to_move
 from apc.runtime.forcing import SiteForcing, forcing_of, impulses, site_forcing
 from apc.runtime.gathering import Gate, Places, build_gates, kept_links
-from apc.runtime.linearize import jacobians
+from apc.runtime.linearize import SiteJacobians, jacobians
+from apc.runtime.methods import DEFAULT, Method, check_step
 from apc.runtime.native import native
 from apc.runtime.parameters import Numbers, resolve
 from apc.runtime.population import (
@@ -34,8 +36,9 @@ from apc.runtime.population import (
     refuse_unheard_of,
 )
 from apc.runtime.program import LocalSignal, Program, build_program, local_signals
-from apc.runtime.propagate import Transitions, rates, transitions
-from apc.runtime.schedule import Schedule, build_schedules
+from apc.runtime.propagate import Transitions, nonlinear_rows, rates, shaken, transitions
+from apc.runtime.scales import state_scales
+from apc.runtime.schedule import Propagate, Schedule, build_schedules
 from apc.runtime.signals import Choice, Signal, choose, signals_of
 from apc.runtime.timetable import Timetable, routes_of
 from apc.runtime.trouble import finite_equations
@@ -63,7 +66,7 @@ class Simulation:
     those not in `ticks` make a row at time 0 only; `forces` are those that change with time, of each group's
     different sites. `chunk` is the frame of all peers, `length` times in a row;
     `compiled` says that it runs in machine code. `gates` are the unreliable links, `seed` is what their luck
-    begins from.
+    begins from. `tolerances` are of the states that CVODES moves.
     """
 
     system: CompiledSystem
@@ -73,6 +76,8 @@ class Simulation:
     forces: tuple[tuple[SiteForcing, ...], ...]
     gates: tuple[Gate, ...]
     seed: int
+    method: Method
+    tolerances: tuple[Tolerance, ...]
     duration: Fraction
     quantum: Fraction
     frame: int
@@ -81,6 +86,11 @@ class Simulation:
     compiled: bool
     length: int
     chunk: Any  # casadi.Function
+
+    @property
+    def all_linear(self) -> bool:
+        """Whether every continuous equation is linear."""
+        return not any(nonlinear_rows(kind) for kind in self.system.kinds)
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -113,6 +123,7 @@ def prepare(
     signals: Sequence[str] = (),
     jit: bool = True,
     seed: int | None = None,
+    method: Method = DEFAULT,
 ) -> Simulation:
     """Do what comes before the first instant.
 
@@ -128,11 +139,13 @@ def prepare(
         Whether to compile to machine code where there is a C compiler.
     seed
         Of what is random; the experiment's if not given.
+    method
+        How the continuous states move between events.
 
     Raises
     ------
     ApcError
-        E870 a continuous equation is not linear, E871 a reduction looks at each pair of peers, E873 a pattern
+        E870 a continuous equation is not linear and the method is exact, E913 a step that does not fit, E871 a reduction looks at each pair of peers, E873 a pattern
         fits nothing, E874 the peers are too many, E893 a peer has nothing of its own to stand in for a
         missing packet; and those of `build_schedules`, `build_population` and `routes_of`.
     """
@@ -140,7 +153,10 @@ def prepare(
     numbers = resolve(system)
     with finite_equations(system.name):
         sites = [jacobians(kind) for kind in system.kinds]
-        rates_of = [rates(kind) for kind in system.kinds]
+        flows = [_flow(system, numbers, place, site, method) for place, site in enumerate(sites)]
+        rates_of = [
+            rates(kind, flow.rows if flow else ()) for kind, flow in zip(system.kinds, flows, strict=True)
+        ]
         patterns = [site.pattern for site in sites]
         exchange = build_exchange(system, numbers.timings)
         routes = routes_of(system, numbers.timings, exchange)
@@ -154,6 +170,7 @@ def prepare(
             local_signals(system.kinds[one.kind], s) for one, s in zip(system.groups, schedules, strict=True)
         ]
         _check_size(system, schedules)
+        _check_step(system, numbers, schedules, method)
         choices = choose(system, available, signals)
         _check_size(system, schedules, choices)
         cuts = exchanges_within(schedules)
@@ -164,8 +181,9 @@ def prepare(
             for peers, recorded in _recorded_and_not(choice):
                 key = (one.kind, id(schedule), recorded)
                 if key not in programs:
-                    programs[key] = build_program(rates_of[one.kind], schedule, recorded, cuts)
-                moves = _transitions(programs[key], vectors)
+                    linear, flow = rates_of[one.kind], flows[one.kind]
+                    programs[key] = build_program(linear, schedule, recorded, cuts, flow)
+                moves = _transitions(programs[key], vectors, method)
                 numbered = exchange.starts[group] + peers
                 site = sites[one.kind]
                 members.append(
@@ -190,6 +208,8 @@ def prepare(
         forces=tuple(_forces(member) for member in members),
         gates=gates,
         seed=system.experiment.seed if seed is None else seed,
+        method=method,
+        tolerances=_tolerances(system, flows),
         duration=duration,
         quantum=schedules[0].quantum,
         frame=schedules[0].frame,
@@ -245,7 +265,44 @@ def _recorded_and_not(choice: Choice) -> list[tuple[Integers, tuple[LocalSignal,
     return [(peers, signals) for peers, signals in split if len(peers)]
 
 
-def _transitions(program: Program, vectors: Floats) -> list[Transitions]:
+def _flow(
+    system: CompiledSystem, numbers: Numbers, place: int, site: SiteJacobians, method: Method
+) -> Flow | None:
+    """Return what the method moves of a kind, None if that is nothing."""
+    kind = system.kinds[place]
+    rows = rows_to_move(kind, method)
+    if not rows:
+        return None
+    vectors = [
+        vector
+        for group, own in zip(system.groups, numbers.parameters, strict=True)
+        if group.kind == place
+        for vector in own
+    ]
+    return flow_of(kind, method, rows, state_scales(system, kind, site, vectors))
+
+
+def _tolerances(system: CompiledSystem, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
+    """Return the tolerances of all states, each state of several kinds once, with the smallest."""
+    found: dict[str, Tolerance] = {}
+    for kind, flow in zip(system.kinds, flows, strict=True):
+        for one in flow.tolerances(kind) if flow else ():
+            if one.state not in found or one.absolute < found[one.state].absolute:
+                found[one.state] = one
+    return tuple(found.values())
+
+
+def _check_step(
+    system: CompiledSystem, numbers: Numbers, schedules: Sequence[Schedule], method: Method
+) -> None:
+    fastest = min((numbers.timings[one.period] for one in system.clocks), default=ROW)
+    lengths = [
+        event.duration * one.quantum for one in schedules for event in one.events if isinstance(event, Propagate)
+    ]
+    check_step(system, method, fastest, max(lengths, default=fastest))
+
+
+def _transitions(program: Program, vectors: Floats, method: Method) -> list[Transitions]:
     """Return what each different site of a group does over every interval; equal ones are one object."""
     seconds = [length * program.schedule.quantum for length in program.durations]
     known: dict[bytes, Transitions] = {}
@@ -255,6 +312,8 @@ def _transitions(program: Program, vectors: Floats) -> list[Transitions]:
         key = np.asarray(program.rates.matrices(vector)).tobytes()
         if key not in known:
             known[key] = transitions(program.rates, vector, seconds)
+            if method.shaken:
+                known[key] = shaken(known[key], len(known))
         found.append(known[key])
     return found
 

@@ -237,7 +237,7 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
 def _places(free: RigidModes, n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the places whose coordinates the rigid motions take away, and all others."""
     held = independent_places(free.basis.T)
-    return held, np.setdiff1d(np.arange(n), held)
+    return held, np.delete(np.arange(n), held)
 
 
 def _modes(

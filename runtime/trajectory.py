@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.methods import DEFAULT, Method
 from apc.runtime.signals import Signal
 from apc.runtime.simulation import Block, Simulation, blocks, prepare
 from apc.runtime.summary import Summary, Watch, summary_text
 
 Floats = NDArray[np.float64]
 
-METHOD = "exact"
 MOST_KEPT = 2**27  # numbers that are kept in memory: 1 GiB
 
 
@@ -187,7 +187,7 @@ def provenance_of(simulation: Simulation) -> Provenance:
         topology=system.name,
         texts=hashlib.sha256(texts.encode()).hexdigest(),
         duration_s=str(simulation.duration),
-        method=METHOD,
+        method=str(simulation.method),
         seed=simulation.seed,
         parameters=tuple(parameters),
         timings=tuple((one.name, str(one.value)) for one in system.timings),
@@ -263,6 +263,7 @@ def simulate(
     signals: Sequence[str] = (),
     jit: bool = True,
     seed: int | None = None,
+    method: Method = DEFAULT,
 ) -> Trajectory:
     """Play a scene in time and keep its rows.
 
@@ -278,13 +279,15 @@ def simulate(
         Whether to compile to machine code where there is a C compiler.
     seed
         Of what is random; the experiment's if not given.
+    method
+        How the continuous states move between events.
 
     Raises
     ------
     ApcError
         E877 no duration is known, E876 too many numbers to keep; and those of `simulation.prepare`.
     """
-    simulation = prepare(system, duration_of(system, duration), signals=signals, jit=jit, seed=seed)
+    simulation = prepare(system, duration_of(system, duration), signals=signals, jit=jit, seed=seed, method=method)
     keeper = Keeper(simulation)
     summary, interrupted = play(simulation, [keeper])
     return trajectory_of(simulation, keeper, summary, interrupted)

@@ -69,13 +69,15 @@ ORDER = (
     "apc.runtime.sensitivity",
     # other ways to analyse: the paper's, other readings of ties, each state of a contact
     *("apc.runtime.openloop", "apc.runtime.paper", "apc.runtime.conventions"),
-    *("apc.runtime.switches", "apc.runtime.contact_modes"),
+    *("apc.runtime.switches", "apc.runtime.contact_modes", "apc.runtime.answer"),
     # published conditions, and results at many values of some parameters
     *("apc.runtime.passivity", "apc.runtime.overlay", "apc.runtime.grid", "apc.runtime.quantities"),
     *("apc.runtime.table_file", "apc.runtime.sweep_work", "apc.runtime.sweep_store"),
     *("apc.runtime.sweep_local", "apc.runtime.sweep_cluster", "apc.runtime.sweep"),
     # a scene played in time
-    *("apc.runtime.propagate", "apc.runtime.forcing", "apc.runtime.program", "apc.runtime.native"),
+    *("apc.runtime.methods", "apc.runtime.guards", "apc.runtime.scales", "apc.runtime.stepping"),
+    *("apc.runtime.integrate", "apc.runtime.propagate", "apc.runtime.flow", "apc.runtime.forcing"),
+    *("apc.runtime.program", "apc.runtime.native"),
     *("apc.runtime.population", "apc.runtime.signals", "apc.runtime.simulation", "apc.runtime.summary"),
     *("apc.runtime.trajectory", "apc.runtime.recording", "apc.runtime.figures"),
     "apc.runtime.ensemble",
@@ -93,6 +95,7 @@ ORDER = (
         "apc.cli_simulate",
         "apc.cli_sweep",
         "apc.cli_critical",
+        "apc.cli_analyze",
         "apc.cli",
         "apc.__main__",
     ),
@@ -100,7 +103,11 @@ ORDER = (
 # A result prints itself: it asks for the report, which knows it, when it is printed and not before.
 BACKWARDS = {
     ("apc.runtime.analysis", "apc.runtime.report"),
+    ("apc.runtime.answer", "apc.runtime.report"),
     ("apc.runtime.trajectory", "apc.runtime.figures"),  # likewise a trajectory that draws itself
+    # and a region that prints, draws and lists itself
+    *(("apc.runtime.region", f"apc.runtime.region_{late}") for late in ("report", "figure", "files")),
+    *(("apc.runtime.region_panels", f"apc.runtime.region_{late}") for late in ("report", "figure")),
 }
 PACKAGES = {"compiler": "apc.compiler", "runtime": "apc.runtime", "runtime/apc": "apc"}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "sympify", "parse_expr", "lambdify", "S"}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import analyze_modes, lifted_groups
+from apc.runtime.analysis import analyze, lifted_groups
 from apc.runtime.balls import frame_balls, precision
 from apc.runtime.batch import BatchEvaluator, matrix_errors
 from apc.runtime.crossings import eigenvalues
@@ -37,7 +37,7 @@ def test_a_batch_has_the_radii_of_single_analyses(text: str) -> None:
     found = family.matrices(values)
     for k, row in enumerate(values):
         overrides = [Override(n, None, Fraction(float(v))) for n, v in zip(NAMES, row, strict=True)]
-        alone = analyze_modes(apply(system, overrides))
+        alone = analyze(apply(system, overrides))
         radius = max(float(np.abs(np.linalg.eigvals(one[k])).max()) for one in found)
         assert abs(radius - alone.spectral_radius) <= 1e-11 * max(1, radius)
 
@@ -49,7 +49,7 @@ def test_other_graphs_clocks_and_groups_are_batched_alike(name: str) -> None:
     values = np.array([[400.0], [900.0]])
     found = family.matrices(values)
     for k, value in enumerate(values[:, 0]):
-        alone = analyze_modes(apply(system, [Override("contact.stiffness", None, Fraction(value))]))
+        alone = analyze(apply(system, [Override("contact.stiffness", None, Fraction(value))]))
         radius = max(float(np.abs(np.linalg.eigvals(one[k])).max()) for one in found)
         assert abs(radius - alone.spectral_radius) <= 1e-9
 

@@ -10,7 +10,7 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze_modes
+from apc.runtime.analysis import analyze
 from apc.runtime.box import parse_range
 from apc.runtime.box_proof import BoxProof, prove_box
 from apc.runtime.parameters import Override, apply
@@ -53,7 +53,7 @@ def test_a_box_is_proved_and_every_point_of_it_is_stable(texts: list[str]) -> No
             Override(one.name, one.group, one.low + share * (one.high - one.low))
             for one, share in zip(ranges, shares, strict=True)
         ]
-        assert analyze_modes(apply(system, point)).stable
+        assert analyze(apply(system, point)).stable
 
 
 def test_a_box_beyond_the_limit_is_unstable_at_a_point_and_one_below_it_is_stable() -> None:
@@ -66,7 +66,7 @@ def test_a_box_beyond_the_limit_is_unstable_at_a_point_and_one_below_it_is_stabl
     [point] = above.point
     assert 1096.41 < point <= 1096.5
     assert (
-        analyze_modes(apply(system, [Override("coordination.stiffness", None, Fraction(point))])).stable
+        analyze(apply(system, [Override("coordination.stiffness", None, Fraction(point))])).stable
         is False
     )
     assert "proved unstable at" in str(above)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import Analysis, analyze_dense, analyze_modes, lifted_groups
+from apc.runtime.analysis import Analysis, analyze, lifted_groups
 from apc.runtime.balls import precision
 from apc.runtime.certify import prove, root_discs, schur_cohn
 from apc.runtime.modes import split
@@ -78,7 +78,7 @@ def test_discs_keep_a_root_that_vanishes_many_times() -> None:
 
 
 def _certified(system: CompiledSystem) -> Analysis:
-    return analyze_modes(system, certify=True)
+    return analyze(system, certify=True)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def _certified(system: CompiledSystem) -> Analysis:
 def test_a_verdict_that_floats_know_is_proved_when_asked_for(
     system: CompiledSystem, verdict: str, proof: str
 ) -> None:
-    plain, certified = analyze_modes(system), _certified(system)
+    plain, certified = analyze(system), _certified(system)
     assert plain.proof == ""
     assert plain.verdict == certified.verdict == verdict
     assert certified.proof == proof
@@ -105,7 +105,7 @@ def test_a_verdict_that_floats_know_is_proved_when_asked_for(
 
 def test_proved_modes_are_the_modes() -> None:
     for system in (paper(bt=2.0), linked(paper(peers=7), "ring")):
-        plain, certified = analyze_modes(system), _certified(system)
+        plain, certified = analyze(system), _certified(system)
         for one in certified.modes:
             near = min(
                 plain.modes, key=lambda mode: (mode.shape != one.shape, abs(mode.eigenvalue - one.eigenvalue))
@@ -141,7 +141,7 @@ def test_what_lies_on_the_circle_stays_undecided() -> None:
     states = (kind.states[0], dataclasses.replace(kind.states[0], name="v"))
     rate = casadi.Function("derivative", [x, u, p, t], [swing(x, u)])
     system = dataclasses.replace(system, kinds=(dataclasses.replace(kind, states=states, derivative=rate),))
-    found = analyze_modes(system)
+    found = analyze(system)
     assert found.verdict == "undecided: |ρ−1| below the error bound"
     assert found.proof == "undecided at 4096 bits"
     assert abs(found.spectral_radius - 1) <= found.spectral_radius_error < 1e-15
@@ -157,7 +157,7 @@ def test_what_is_rounded_is_not_called_proved() -> None:
 
 def test_all_peers_as_one_system_are_proved_as_the_few_small_ones_are() -> None:
     for system in (paper(bt=2.0), columned(paper(), device__mass=[0.1, 0.2, 0.15])):
-        whole, small = analyze_dense(system, certify=True), _certified(system)
+        whole, small = analyze(system, certify=True, method="dense"), _certified(system)
         assert whole.verdict == small.verdict == TRANSLATING
         assert whole.proof == small.proof == "proved stable with 256 bits"
         assert whole.spectral_radius == pytest.approx(small.spectral_radius, abs=1e-14)
@@ -165,7 +165,7 @@ def test_all_peers_as_one_system_are_proved_as_the_few_small_ones_are() -> None:
 
 def test_a_frame_of_thousand_ticks_is_decided() -> None:
     """1 ms and 7.99 ms: all clocks stand as before after 0.799 s; float bounds multiply up to 1e23."""
-    found = analyze_modes(paper(network=MS * 799 / 100, comm=8 * MS))
+    found = analyze(paper(network=MS * 799 / 100, comm=8 * MS))
     assert found.verdict == TRANSLATING
     assert found.proof.startswith("proved stable with")
     assert found.spectral_radius_error < 1e-14
@@ -176,8 +176,8 @@ def test_more_bits_are_taken_as_long_as_they_decide() -> None:
     low, high = 900.0, 1200.0
     while np.nextafter(low, high) < high:
         middle = (low + high) / 2
-        low, high = (middle, high) if analyze_modes(paper(kc=1000.0, kt=middle)).stable else (low, middle)
-    below, above = (analyze_modes(paper(kc=1000.0, kt=kt)) for kt in (low, high))
+        low, high = (middle, high) if analyze(paper(kc=1000.0, kt=middle)).stable else (low, middle)
+    below, above = (analyze(paper(kc=1000.0, kt=kt)) for kt in (low, high))
     assert (below.stable, above.stable) == (True, False)
     assert below.proof.startswith("decided with") or below.proof.startswith("proved stable")
     assert above.proof.startswith("proved unstable")

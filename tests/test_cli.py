@@ -15,7 +15,9 @@ import pytest
 from apc.__main__ import run
 from tests.topologies import AVERAGE, MESH
 
-COMMANDS = ("new", "check", "compile", "show", "analyze", "schema")
+COMMANDS = (
+    *("new", "check", "compile", "show", "analyze", "critical", "region", "simulate", "sweep", "schema"),
+)
 
 
 class Ran(NamedTuple):
@@ -181,7 +183,7 @@ def test_a_damaged_model_beside_its_topology_is_passed_over(cli: Cli) -> None:
     [
         (("analyse",), "No such command 'analyse'."),
         (("compile", "--until", "nowhere"), "Invalid value for '--until'"),
-        (("analyze", "--method", "paper"), "Invalid value for '--method'"),
+        (("analyze", "--method", "schur"), "Invalid value for '--method'"),
         (("analyze", "--jsn"), "No such option '--jsn'"),
         (("compile", "a", "b"), "Got unexpected extra argument (b)"),
     ],

@@ -10,7 +10,7 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import analyze_dense, analyze_modes, prepare
+from apc.runtime.analysis import analyze, prepare
 from apc.runtime.contact_modes import ContactMode, ContactModes, contact_modes
 from tests import bruteforce
 from tests.sites import alone
@@ -47,7 +47,7 @@ def test_each_mode_of_the_experiment_is_the_scene_of_springs_it_stands_for(scene
     assert found.parts == ("contact.push",)
     touching = ((True, True), (False, False), (True, False), (False, True))
     for one, (right, left) in zip(found.modes, touching, strict=True):
-        truth = analyze_dense(compiled(spring(EXPERIMENTS[scene], right=right, left=left)))
+        truth = analyze(compiled(spring(EXPERIMENTS[scene], right=right, left=left)), method="dense")
         assert one.spectral_radius == pytest.approx(truth.spectral_radius, abs=1e-12)
         assert one.verdict == truth.verdict
         assert not one.linearized
@@ -95,7 +95,7 @@ def test_the_experiment_with_the_mean_is_stable_in_contact_and_with_the_mesh_it_
 def test_the_plain_analysis_is_that_of_the_mode_the_scene_starts_in() -> None:
     system = compiled(EXPERIMENTS["average"])
     assert mode(contact_modes(system), "on at no peer").spectral_radius == pytest.approx(
-        analyze_modes(system).spectral_radius, abs=1e-12
+        analyze(system).spectral_radius, abs=1e-12
     )
 
 
@@ -109,7 +109,7 @@ def test_a_limited_force_is_on_while_it_is_not_at_its_limit(text: str) -> None:
     assert tuple(one.name for one in found.modes) == MODES[:2]
     free = replaced(text, ("stiffness: 1000 N/m", "stiffness: 0 N/m"))
     for one, truth in zip(found.modes, (text, free), strict=True):
-        expected = analyze_modes(compiled(truth))
+        expected = analyze(compiled(truth))
         assert one.spectral_radius == pytest.approx(expected.spectral_radius, abs=1e-12)
         assert (one.verdict, one.linearized) == (expected.verdict, False)
 
@@ -120,7 +120,7 @@ def test_a_limit_on_what_is_heard_of_each_other_one_switches_too() -> None:
     assert found.parts == ("coordination.f",)
     apart = replaced(MESH, ("stiffness: 500 N/m", "stiffness: 0 N/m"))
     for one, truth in zip(found.modes, (MESH, apart), strict=True):
-        expected = analyze_modes(compiled(truth)).spectral_radius
+        expected = analyze(compiled(truth)).spectral_radius
         assert one.spectral_radius == pytest.approx(expected, abs=1e-12)
 
 
@@ -170,7 +170,7 @@ def test_a_piece_that_is_not_linear_is_taken_at_the_start_or_refused_there() -> 
     )
     expected = mode(contact_modes(compiled(alike)), MODES[0]).spectral_radius
     assert found.spectral_radius == pytest.approx(expected, abs=1e-12)
-    assert found.spectral_radius == pytest.approx(analyze_modes(compiled(deep)).spectral_radius, abs=1e-12)
+    assert found.spectral_radius == pytest.approx(analyze(compiled(deep)).spectral_radius, abs=1e-12)
 
 
 def test_where_nothing_switches_there_are_no_modes() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import analyze_modes, prepare
+from apc.runtime.analysis import analyze, prepare
 from apc.runtime.conventions import Conventions, Outcome, conventions
 from apc.runtime.schedule import ORDER
 from tests import bruteforce
@@ -71,7 +71,7 @@ def test_every_order_has_the_radius_that_its_own_analysis_finds() -> None:
     system = paper(comp=NONE, comm=NONE, kt=900.0)
     found = conventions(system)
     for order in itertools.permutations(ORDER):
-        own = analyze_modes(system, prepared=prepare(system, order=order))
+        own = analyze(system, prepared=prepare(system, order=order))
         assert outcome(found, order).spectral_radius == pytest.approx(own.spectral_radius, abs=1e-11)
 
 
@@ -101,7 +101,7 @@ def test_where_the_slope_depends_on_what_is_heard_both_readings_of_the_start_are
     assert found.start_matters
     readings = {one.start: one.spectral_radius for one in found.outcomes if ORDER in one.orders}
     assert set(readings) == {"the sender's start values", "nothing"}
-    assert readings["the sender's start values"] == analyze_modes(system).spectral_radius
+    assert readings["the sender's start values"] == analyze(system).spectral_radius
     apart = columned(edged(paper(), cubic=1e7), cube__x__start=[0.0, 0.0, 0.0])
     assert readings["nothing"] != readings["the sender's start values"]
     # Everybody at 0 hears 0, as if nothing.
@@ -135,7 +135,7 @@ def test_in_passing_a_large_scene_is_not_repeated_and_says_so() -> None:
 def test_work_done_before_is_used_again() -> None:
     system = compiled(FLIPPING)
     prepared = prepare(system)
-    default = analyze_modes(system, prepared=prepared)
+    default = analyze(system, prepared=prepared)
     assert conventions(system, prepared=prepared, default=default) == conventions(system)
 
 

@@ -12,7 +12,7 @@ import pytest
 from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze_modes
+from apc.runtime.analysis import analyze
 from apc.runtime.critical import critical
 from apc.runtime.crossings import scan
 from apc.runtime.parameters import Override, apply
@@ -38,7 +38,7 @@ def with_values(system: CompiledSystem, values: dict[str, str]) -> CompiledSyste
 
 
 def stable_at(system: CompiledSystem, name: str, value: float) -> bool | None:
-    return analyze_modes(apply(system, [Override(name, None, Fraction(value))])).stable
+    return analyze(apply(system, [Override(name, None, Fraction(value))])).stable
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
     ticks = first.value / 1e-3
     assert ticks == pytest.approx(round(ticks), abs=1e-9)
     sides = [
-        analyze_modes(
+        analyze(
             apply(system, [Override("lan.delay", None, Fraction(round(ticks), 1000) + shift)])
         ).stable
         for shift in (Fraction(-1, 10**7), Fraction(1, 10**7))
@@ -189,7 +189,7 @@ def test_groups_alike_at_present_only_are_kept_apart() -> None:
     assert alone.value is not None
     for shift, stable in ((1 - 1e-9, True), (1 + 1e-9, False)):
         changed = apply(system, [Override("contact.stiffness", "one", Fraction(alone.value * shift))])
-        assert analyze_modes(changed).stable is stable
+        assert analyze(changed).stable is stable
     together = critical(system, "contact.stiffness")
     assert together.value == pytest.approx(1645.35314612339, rel=1e-12)
     assert abs(alone.value - together.value) > 1

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from apc.runtime.curves import area_beside, between, fill, off_an_arc, stencils, through_four
 
+Floats = NDArray[np.float64]
 
-def circle(angles: np.ndarray[tuple[int], np.dtype[np.float64]], radius: float = 2.0):  # type: ignore[no-untyped-def]
+
+def circle(angles: Floats, radius: float = 2.0) -> tuple[Floats, Floats]:
     points = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return points, np.stack([-np.sin(angles), np.cos(angles)], axis=1)
 

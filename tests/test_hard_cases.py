@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
-from apc.runtime.analysis import Analysis, analyze_modes
+from apc.runtime.analysis import Analysis, analyze
 from apc.runtime.balls import precision
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, alone, columned, grouped, linked, paper
@@ -50,7 +50,7 @@ def analysed(**values: object) -> Analysis:
     system = paper(**values)  # type: ignore[arg-type]
     if own:
         system = grouped(system, ("user", system.peers, own))  # type: ignore[dict-item]
-    return analyze_modes(system)
+    return analyze(system)
 
 
 def check(found: Analysis, values: list[flint.acb], *, rigid: int, bits: int = 200) -> None:
@@ -146,10 +146,10 @@ def test_no_damping_but_ties_are_decided() -> None:
 @pytest.mark.parametrize("ratio", [1, 10, 100, 1000])
 def test_the_frame_of_loose_peers_is_the_tick_to_the_power_of_the_ratio(ratio: int) -> None:
     """One peer and a loose copy: what the frame does is the tick's own map to the power of the ratio."""
-    found = analyze_modes(paper(kt=0.0, kc=500.0, bc=1.0, network=ratio * MS, comm=ratio * MS))
+    found = analyze(paper(kt=0.0, kc=500.0, bc=1.0, network=ratio * MS, comm=ratio * MS))
     [tick] = {
         mode.magnitude
-        for mode in analyze_modes(paper(kt=0.0, kc=500.0, bc=1.0, network=MS, comm=MS)).modes[:1]
+        for mode in analyze(paper(kt=0.0, kc=500.0, bc=1.0, network=MS, comm=MS)).modes[:1]
     }
     assert found.verdict == TRANSLATING
     assert found.rigid_modes == 3
@@ -163,7 +163,7 @@ def test_a_delay_of_many_frames_is_decided(frames: int) -> None:
 
     Two peers on the mean hear ±s[k − d]: det(z − P ∓ z^(−d) Q S) = 0, whatever the number of packets.
     """
-    found = analyze_modes(paper(peers=2, kt=5.0, bt=0.0, kc=500.0, comm=8 * MS * frames))
+    found = analyze(paper(peers=2, kt=5.0, bt=0.0, kc=500.0, comm=8 * MS * frames))
     assert found.stable is not None
     function = _characteristic(frames)
     for mode in found.modes[:4]:
@@ -226,7 +226,7 @@ def test_two_nearly_equal_eigenvalues_on_the_boundary_are_told_apart() -> None:
         ((below, above), False),
         ((above, 1 + 2.0**-51), False),
     ):
-        found = analyze_modes(columned(_shrinking(), factor=pair))
+        found = analyze(columned(_shrinking(), factor=pair))
         assert found.stable is stable
         assert found.spectral_radius == max(pair)
         assert found.spectral_radius_error < 1e-15
@@ -259,7 +259,7 @@ def _shrinking() -> CompiledSystem:
 
 def test_two_clusters_have_two_translations() -> None:
     arcs = [(0, 1, 1.0), (1, 0, 1.0), (2, 3, 1.0), (3, 2, 1.0)]
-    found = analyze_modes(linked(paper(peers=4), arcs))
+    found = analyze(linked(paper(peers=4), arcs))
     weights = {(i, j): weight for i, j, weight in arcs}
     assert found.rigid_modes == 2
     assert found.verdict == TRANSLATING
@@ -268,7 +268,7 @@ def test_two_clusters_have_two_translations() -> None:
 
 def test_a_peer_nobody_hears_changes_nobody_else() -> None:
     arcs = [(0, 1, 1.0), (1, 0, 1.0), (0, 2, 1.0)]  # 2 hears 0, and is heard by nobody
-    found = analyze_modes(linked(paper(peers=3), arcs))
+    found = analyze(linked(paper(peers=3), arcs))
     weights = {(i, j): weight for i, j, weight in arcs}
     assert found.stable is True
     check(found, truth(Scene(peers=3, weights=weights), 1024), rigid=1)
@@ -285,7 +285,7 @@ def test_a_lone_mass_is_its_closed_form() -> None:
                 {"device.mass": mass, "device.damping": damping, "cube.mass": mass, "cube.damping": damping},
             ),
         )
-        found = analyze_modes(system)
+        found = analyze(system)
         with precision(300):
             exact = (-flint.arb(damping) / flint.arb(mass) * flint.arb(found.frame_s)).exp()
         assert found.verdict == TRANSLATING

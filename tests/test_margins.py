@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 
-from apc.runtime.analysis import analyze_modes
+from apc.runtime.analysis import analyze
 from apc.runtime.margins import margins, margins_report
 from apc.runtime.parameters import Override, apply
 from tests.topologies import AVERAGE, compiled, replaced
@@ -25,7 +25,7 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_margin_that_holds(
         assert one.error <= 1e-12 * one.value
         for side, stable in ((-1e-9, True), (1e-9, False)):
             value = Fraction(one.value * (1 + side))
-            assert analyze_modes(apply(system, [Override(name, None, value)])).stable is stable
+            assert analyze(apply(system, [Override(name, None, value)])).stable is stable
         assert one.factor == (one.value / one.present if one.present else None)
 
 

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from apc.runtime.analysis import analyze_modes
+from apc.runtime.analysis import analyze
 from apc.runtime.needs import needs
 from tests.sites import columned, edged, linked, paper
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
@@ -35,7 +35,7 @@ def test_a_peer_keeps_its_motion_its_delayed_forces_and_its_packets_on_their_way
     system = compiled(replaced(AVERAGE, *changes))
     (site,) = needs(system).sites
     assert (site.motion, site.remembered, site.packets) == counts
-    assert site.states == sum(counts) == analyze_modes(system).states_per_peer
+    assert site.states == sum(counts) == analyze(system).states_per_peer
 
 
 def test_the_papers_scene_needs_eight_states_a_peer() -> None:

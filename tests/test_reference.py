@@ -15,7 +15,7 @@ import pytest
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import Analysis, Prepared, analyze_dense, analyze_modes, prepare
+from apc.runtime.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.parameters import Override, apply
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
@@ -60,7 +60,7 @@ def analyse(
     scheme: str, values: dict[str, float], *, peers: int = 3, delays: str = "all", delayed: bool = True
 ) -> Analysis:
     system, shared = prepared(scheme, peers, delays, delayed)
-    return analyze_modes(changed(system, values), prepared=shared)
+    return analyze(changed(system, values), prepared=shared)
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_modes_are_the_spectrum_of_all_peers_together(scheme: str, peers: int) -
     system, shared = prepared(scheme, peers, "all", True)
     # The mesh is stiffer with every peer; a stable scene has the better conditioned eigenvalues.
     system = changed(system, gains(800 if scheme == "AP" else 800 / (peers - 1), 2, 1500, 2))
-    modes, dense = analyze_modes(system, prepared=shared), analyze_dense(system, prepared=shared)
+    modes, dense = analyze(system, prepared=shared), analyze(system, prepared=shared, method="dense")
     assert (modes.verdict, modes.rigid_modes) == (dense.verdict, dense.rigid_modes)
     assert abs(modes.spectral_radius - dense.spectral_radius) < 1e-12
     multiplicity = {mode.shape: mode.multiplicity for mode in modes.modes}
@@ -242,7 +242,7 @@ def test_a_slow_late_network_adds_the_viscosity_of_the_formula(
             "coordination.delay": computed,
         },
     )
-    result = analyze_modes(system, prepared=shared)
+    result = analyze(system, prepared=shared)
     common = [mode for mode in result.modes if mode.shape == "common" and mode.eigenvalue.imag == 0]
     slowest = max(mode.magnitude for mode in common)
     total = -np.log(slowest) / result.frame_s * 2 * heavy

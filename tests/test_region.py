@@ -11,7 +11,7 @@ import pytest
 import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze_modes
+from apc.runtime.analysis import analyze
 from apc.runtime.boundary import relative_to
 from apc.runtime.curves import between
 from apc.runtime.parameters import Override, apply
@@ -111,7 +111,7 @@ def test_what_is_inside_is_what_an_analysis_calls_stable(paper: Region, average:
     random = np.random.default_rng(7)
     for x, y in random.uniform(10, 3000, (25, 2)).tolist():
         overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((paper.x, x), (paper.y, y))]
-        assert paper.contains(x, y) == analyze_modes(apply(average, overrides)).stable
+        assert paper.contains(x, y) == analyze(apply(average, overrides)).stable
     grid = np.linspace(10, 3000, 60)
     share = paper.contains(*np.meshgrid(grid, grid)).mean()
     assert share == pytest.approx(paper.stable_area / 2990**2, abs=0.02)
@@ -168,7 +168,7 @@ def test_a_mass_and_a_damping_can_be_axes(average: CompiledSystem) -> None:
     random = np.random.default_rng(3)
     for x, y in zip(random.uniform(0.02, 0.3, 15), random.uniform(0.5, 8, 15), strict=True):
         overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
-        assert found.contains(x, y) == analyze_modes(apply(average, overrides)).stable
+        assert found.contains(x, y) == analyze(apply(average, overrides)).stable
 
 
 def test_over_a_delay_the_boundary_is_known_to_a_cell(average: CompiledSystem) -> None:
@@ -195,7 +195,7 @@ def test_the_frequency_is_that_of_the_mode_on_the_boundary(paper: Region, averag
     [curve] = paper.curves
     x, y = curve.knots[len(curve.knots) // 2]
     overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((paper.x, x), (paper.y, y))]
-    mode = analyze_modes(apply(average, overrides)).modes[0]
+    mode = analyze(apply(average, overrides)).modes[0]
     low, high = curve.frequency_hz
     assert low <= mode.frequency_hz * (1 + 1e-9)
     assert mode.frequency_hz <= high * (1 + 1e-9)

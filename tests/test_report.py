@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from apc.runtime.analysis import analyze_modes
+from apc.runtime.analysis import analyze
 from apc.runtime.needs import needs
 from apc.runtime.report import WIDTH, analysis_report, compile_report
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
@@ -21,7 +21,7 @@ def test_no_line_is_wider_than_a_terminal(text: str) -> None:
     system = compiled(text)
     for told in (
         compile_report(system, needs(system), Path("scene.apc"), 2e-16),
-        analysis_report(analyze_modes(system)),
+        analysis_report(analyze(system)),
     ):
         assert max(len(line) for line in told.splitlines()) <= WIDTH
 
@@ -50,7 +50,7 @@ def test_a_scene_without_clocks_says_so() -> None:
 
 
 def test_an_analysis_names_verdict_radius_and_error() -> None:
-    result = analyze_modes(compiled(AVERAGE))
+    result = analyze(compiled(AVERAGE))
     lines = analysis_report(result).splitlines()
     assert lines[0] == "three-users-average: stable up to a common translation"
     radius = next(line for line in lines if "spectral radius" in line)
@@ -60,7 +60,7 @@ def test_an_analysis_names_verdict_radius_and_error() -> None:
 
 
 def test_a_conjugate_pair_is_one_row_and_the_rest_is_counted() -> None:
-    result = analyze_modes(compiled(AVERAGE))
+    result = analyze(compiled(AVERAGE))
     rows = [line for line in analysis_report(result).splitlines() if " Hz " in line or " – " in line]
     alive = [mode for mode in result.modes if mode.magnitude > 1e-3]
     assert len(rows) == sum(1 for mode in alive if mode.eigenvalue.imag >= 0)
@@ -69,7 +69,7 @@ def test_a_conjugate_pair_is_one_row_and_the_rest_is_counted() -> None:
 
 
 def test_what_rounding_makes_of_a_zero_changes_nothing_that_is_printed() -> None:
-    result = analyze_modes(compiled(AVERAGE))
+    result = analyze(compiled(AVERAGE))
     other = dataclasses.replace(
         result,
         modes=tuple(
@@ -90,5 +90,5 @@ def test_what_rounding_makes_of_a_zero_changes_nothing_that_is_printed() -> None
     ],
 )
 def test_every_verdict_is_told_in_words(verdict: str, words: str) -> None:
-    result = dataclasses.replace(analyze_modes(compiled(ONE_MASS)), verdict=verdict)
+    result = dataclasses.replace(analyze(compiled(ONE_MASS)), verdict=verdict)
     assert words in analysis_report(result)

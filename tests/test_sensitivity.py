@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import analyze_modes
+from apc.runtime.analysis import analyze
 from apc.runtime.balls import precision
 from apc.runtime.batch import BatchEvaluator
 from apc.runtime.evaluator import evaluator
@@ -79,7 +79,7 @@ def test_equal_groups_have_an_active_set_and_no_single_gradient() -> None:
     rates = sorted(row.derivative for row in found.rows if row.parameter == "one.contact.stiffness")
     step = 1e-3
     radius = [
-        analyze_modes(
+        analyze(
             apply(system, [Override("contact.stiffness", "one", Fraction(1000.0 + side))])
         ).spectral_radius
         for side in (-step, 0.0, step)

@@ -100,7 +100,7 @@ def test_ten_seconds_are_the_powers_of_the_analysis_frame_map() -> None:
 def test_an_unstable_motion_grows_by_the_spectral_radius() -> None:
     text = replaced(AVERAGE, ("{count: 3}", MOVED), ("stiffness: 500 N/m", "stiffness: 1400 N/m"))
     system = compiled(text)
-    radius = analyze_dense(system).spectral_radius
+    radius = analyze(system, method="dense").spectral_radius
     assert radius > 1.01
     found = simulate(system, duration=Fraction(8), signals=["cube.v"])
     size = np.linalg.norm(found.values[::8], axis=1)

@@ -13,7 +13,7 @@ import pytest
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import Analysis, analyze_dense, analyze_modes
+from apc.runtime.analysis import Analysis, analyze
 from apc.runtime.enclosure import enclose_eigenvalues
 from apc.runtime.rigid import independent_places
 from apc.runtime.spectrum import _relative
@@ -38,7 +38,7 @@ OWN = {**BOTH, "own_delay": True}
     ],
 )
 def test_the_reference_radii_come_out(operator: str, peers: int, delays: dict, radius: float) -> None:
-    found = analyze_modes(paper(operator, peers=peers, kt=800.0, bt=2.0, kc=1500.0, bc=2.0, **delays))
+    found = analyze(paper(operator, peers=peers, kt=800.0, bt=2.0, kc=1500.0, bc=2.0, **delays))
     assert found.spectral_radius == pytest.approx(radius, abs=1e-8)
     assert found.verdict == "stable up to a common translation"
     assert found.rigid_modes == 1
@@ -46,10 +46,10 @@ def test_the_reference_radii_come_out(operator: str, peers: int, delays: dict, r
 
 def _crossing(build: object, low: float, high: float) -> float:
     """Return where the radius crosses 1 between two values, by bisection."""
-    assert analyze_modes(build(low)).spectral_radius < 1 < analyze_modes(build(high)).spectral_radius  # type: ignore[operator]
+    assert analyze(build(low)).spectral_radius < 1 < analyze(build(high)).spectral_radius  # type: ignore[operator]
     while high - low > 1e-5:
         middle = (low + high) / 2
-        if analyze_modes(build(middle)).spectral_radius < 1:  # type: ignore[operator]
+        if analyze(build(middle)).spectral_radius < 1:  # type: ignore[operator]
             low = middle
         else:
             high = middle
@@ -80,7 +80,7 @@ def test_the_largest_coordination_stiffness_is_the_reference_one(
 
         assert _crossing(build, limit * 0.99, limit * 1.01) == pytest.approx(limit, abs=6e-4)
         for kt in np.linspace(1.0, limit * 0.99, 8):
-            assert analyze_modes(build(float(kt))).stable
+            assert analyze(build(float(kt))).stable
 
 
 @pytest.mark.parametrize(("damping", "limit"), [(0.0, 1865.424), (2.0, 3175.018)])
@@ -107,7 +107,7 @@ def test_a_slow_late_network_brakes_like_a_damper(operator: str, viscosity: floa
     system = grouped(
         paper(operator, kt=200.0, kc=0.0, cube=mass, comp=comp), ("user", 3, {"cube.damping": 0.0})
     )
-    slow = next(mode for mode in analyze_modes(system).modes if mode.shape == "common")
+    slow = next(mode for mode in analyze(system).modes if mode.shape == "common")
     assert -mass * math.log(slow.magnitude) / 0.008 == pytest.approx(viscosity, rel=1e-4)
 
 
@@ -149,7 +149,7 @@ def _random(generator: np.random.Generator, number: int) -> dict:
 
 def _check_against_truth(values: dict) -> Analysis:
     """Assert that truth is within every bound, and that no verdict contradicts it; return the analysis."""
-    found = analyze_modes(paper(peers=2, **values))
+    found = analyze(paper(peers=2, **values))
     truth = _truth(Scene(peers=2, **values))
     for mode in found.modes:
         place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
@@ -188,7 +188,7 @@ def test_next_to_the_boundary_every_verdict_is_decided_and_right() -> None:
         low, high = 1.0, 20000.0
         while np.nextafter(low, high) < high:
             middle = (low + high) / 2
-            if analyze_modes(paper(peers=2, **{**values, "kt": middle})).spectral_radius < 1:
+            if analyze(paper(peers=2, **{**values, "kt": middle})).spectral_radius < 1:
                 low = middle
             else:
                 high = middle
@@ -203,7 +203,7 @@ def test_mpmath_at_50_digits_agrees() -> None:
     with mpmath.workdps(50):
         rows = frame_matrix(Scene(peers=2, **values), number=mpmath.mpf, exp=mpmath.exp)
         truth = mpmath.eig(mpmath.matrix(rows), left=False, right=False)
-        found = analyze_modes(paper(peers=2, **values))
+        found = analyze(paper(peers=2, **values))
         radius = max(abs(value) for value in truth if abs(value - 1) > mpmath.mpf(10) ** -30)
         assert abs(radius - found.spectral_radius) <= found.spectral_radius_error
 
@@ -256,7 +256,7 @@ def test_scenes_with_long_queues_and_extreme_numbers_are_decided(
     text = (ROOT / "models" / "scenes" / "template.yaml").read_text(encoding="utf-8")
     assert text.count(old) == 1
     (tmp_path / "scene.yaml").write_text(text.replace(old, new), encoding="utf-8")
-    found = analyze_modes(apc.compile(tmp_path / "scene.yaml"))
+    found = analyze(apc.compile(tmp_path / "scene.yaml"))
     assert found.stable is stable
     assert found.spectral_radius_error < width
     assert all(math.isfinite(mode.error) for mode in found.modes)
@@ -295,7 +295,7 @@ def test_whatever_the_matrix_every_bound_is_finite_and_holds_the_truth() -> None
 
 
 def test_conjugates_of_a_real_matrix_are_exact_and_the_upper_one_is_first() -> None:
-    found = analyze_modes(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
+    found = analyze(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
     pairs = [mode.eigenvalue for mode in found.modes if mode.eigenvalue.imag]
     assert pairs
     for upper, lower in zip(pairs[::2], pairs[1::2], strict=True):
@@ -328,7 +328,7 @@ def test_relative_coordinates_are_bounded_against_exact_rationals() -> None:
 def test_a_fast_shake_in_a_slow_frame_keeps_its_frequency() -> None:
     """Device and cube on a spring: ω² = K (1/m + 1/m_O); forces every 0.1 ms, 1.5 turns a frame."""
     stiffness = 1e5
-    found = analyze_modes(paper(kc=stiffness, kt=0.0, haptic=MS / 10, comp=Fraction(0)))
+    found = analyze(paper(kc=stiffness, kt=0.0, haptic=MS / 10, comp=Fraction(0)))
     expected = math.sqrt(stiffness * 15) / (2 * math.pi)
     assert expected > 1.5 / 0.008
     assert found.modes[0].frequency_hz == pytest.approx(expected, rel=3e-3)
@@ -341,7 +341,7 @@ def test_an_oscillator_has_its_textbook_frequency_and_damping() -> None:
         paper(kc=100.0, kt=0.0, haptic=MS / 100, network=MS, comp=Fraction(0)),
         ("user", 3, {"device.damping": 2.0, "cube.damping": 4.0}),
     )
-    [first, *_] = [mode for mode in analyze_modes(system).modes if mode.frequency_hz > 0]
+    [first, *_] = [mode for mode in analyze(system).modes if mode.frequency_hz > 0]
     natural = math.sqrt(100.0 * 15)
     ratio = 20.0 / (2 * natural)
     assert first.damping_ratio == pytest.approx(ratio, rel=2e-3)
@@ -349,17 +349,17 @@ def test_an_oscillator_has_its_textbook_frequency_and_damping() -> None:
 
 
 def test_shares_name_the_states_that_take_part_and_add_up() -> None:
-    found = analyze_modes(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
+    found = analyze(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
     for mode in found.modes:
         assert sum(share for _, share in mode.participation) == pytest.approx(1, abs=1e-12)
         assert [name for name, _ in mode.participation][:2] == ["device.x", "device.v"]
-    free = analyze_modes(paper(kc=0.0, kt=0.0, comp=Fraction(0)))
+    free = analyze(paper(kc=0.0, kt=0.0, comp=Fraction(0)))
     slow = next(mode for mode in free.modes if abs(mode.eigenvalue - math.exp(-0.2)) < 1e-9)  # b/m_O = 25/s
     assert dict(slow.participation)["cube.v"] == pytest.approx(1, abs=1e-9)
 
 
 def test_a_mode_that_ends_in_finite_time_has_no_frequency() -> None:
-    found = analyze_modes(paper(kc=0.0, kt=0.0))
+    found = analyze(paper(kc=0.0, kt=0.0))
     dead = [mode for mode in found.modes if mode.magnitude < 1e-9]
     assert dead
     assert {(mode.frequency_hz, mode.damping_ratio) for mode in dead} == {(0.0, 1.0)}
@@ -373,18 +373,18 @@ def _undamped(**values: object) -> CompiledSystem:
 
 
 def test_every_verdict_says_what_it_says() -> None:
-    assert analyze_modes(paper()).verdict == "stable up to a common translation"
-    assert analyze_modes(paper(kc=2500.0)).verdict == "unstable"
-    drifting = analyze_modes(_undamped(kt=0.0, bt=2.0, bc=2.0, comp=Fraction(0)))
+    assert analyze(paper()).verdict == "stable up to a common translation"
+    assert analyze(paper(kc=2500.0)).verdict == "unstable"
+    drifting = analyze(_undamped(kt=0.0, bt=2.0, bc=2.0, comp=Fraction(0)))
     assert (drifting.verdict, drifting.stable) == ("drifts", False)
     assert drifting.spectral_radius < 1
-    shaking = analyze_modes(_undamped(kt=0.0, bt=0.0, kc=3000.0))
+    shaking = analyze(_undamped(kt=0.0, bt=0.0, kc=3000.0))
     assert (shaking.verdict, shaking.stable) == ("unstable", False)
 
 
 def test_the_dense_system_gives_the_same_answer() -> None:
     for values in ({}, {"kt": 0.0}, {"operator": "sum", "kc": 2500.0}):
-        split, whole = analyze_modes(paper(**values)), analyze_dense(paper(**values))  # type: ignore[arg-type]
+        split, whole = analyze(paper(**values)), analyze(paper(**values), method="dense")  # type: ignore[arg-type]
         assert split.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-12)
         assert (split.verdict, split.rigid_modes) == (whole.verdict, whole.rigid_modes)
         assert sum(mode.multiplicity for mode in split.modes) == len(whole.modes)

@@ -10,7 +10,7 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze_modes
+from apc.runtime.analysis import analyze
 from apc.runtime.linearize import LinearSite, jacobians, linearize
 from apc.runtime.switches import SwitchingPart, bind, find_switches, switching_parts
 from tests.sites import alone
@@ -161,4 +161,4 @@ def test_a_scene_without_decisions_is_as_it_was() -> None:
     switched = find_switches(kind)
     assert switched.walkable
     assert switched.decisions == ()
-    assert analyze_modes(system).stable
+    assert analyze(system).stable

@@ -18,7 +18,7 @@ import flint
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import Prepared, analyze_modes, prepare
+from apc.runtime.analysis import Prepared, analyze, prepare
 from apc.runtime.balls import precision
 from apc.runtime.parameters import Override, apply
 from apc.runtime.threads import single_threaded
@@ -124,7 +124,7 @@ class Tally:
         """Analyse a point and compare."""
         began = time.perf_counter()
         changed = apply(system, [Override(name, None, Fraction(value)) for name, value in values.items()])
-        found = analyze_modes(changed, prepared=shared)
+        found = analyze(changed, prepared=shared)
         self.seconds += time.perf_counter() - began
         self.points += 1
         self.undecided += found.stable is None

@@ -88,9 +88,7 @@ def paper(quick: bool) -> None:
     print(f"    of it set-up    {1e3 * set_up:8.1f} ms   equations of one peer, whatever is asked of them")
     print(f"    true error      {off:11.1e}   against 50 digits, at the points and between")
     print(f"  obvious program   {1e3 * naive:8.1f} ms   {wrong}")
-    print(
-        f"  ratio             {naive / exact:8.1f}      {naive / (exact - set_up):.1f} with set-up not counted"
-    )
+    print(f"  ratio             {naive / exact:8.1f}      {naive / (exact - set_up):.1f} without set-up")
     print(f"  target            {TARGET:8.1f}")
 
 

@@ -76,7 +76,7 @@ def growth() -> None:
     found = simulate(system, duration=Fraction(16), signals=["cube.v"])
     size = np.linalg.norm(found.values[::8], axis=1)
     grown = (size[-100:].max() / size[-1100:-1000].max()) ** 1e-3
-    radius = analyze_dense(system).spectral_radius
+    radius = analyze(system, method="dense").spectral_radius
     print(
         f"growth of an unstable run a frame         {grown:.6f}, spectral radius {radius:.6f}, relative {abs(grown / radius - 1):.1e}"
     )

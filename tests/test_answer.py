@@ -1,0 +1,75 @@
+"""What stands beside the verdict: it comes from the same scene, and never changes the verdict."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from apc.compiler.errors import ApcError
+from apc.compiler.pipeline import compile_topology
+from apc.runtime.analysis import analyze
+from apc.runtime.answer import answer, judge
+from apc.runtime.box import parse_range
+from tests.topologies import AVERAGE, ROOT, SCENES, replaced
+
+FLIPS = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"
+
+
+def test_the_verdict_is_that_of_the_analysis_alone() -> None:
+    system = compile_topology(SCENES / "three-users-average.yaml")
+    found, alone = answer(system), analyze(system)
+    assert found.analysis.verdict == alone.verdict
+    assert found.analysis.modes == alone.modes
+    assert found.contact_modes is None  # nothing switches in it
+    assert found.to_dict()["spectral_radius"] == alone.spectral_radius
+
+
+def test_a_json_answer_holds_what_stands_beside_the_verdict() -> None:
+    system = compile_topology(SCENES / "three-users-average.yaml")
+    found = json.loads(json.dumps(answer(system).to_dict(), allow_nan=False))
+    margin = {one["parameter"]: one for one in found["margins"]}["coordination.stiffness"]
+    assert margin["value"] == pytest.approx(1096.411, rel=1e-6)  # the limit derived for this scene
+    assert found["sensitivities"]["derivatives"][0]["parameter"] == "device.damping"
+    assert found["warnings"] == []
+    assert "conventions" not in found and "box" not in found
+
+
+def test_a_verdict_that_hangs_on_a_convention_is_warned_of() -> None:
+    system = compile_topology(FLIPS)
+    found = answer(system)
+    assert found.to_dict()["warnings"] == [found.conventions.warning]
+    assert "Warning: the verdict hangs on a convention" in str(found)
+    assert all(len(line) <= 80 for line in str(found).splitlines())
+
+
+def test_a_scene_with_contact_says_which_mode_is_unstable() -> None:
+    text = str(answer(compile_topology(SCENES / "experiment-average.yaml")))
+    assert "unstable when on at no peer or on at right" in text
+    assert all(len(line) <= 80 for line in text.splitlines())
+
+
+def test_a_box_and_a_proof_stand_below_the_answer() -> None:
+    system = compile_topology(SCENES / "three-users-average.yaml")
+    ranges = [parse_range(system, "contact.stiffness=±1%")]
+    found = answer(system, certify=True, box=ranges, every_convention=True)
+    assert found.analysis.proof.startswith("proved stable")
+    assert found.box is not None and found.box.stable
+    assert {"conventions", "box"} <= found.to_dict().keys()
+
+
+def test_the_method_of_the_paper_agrees_and_proves_nothing() -> None:
+    system = compile_topology(SCENES / "three-users-average.yaml")
+    assert judge(system, method="paper").spectral_radius == pytest.approx(
+        judge(system).spectral_radius, abs=1e-12
+    )
+    with pytest.raises(ApcError, match="E850 method paper gives no proof"):
+        judge(system, method="paper", certify=True)
+
+
+def test_packet_loss_is_said_to_be_out_of_the_verdict(tmp_path: Path) -> None:
+    path = tmp_path / "lossy.yaml"
+    path.write_text(replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 2 %}")), encoding="utf-8")
+    notes = " ".join(analyze(compile_topology(path)).notes)
+    assert "lan" in notes and "apc simulate" in notes
