@@ -31,7 +31,7 @@ from apc.runtime.parameters import Numbers, resolve
 from apc.runtime.peers import (
     MOST_STATES,
     PeerGroup,
-    different_peers,
+    more_differ,
     peer_groups,
     states_of,
     too_large,
@@ -266,7 +266,7 @@ def _many(system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange
     if states <= FEW_STATES:
         return False
     most = max(len(kind.states) for kind in system.kinds)
-    return different_peers(system, prepared.jacobians, numbers, exchange) * most > FEW_STATES
+    return more_differ(system, prepared.jacobians, numbers, exchange, FEW_STATES // most)
 
 
 def _arranged(
@@ -363,27 +363,3 @@ def _scheduled(
     """Add the schedules of these timings to the Jacobians."""
     schedules = build_schedules(system, timings, [site.pattern for site in built], order=order)
     return Prepared(built, schedules, timings, order)
-
-
-def analyze_modes(
-    system: CompiledSystem, *, prepared: Prepared | None = None, certify: bool = False
-) -> Analysis:
-    return analyze(system, prepared=prepared, certify=certify)
-
-
-def analyze_dense(
-    system: CompiledSystem, *, prepared: Prepared | None = None, certify: bool = False
-) -> Analysis:
-    return analyze(system, method="dense", prepared=prepared, certify=certify)
-
-
-def analyze_modes(
-    system: CompiledSystem, *, prepared: Prepared | None = None, certify: bool = False
-) -> Analysis:
-    return analyze(system, prepared=prepared, certify=certify)
-
-
-def analyze_dense(
-    system: CompiledSystem, *, prepared: Prepared | None = None, certify: bool = False
-) -> Analysis:
-    return analyze(system, method="dense", prepared=prepared, certify=certify)

@@ -22,23 +22,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.cells import INSIDE_RIM, Survey
+from apc.runtime.boundary_points import MOST_STEPS, SHORT, clear, cross, just_inside, moved, polish
+from apc.runtime.cells import Survey
 from apc.runtime.curves import between, fill, off_an_arc, stencils, through_four
 from apc.runtime.discretize import UNIT
-from apc.runtime.eigenpairs import Family, Pairs, follow, join, leading, log_magnitudes, value_errors
+from apc.runtime.eigenpairs import Family, Pairs, follow, join, log_magnitudes, value_errors
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Integers = NDArray[np.int64]
-
-# A step this short, in unit coordinates, leaves an error of its square.
-SHORT = 1e-8
-
-# Newton's method either arrives within so many steps or is not near anything.
-MOST_STEPS = 8
-
-# A bracket is closed in on at most so many times, each time by half or more.
-MOST_BRACKETS = 50
 
 # Halvings of the intervals between the first points of a curve. Each makes the interpolant 16 times better.
 MOST_HALVINGS = 12
@@ -56,9 +48,6 @@ ASTRAY = 0.25
 
 # Two ends of an interval are on one branch if the eigenvalue's slopes explain its difference to this share.
 EXPLAINED = 0.25
-
-# log|λ| of another eigenvalue at a point of the boundary above this means that the point isn't on it.
-OUTSIDE = 1e-9
 
 # The share of the tolerance that interpolation may take.
 FILLED = 0.75
@@ -138,7 +127,7 @@ def trace(family: Family, found: Survey, *, tolerance: float, offset: Floats) ->
     """
     if not found.crossings:
         return ()
-    points, pairs = _cross(
+    points, pairs = cross(
         family,
         np.array([one.stable for one in found.crossings]),
         np.array([one.unstable for one in found.crossings]),
@@ -184,142 +173,6 @@ def _tangents(gradient: Floats) -> Floats:
     return unit
 
 
-def _cross(family: Family, stable: Floats, unstable: Floats, growth: Floats) -> tuple[Floats, Pairs]:
-    """Return where the boundary lies on stretches from stable to unstable points, and who decides there.
-
-    Parameters
-    ----------
-    family
-        The closed systems.
-    stable, unstable
-        The ends of the stretches (k, 2).
-    growth
-        The log of the spectral radius at both ends (k, 2).
-
-    Notes
-    -----
-    The eigenvalue that is largest at the unstable end is followed to where it enters the unit circle. If
-    another one is still outside there, that point is the new unstable end; if Newton's method went nowhere,
-    the middle becomes an end.
-    """
-    count = len(stable)
-    low, high = np.zeros(count), np.ones(count)
-    along = unstable - stable
-    points = unstable.copy()
-    pairs = leading(family, _inside(unstable))
-    guess = _quadratic_root(growth, (pairs.gradient * along).sum(axis=1))
-    rest = np.arange(count)
-    for _ in range(MOST_BRACKETS):
-        start = stable[rest] + guess[rest, None] * along[rest]
-        place, found = _polish(family, start, _moved(pairs.at(rest), start - points[rest]), along[rest])
-        length = np.square(along[rest]).sum(axis=1)
-        reached = ((place - stable[rest]) * along[rest]).sum(axis=1) / length
-        arrived = np.isfinite(reached) & (reached >= low[rest]) & (reached <= high[rest])
-        middle = (low[rest] + high[rest]) / 2
-        looked_at = np.where(arrived, reached, middle)
-        spots = stable[rest] + looked_at[:, None] * along[rest]
-        top = log_magnitudes(family, _inside(spots), 1)[:, 0]
-        good = arrived & (top <= _rounded(spots, found.gradient))
-        done = rest[good]
-        points[done] = place[good]
-        _put(pairs, done, found.at(good))
-        out = ~good & (top > 0)
-        low[rest[~good & ~out]] = looked_at[~good & ~out]
-        high[rest[out]] = looked_at[out]
-        again = rest[out]
-        if len(again):
-            points[again] = spots[out]
-            _put(pairs, again, leading(family, points[again]))
-        rest = rest[~good]
-        if not len(rest):
-            break
-        guess[rest] = (low[rest] + high[rest]) / 2
-    return points, pairs
-
-
-def _quadratic_root(growth: Floats, slope: Floats) -> Floats:
-    """Return where in (0, 1) a quadratic vanishes, of given values (k, 2) at 0 and 1 and slope (k,) at 1.
-
-    Where the slope doesn't fit, by another mode at the other end, the secant's root.
-    """
-    low, high = growth.T
-    bend = slope - (high - low)  # g = high + slope (t − 1) + bend (t − 1)²
-    root = np.sqrt(np.maximum(slope**2 - 4 * bend * high, 0.0))
-    # The root next to t = 1, in the form that cancels nothing.
-    found = 1 - 2 * high / np.where(slope + root > 0, slope + root, np.inf)
-    fits = (found > 0) & (found < 1) & (slope > 0)
-    guess: Floats = np.where(fits, found, low / (low - high))
-    return guess
-
-
-def _put(pairs: Pairs, places: Integers, new: Pairs) -> None:
-    """Write pairs into others, in place."""
-    for name in Pairs.__slots__:
-        getattr(pairs, name)[places] = getattr(new, name)
-
-
-def _inside(points: Floats) -> Floats:
-    """Return points a hair inside the unit square, as the survey samples them."""
-    return np.clip(points, INSIDE_RIM, 1 - INSIDE_RIM)
-
-
-def _rounded(points: Floats, gradient: Floats) -> Floats:
-    """Return up to where log|λ| counts as zero at points of the boundary, looked at a hair inside the rim."""
-    shift = np.abs(_inside(points) - points)
-    limit: Floats = OUTSIDE + 2 * (shift * np.abs(gradient)).sum(axis=1)
-    return limit
-
-
-def _clear(family: Family, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
-    """Say of each point of the boundary whether no other eigenvalue has left the unit circle there."""
-    clear: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
-    if clear.any():
-        top = log_magnitudes(family, _inside(points[clear]), 1)[:, 0]
-        clear[clear] = top <= _rounded(points[clear], pairs.gradient[clear])
-    return clear
-
-
-def _moved(pairs: Pairs, by: Floats) -> Pairs:
-    """Return a guess of the pairs at points moved by (k, 2), to first order."""
-    return replace(pairs, value=pairs.value + (pairs.slope * by).sum(axis=1))
-
-
-def _polish(
-    family: Family, points: Floats, guess: Pairs, along: Floats | None = None
-) -> tuple[Floats, Pairs]:
-    """Move points onto the curve log|λ| = 0 of the eigenvalues guessed; NaN where that leads nowhere.
-
-    Parameters
-    ----------
-    family
-        The closed systems.
-    points
-        Where to begin (k, 2).
-    guess
-        The eigenvalues to follow.
-    along
-        Directions to stay on (k, 2); left out, each point moves down its gradient.
-    """
-    points, pairs = points.copy(), guess.at(np.arange(len(points)))
-    rest = np.arange(len(points))
-    for _ in range(MOST_STEPS):
-        own = follow(family, points[rest], pairs.at(rest))
-        _put(pairs, rest, own)
-        way = own.gradient if along is None else along[rest]
-        rise = (own.gradient * way).sum(axis=1)
-        step = -(own.growth / np.where(rise == 0, np.nan, rise))[:, None] * way
-        points[rest] += step
-        left = ~(np.linalg.norm(step, axis=1) <= SHORT)
-        lost = ~(np.linalg.norm(step, axis=1) <= 1)
-        points[rest[lost]] = np.nan
-        pairs.value[rest] += (own.slope * np.where(lost[:, None], 0, step)).sum(axis=1)
-        rest = rest[left & ~lost]
-        if not len(rest):
-            return points, pairs
-    points[rest] = np.nan
-    return points, pairs
-
-
 def _halve(
     family: Family, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats, *, guarded: bool
 ) -> Integers:
@@ -338,11 +191,11 @@ def _halve(
         chord = knots.points[b] - knots.points[a]
         length = np.linalg.norm(chord, axis=1)
         expected, unseen, gain = _expected(knots, a, b)
-        place, pairs = _polish(family, expected, _halfway(knots, a, b, chord))
+        place, pairs = polish(family, expected, _halfway(knots, a, b, chord))
         off = np.linalg.norm(place - expected, axis=1)
         good = off <= ASTRAY * length
         if guarded:
-            good &= _clear(family, place, pairs)
+            good &= clear(family, place, pairs)
         lost = np.concatenate([lost, np.stack([a[~good], b[~good]], axis=1)])
         a, b, place, pairs = a[good], b[good], place[good], pairs.at(good)
         off = off[good] / gain[good] + unseen[good]
@@ -423,9 +276,9 @@ def _corners(family: Family, knots: _Knots, intervals: Integers) -> tuple[Intege
     pairs = join([knots.pairs.at(a), knots.pairs.at(b)])
     before = np.concatenate([knots.points[a], knots.points[b]])
     for _ in range(MOST_STEPS):
-        moved = _moved(pairs, np.concatenate([place, place]) - before)
-        pairs = follow(family, np.concatenate([place, place]), moved)
-        before = np.concatenate([place, place])
+        both = np.concatenate([place, place])
+        pairs = follow(family, both, moved(pairs, both - before))
+        before = both
         rows = np.stack([pairs.gradient[:count], pairs.gradient[count:]], axis=1)
         growth = np.stack([pairs.growth[:count], pairs.growth[count:]], axis=1)
         regular = np.abs(np.linalg.det(rows)) > UNIT * np.square(rows).sum(axis=(1, 2))
@@ -439,10 +292,9 @@ def _corners(family: Family, knots: _Knots, intervals: Integers) -> tuple[Intege
             break
     off = np.linalg.norm(place - (knots.points[a] + knots.points[b]) / 2, axis=1)
     good = regular & (size <= SHORT) & (off <= length)
-    good &= _clear(family, place, pairs.at(np.arange(count)))
+    good &= clear(family, place, pairs.at(np.arange(count)))
     a, b, place = a[good], b[good], place[good]
-    both = np.concatenate([good, good])
-    own = pairs.at(both)
+    own = pairs.at(np.concatenate([good, good]))
     third = (knots.key[b] - knots.key[a]) / 3
     ends = knots.add(place, own.at(np.arange(len(a))), a, knots.key[a] + third)
     starts = knots.add(place, own.at(np.arange(len(a), 2 * len(a))), a, knots.key[b] - third)
@@ -460,14 +312,14 @@ def _search(family: Family, knots: _Knots, intervals: Integers) -> Integers:
     chord = knots.points[b] - knots.points[a]
     middle = (knots.points[a] + knots.points[b]) / 2
     across = np.stack([chord[:, 1], -chord[:, 0]], axis=1) / 2  # to the right, where it is unstable
-    stable, unstable = _inside(middle - across), _inside(middle + across)
+    stable, unstable = just_inside(middle - across), just_inside(middle + across)
     ends = log_magnitudes(family, np.concatenate([stable, unstable]), 1)[:, 0].reshape(2, -1).T
     found = (ends[:, 0] < 0) & (ends[:, 1] >= 0)
     knots.error[a[~found]] = np.linalg.norm(chord[~found], axis=1)
     a, b = a[found], b[found]
     if not len(a):
         return intervals[:0]
-    place, pairs = _cross(family, stable[found], unstable[found], ends[found])
+    place, pairs = cross(family, stable[found], unstable[found], ends[found])
     new = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
     return np.concatenate([np.stack([a, new], axis=1), np.stack([new, b], axis=1)])
 

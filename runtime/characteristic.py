@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 # Steps of the power method for a scaling, and the least ratio of its entries.
-POWER_STEPS, FLOOR, TINY = 8, 1e-12, 1e-300
+POWER_STEPS, FLOOR, TINY = 4, 1e-12, 1e-300
 
 # Steps of Newton's method, none longer than this share of |ζ|; the relative step at which it has arrived, and
 # that from which on rounding alone moves it. Nobody looks for a zero beyond the last.
@@ -171,8 +171,13 @@ def refine(
             moved = now + step
             size = np.abs(moved)
             lost = ~np.isfinite(size) | (size <= function.innermost) | (size > FARTHEST)
-            points[active], steps[active] = np.where(lost, np.nan, moved), np.abs(step) / size
-            active = active[~lost & ~(steps[active] <= ARRIVED)]
+            before, steps[active] = steps[active], np.abs(step) / size
+            points[active] = np.where(lost, np.nan, moved)
+            # Far below what is `NEAR`, steps that no longer shrink are rounding.
+            arrived = (steps[active] <= ARRIVED) | (
+                (steps[active] < NEAR**1.5) & (steps[active] > before / 2)
+            )
+            active = active[~lost & ~arrived]
         # Rounding may keep it from standing still; who has found a zero is told by the bounds.
         return np.where(steps < NEAR, points, np.nan)
 

@@ -30,19 +30,19 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 # Modes listed of each system; of many peers fewer, as the shares of all peers are worked out for each.
-LISTED, LISTED_OF_MANY, MANY = 8, 1, 20_000
+LISTED, LISTED_OF_MANY, MANY = 6, 1, 20_000
 
 # Poles of a crowd's sites that zeros are looked for close to.
 NEAR_POLES = 6
 
 # Peers of a crowd whose copies, all equal, tell where its common zeros may be.
-SAMPLES = 5
+SAMPLES = 3
 
 # Smaller eigenvalues of these decide nothing.
-LEAST_START = 0.1
+LEAST_START = 0.5
 
 # Zeros of a loop that Newton's method starts from, the largest by their estimate.
-STARTS = 64
+STARTS = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,14 +114,23 @@ def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spect
 def _solve_loop(loop: Loop) -> _Solved:
     """Find the largest modes of a loop."""
     function = of_loop(loop.sites, loop.coupling, loop.doubts)
-    free = find_rigid_modes(loop, with_drifts=False)
-    rigid, drifts = free.directions.shape[1], 0
+    prompt = _without_packets(loop)
+    rigid, drifts = find_rigid_modes(prompt, with_drifts=False).directions.shape[1], 0
     starts = _delay_starts(function)
     zeros = find_zeros(function, starts, rigid=rigid, listed=LISTED)
-    if rigid and not zeros.rigid_counted and (drifts := find_rigid_modes(loop).drifts):
+    if rigid and not zeros.rigid_counted and (drifts := find_rigid_modes(prompt).drifts):
         zeros = find_zeros(function, starts, rigid=rigid + drifts, listed=LISTED)
     modes = _with_conjugates(_loop_mode(function, loop, zero) for zero in zeros.found)
     return _Solved(zeros, rigid, drifts, modes)
+
+
+def _without_packets(loop: Loop) -> Loop:
+    """Return the loop with no packet in its state: how many motions are rigid does not depend on delays."""
+    sites = tuple(
+        replace(group, schedule=replace(group.schedule, depths=(0,) * len(group.schedule.depths)))
+        for group in loop.sites
+    )
+    return replace(loop, sites=sites)
 
 
 def _delay_starts(function: Characteristic) -> Complexes:

@@ -86,6 +86,7 @@ class _Passes:
             "abstol": self.tolerance,
             "max_num_steps": MOST_STEPS,
             "disable_internal_warnings": True,
+            "show_eval_warnings": False,
         }
         return casadi.integrator(name, "cvodes", problem, 0.0, list(outputs), options)
 

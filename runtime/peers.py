@@ -1,7 +1,7 @@
 """Which peers move alike: the groups of equal peers of a scene, each linearized and lifted once.
 
 Takes: a `CompiledSystem`, its numbers, Jacobians and schedules, and the exchange.
-Gives: `PeerGroup`, `peer_groups`, `different_peers`, `group_of_row`.
+Gives: `PeerGroup`, `peer_groups`, `more_differ`, `group_of_row`.
 Guarantees: as few groups as there are peers of different dynamics, found in a time that grows with the number
 of peers, not with its square. A site that is not affine is linearized at its own start values, hearing the
 others at theirs.
@@ -76,6 +76,9 @@ MOST_DIFFERENT = 400
 # More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
 # their error bounds would decide nothing.
 MOST_STATES = 1000
+
+# Peers looked at together for whether they differ: mostly, the first ones tell.
+PEEK = 1024
 
 # Names of peers written out in the name of a group that is part of a scene's group.
 MOST_NAMED = 4
@@ -191,15 +194,23 @@ def _by_matrices(
     return tuple(found)
 
 
-def different_peers(
-    system: CompiledSystem, jacobians: Sequence[SiteJacobians], numbers: Numbers, exchange: Exchange
-) -> int:
-    """Return how many peers of different matrices there are, all of them affine and without edges."""
-    keys = set()
+def more_differ(
+    system: CompiledSystem,
+    jacobians: Sequence[SiteJacobians],
+    numbers: Numbers,
+    exchange: Exchange,
+    count: int,
+) -> bool:
+    """Say whether there are more than `count` peers of different matrices, all affine and without edges."""
+    keys: set[_Key] = set()
     for place, group in enumerate(system.groups):
-        rows = linearize_rows(jacobians[group.kind], numbers.parameters[place])
-        keys |= {(group.kind, exchange.role(place), row.tobytes()) for row in rows}
-    return len(keys)
+        parameters = numbers.parameters[place]
+        for start in range(0, len(parameters), PEEK):
+            rows = linearize_rows(jacobians[group.kind], parameters[start : start + PEEK])
+            keys |= {(group.kind, exchange.role(place), row.tobytes()) for row in rows}
+            if len(keys) > count:
+                return True
+    return False
 
 
 def group_of_row(

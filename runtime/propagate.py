@@ -23,6 +23,7 @@ from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.discretize import discretize
 from apc.runtime.exact import evaluate_exact
+from apc.runtime.guards import guards_of
 
 Floats = NDArray[np.float64]
 Pattern = NDArray[np.bool_]
@@ -57,13 +58,11 @@ class Transitions:
 
 def nonlinear_rows(kind: Kind) -> tuple[int, ...]:
     """Return the states whose equations are not linear, and all that equations tie to them."""
-    moving, p, t, speed = _symbols(kind)
-    slopes = casadi.jacobian(speed, moving)
-    curved = [row for row in range(slopes.size1()) if _is_curved(slopes[row, :], moving, t)]
+    moving, _, t, speed = _symbols(kind)
+    curved = _curved(speed, moving, t)
     if not curved:
         return ()
-    n_x = len(kind.states)
-    tied = _structure(slopes)[:, :n_x]
+    tied = _structure(kind.derivative.jac_sparsity(0, 0))
     together = _closure(tied | tied.T)
     return tuple(np.flatnonzero(together[:, curved].any(axis=1)).tolist())
 
@@ -85,9 +84,10 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
     """
     moving, p, t, speed = _symbols(kind)
     n_x, rest = len(kind.states), sorted(set(range(len(kind.states))) - set(moved))
+    curved = sorted(set(_curved(speed, moving, t)) & set(rest))
+    if curved:
+        raise _nonlinear(kind, curved, speed, moving, p)
     slopes = casadi.jacobian(speed, moving)
-    if rest and _is_curved(slopes[rest, :], moving, t):
-        raise _nonlinear(kind, slopes, moving, p, t)
     type_ = type(moving)
     at_rest = kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
     kept = casadi.diag(casadi.DM([float(row in rest) for row in range(n_x)]))
@@ -131,24 +131,6 @@ def shaken(exact: Transitions, seed: int) -> Transitions:
     return Transitions(tuple(moved(one) for one in exact.matrices), exact.a)
 
 
-def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:
-    """Return (x, u), p and t as symbols, and the rates of change."""
-    type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
-    x, u = type_.sym("x", len(kind.states)), type_.sym("u", len(kind.holds))
-    p, t = type_.sym("p", len(kind.parameters)), type_.sym("t")
-    speed = kind.derivative(x, u, p, t)
-    if type_ is casadi.SX:
-        return casadi.vertcat(x, u), p, t, speed
-    # A derivative is taken with respect to a symbol, which a column of two is not.
-    both = type_.sym("moving", x.numel() + u.numel())
-    speed = kind.derivative(both[: x.numel()], both[x.numel() :], p, t)
-    return both, p, t, speed
-
-
-def _is_curved(slopes: Any, moving: Any, t: Any) -> bool:
-    return bool(slopes.nnz() and casadi.depends_on(slopes, casadi.vertcat(moving, t)))
-
-
 def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fraction]) -> Transitions:
     """Return what a site does in every duration.
 
@@ -177,10 +159,37 @@ def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fractio
     return Transitions(tuple(step.matrix for step in steps), whole[:, :n_x])
 
 
+def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:
+    """Return (x, u), p and t as symbols, and the rates of change."""
+    type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
+    x, u = type_.sym("x", len(kind.states)), type_.sym("u", len(kind.holds))
+    p, t = type_.sym("p", len(kind.parameters)), type_.sym("t")
+    speed = kind.derivative(x, u, p, t)
+    if type_ is casadi.SX:
+        return casadi.vertcat(x, u), p, t, speed
+    # A derivative is taken with respect to a symbol, which a column of two is not.
+    both = type_.sym("moving", x.numel() + u.numel())
+    speed = kind.derivative(both[: x.numel()], both[x.numel() :], p, t)
+    return both, p, t, speed
+
+
+def _curved(speed: Any, moving: Any, t: Any) -> list[int]:
+    """Return the rates that are not linear in what moves: their slopes change, or they jump."""
+    slopes = casadi.jacobian(speed, moving)
+    varies = casadi.vertcat(moving, t)
+    return [
+        row
+        for row in range(speed.numel())
+        if (slopes[row, :].nnz() and casadi.depends_on(slopes[row, :], varies))
+        or (isinstance(speed, casadi.SX) and guards_of(speed[row], moving))
+    ]
+
+
 def _structure(block: Any) -> Pattern:
-    """Return the structural nonzeros of a CasADi matrix as truth values."""
+    """Return the structural nonzeros of a CasADi matrix or sparsity as truth values."""
     pattern = np.zeros((block.size1(), block.size2()), dtype=bool)
-    rows, columns = block.sparsity().get_triplet()
+    sparsity = block if isinstance(block, casadi.Sparsity) else block.sparsity()
+    rows, columns = sparsity.get_triplet()
     pattern[rows, columns] = True
     return pattern
 
@@ -193,13 +202,13 @@ def _closure(a: Pattern) -> Pattern:
     return reach
 
 
-def _nonlinear(kind: Kind, slopes: Any, moving: Any, p: Any, t: Any) -> ApcError:
+def _nonlinear(kind: Kind, rows: Sequence[int], speed: Any, moving: Any, p: Any) -> ApcError:
     """Return the mistake that names the states and the parts whose equations are not linear."""
-    varies = casadi.vertcat(moving, t)
-    rows = [row for row in range(slopes.size1()) if casadi.depends_on(slopes[row, :], varies)]
     involved = []
     for row in rows:
-        reads = casadi.which_depends(slopes[row, :].T, p, 1, False) if p.numel() else ()
+        guards = guards_of(speed[row], moving) if isinstance(speed, casadi.SX) else []
+        varies = casadi.vertcat(casadi.jacobian(speed[row], moving).T, *guards)
+        reads = casadi.which_depends(varies, p, 1, False) if p.numel() else ()
         parts = {name.rpartition(".")[0] for name, read in zip(kind.parameters, reads, strict=True) if read}
         involved.append(parts - {""})
     shared = set.intersection(*involved) or set.union(*involved)
@@ -209,6 +218,5 @@ def _nonlinear(kind: Kind, slopes: Any, moving: Any, p: Any, t: Any) -> ApcError
         f"the motion of {names} is not linear between the ticks{through}: only what is linear "
         "there can be simulated exactly"
     )
-    return ApcError(
-        Mistake("E870", Place(kind.name), what, hint="a part that computes its force at ticks of a clock")
-    )
+    hint = "no --method (what is linear stays exact), or a part that computes its force at ticks of a clock"
+    return ApcError(Mistake("E870", Place(kind.name), what, hint=hint))

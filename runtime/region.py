@@ -1,7 +1,7 @@
 """The stable region of two parameters: exact boundary curves, areas, and who is inside.
 
 Takes: a `CompiledSystem`, two parameters and their ranges.
-Gives: `RegionAxis`, `Curve`, `Region`, `region`, `parse_axes`.
+Gives: `Curve`, `Region`, `region`, `side_of_curves`.
 Guarantees: every curve comes with a bound on its distance from the boundary, the mode that makes it and that
 mode's frequency; an empty region and one without boundary are answers. What was looked at how finely is part
 of the answer: a component smaller than a cell, with nothing around it that hints at it, can be missed.
@@ -11,7 +11,7 @@ Does not: draw, or write files (see `region_figure`, `region_files`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Mistake
 from apc.runtime.analysis import Prepared, analyze, prepare
 from apc.runtime.batch import BatchEvaluator, matrix_errors
 from apc.runtime.boundary import Arc, relative_to, trace
@@ -27,8 +27,9 @@ from apc.runtime.cells import Survey, survey
 from apc.runtime.curves import area_beside, between
 from apc.runtime.eigenpairs import Family, log_magnitudes
 from apc.runtime.evaluator import PointEvaluator, evaluator, reaches_time
-from apc.runtime.grid import parse_axis
 from apc.runtime.parameters import Free, Override, apply
+from apc.runtime.region_axes import PLACE, RegionAxis
+from apc.runtime.rigid import find_rigid_modes, independent_places
 from apc.runtime.spectrum import angle_in_frame
 from apc.runtime.staircase import trace_steps
 from apc.runtime.surrogate import Rectangle, resolve_family
@@ -39,8 +40,6 @@ if TYPE_CHECKING:
     import pandas
 
 Floats = NDArray[np.float64]
-
-PLACE = Place("region")
 
 # Coarse cells along each side of the rectangle.
 CELLS = 12
@@ -56,28 +55,6 @@ FOLD = 0.1
 
 # Points looked at together when they are compared with all curves.
 CHUNK = 1024
-
-_FORM = "contact.stiffness=10 N/m:3000 N/m"
-
-
-@dataclass(frozen=True, slots=True)
-class RegionAxis:
-    """A parameter (of one group, or of all: `group` None) and its range in SI."""
-
-    name: str
-    group: str | None
-    unit: str
-    low: Fraction
-    high: Fraction
-
-    @property
-    def label(self) -> str:
-        """The parameter's name, its group before it."""
-        return f"{self.group}.{self.name}" if self.group else self.name
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the axis as plain data, ready for JSON."""
-        return {"parameter": self.label, "unit": self.unit, "range": [float(self.low), float(self.high)]}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,62 +212,6 @@ class Region:
         return bool(inside[0]) if wide.ndim == 0 else inside.reshape(wide.shape)
 
 
-def parse_axes(
-    system: CompiledSystem, x: str | None, y: str | None, *, scale: Fraction = Fraction(1)
-) -> tuple[RegionAxis, RegionAxis]:
-    """Read the two axes of a region: `PATH=LOW:HIGH` each, or the scene's own where one is left out.
-
-    Parameters
-    ----------
-    system
-        The scene.
-    x, y
-        `contact.stiffness=10 N/m:3000 N/m`, or None for that of `studies: region:`.
-    scale
-        What the range of y is divided by.
-
-    Raises
-    ------
-    ApcError
-        E901 not of that form, or missing; E902 the same parameter twice; E903 a parameter that can't be an
-        axis; E622, E881, E204, E624 as `grid.parse_axis`.
-    """
-    found = []
-    for letter, text, place in (("x", x, 0), ("y", y, 1)):
-        if text is None and len(system.region) == 2:
-            own = system.region[place]
-            unit = next((one.unit for one in system.parameters if one.name == own.parameter), "s")
-            text = f"{own.parameter}={float(own.low)!r} {unit}:{float(own.high)!r} {unit}"
-        if text is None:
-            what = f"the scene has no studies: region:, so that --{letter} must be given"
-            raise ApcError(Mistake("E901", PLACE, what, hint=f'--{letter} "{_FORM}"'))
-        name, equals, span = (part.strip() for part in text.partition("="))
-        if not (equals and name and span.count(":") == 1):
-            hint = f'--{letter} "{_FORM}"'
-            raise ApcError(
-                Mistake("E901", PLACE, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", hint)
-            )
-        try:
-            axis = parse_axis(system, name, f"{span}:2")
-        except ApcError as error:
-            mistakes = [replace(one, place=Place(f"--{letter}")) for one in error.mistakes]
-            raise ApcError(mistakes) from None
-        _refuse_period(system, axis.name, axis.label)
-        found.append(RegionAxis(axis.name, axis.group, axis.unit, axis.values[0], axis.values[-1]))
-    first, second = found
-    if (first.name, first.group) == (second.name, second.group):
-        raise ApcError(Mistake("E902", PLACE, f"{first.label} is on both axes; a region has two parameters"))
-    return first, replace(second, low=second.low / scale, high=second.high / scale)
-
-
-def _refuse_period(system: CompiledSystem, name: str, label: str) -> None:
-    """Raise E903 for what makes another frame at every value: one would see arithmetic, not physics."""
-    for clock in system.clocks:
-        if name in (clock.period, clock.phase):
-            what = f"{label} can't be an axis: at each value all clocks stand as before after another time"
-            raise ApcError(Mistake("E903", PLACE, what, hint='--vary "haptic.period=1 ms, 2 ms"'))
-
-
 def region(
     system: CompiledSystem,
     axes: tuple[RegionAxis, RegionAxis],
@@ -361,15 +282,30 @@ def _family(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, timed
     if isinstance(source, BatchEvaluator):
         return resolve_family(source, rectangle, lambda values: matrix_errors(source, values))
 
-    def errors(values: Floats) -> tuple[Floats, ...]:
-        systems = source.closed_at(values.mean(axis=0).tolist())
-        size = sum(len(one.names) for one in systems)
-        worst = max(float(one.error.max(initial=0.0)) for one in systems)
-        return (np.full((1, size, size), worst),)
-
     if timed:
         return _Timed(source, rectangle)
-    return resolve_family(source, rectangle, errors)
+    return resolve_family(source, rectangle, lambda values: _point_errors(source, values))
+
+
+def _point_errors(source: PointEvaluator, values: Floats) -> tuple[Floats, ...]:
+    """Return bounds (1, n, n) on the errors of an evaluator's one matrix, amid some values (k, 2).
+
+    A block of relative coordinates x_rest − W x_held is off by what its rows and W times the others' are.
+    """
+    middle = values.mean(axis=0)
+    (matrix,) = source.matrices(middle[None])
+    found = np.zeros(matrix.shape)
+    start = 0
+    for system in source.closed_at(middle.tolist()):
+        basis = find_rigid_modes(system, with_drifts=False).basis
+        held = independent_places(basis.T)
+        rest = np.delete(np.arange(len(system.names)), held)
+        weights = np.abs(basis[rest] @ np.linalg.inv(basis[held]))
+        error = system.error[np.ix_(rest, rest)] + weights @ system.error[np.ix_(held, rest)]
+        rows = slice(start, min(start + len(rest), found.shape[1]))
+        found[0, rows, rows] = error[: rows.stop - start, : rows.stop - start]
+        start = rows.stop
+    return (found,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

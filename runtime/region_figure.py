@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.curves import between
-from apc.runtime.region import Region, RegionAxis, side_of_curves
+from apc.runtime.region import Region, side_of_curves
+from apc.runtime.region_axes import RegionAxis
 from apc.runtime.region_panels import Panel, Panels
 from apc.runtime.trajectory import need
 

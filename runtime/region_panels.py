@@ -21,9 +21,8 @@ from apc.runtime.exchange import build_exchange
 from apc.runtime.linearize import jacobians, linearize_rows, site_of_row
 from apc.runtime.overlay import Overlay, overlay_points, parse_overlay
 from apc.runtime.parameters import Override, apply, parse_override, resolve
-from apc.runtime.region import CELLS, Floats, Region, RegionAxis, parse_axes, region
-
-PLACE = Place("region")
+from apc.runtime.region import CELLS, Floats, Region, region
+from apc.runtime.region_axes import PLACE, RegionAxis, parse_axes
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
 MOVE = Fraction(19, 13)

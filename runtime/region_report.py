@@ -6,6 +6,7 @@ Guarantees: says what was not looked for. Does not: compute.
 
 from __future__ import annotations
 
+from apc.runtime.evaluator import PointEvaluator
 from apc.runtime.region import Curve, Region
 from apc.runtime.region_panels import Panels
 
@@ -36,6 +37,8 @@ def region_report(found: Region) -> str:
     )
     lines += ["", f"  Looked at in cells of {cell}, and finer where the"]
     lines.append("  eigenvalues hint at more; an island inside one cell could be missed.")
+    if any(isinstance(curve.source, PointEvaluator) and curve.smooth for curve in found.curves):
+        lines.append("  The scene is not linear: this holds near its start values only.")
     if any(not curve.smooth for curve in found.curves):
         lines.append("  Along a time the boundary has steps: it is right to a cell only.")
     return "\n".join(lines)

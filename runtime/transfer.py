@@ -103,38 +103,25 @@ def build_transfer(space: StateSpace, counts: Floats) -> Transfer:
     majorant of rank one, Δ_kl ≤ u_k w_l, makes the Neumann series of (ζ − Λ − Δ)⁻¹ a geometric one: what it
     changes is at most (Σ_k |S X|_k u_k/|ζ − p_k|) (Σ_l w_l |Y B|_l/|ζ − p_l|) / (1 − Σ_k u_k w_k/|ζ − p_k|).
     """
+    sites, n = space.m.shape[:2]
     scale = balance(np.max(np.abs(space.m) + space.m_error, axis=0))
-    inverse = 1.0 / scale
-    space = StateSpace(
-        m=space.m * inverse[:, None] * scale,
-        b=space.b * inverse[:, None],
-        s=space.s * scale,
-        d=space.d,
-        m_error=space.m_error * inverse[:, None] * scale,
-        b_error=space.b_error * inverse[:, None],
-        s_error=space.s_error * scale,
-        d_error=space.d_error,
-    )
-    values, vectors = (part.astype(np.complex128) for part in np.linalg.eig(space.m))
-    order = np.argsort(-np.abs(values), axis=1, kind="stable")
-    values = np.take_along_axis(values, order, axis=1)
-    vectors = np.take_along_axis(vectors, order[:, None, :], axis=2)
+    values, vectors = np.empty((sites, n), np.complex128), np.empty((sites, n, n), np.complex128)
+    for place in _chunks(np.arange(sites)):
+        own, right = np.linalg.eig(space.m[place] / scale[:, None] * scale)
+        order = np.argsort(-np.abs(own), axis=1, kind="stable")
+        values[place] = np.take_along_axis(own, order, axis=1)
+        vectors[place] = np.take_along_axis(right, order[:, None, :], axis=2)
     inner = INNER * min(1.0, float(np.abs(values).max(initial=0.0))) or INNER
-    large = (np.abs(values) > inner).sum(axis=1)
-    return _gathered(space, counts, values, vectors, large, inner)
+    return _gathered(space, scale, counts, values, vectors, inner)
 
 
 def _gathered(
-    space: StateSpace,
-    counts: Floats,
-    values: Complexes,
-    vectors: Complexes,
-    large: NDArray[np.int64],
-    inner: float,
+    space: StateSpace, scale: Floats, counts: Floats, values: Complexes, vectors: Complexes, inner: float
 ) -> Transfer:
     """Split the sites, those of equally many poles together, and put the parts side by side."""
     sites, n = values.shape
     n_s, n_r = space.d.shape[1:]
+    large = (np.abs(values) > inner).sum(axis=1)
     most = int(large.max(initial=0))
     errors = np.full((sites, n), np.inf)
     poles = np.zeros((most, sites), np.complex128)
@@ -148,7 +135,7 @@ def _gathered(
     series[2, 0] += np.tensordot(counts, space.d_error, 1)
     for count in np.unique(large).tolist():
         for place in _chunks(np.flatnonzero(large == count)):
-            own = StateSpace(*(getattr(space, name)[place] for name in StateSpace.__slots__))
+            own = _balanced(space, place, scale)
             part = _split(own, values[place], vectors[place], count, inner)
             poles[:count, place] = values[place, :count].T
             residues[:count, place] = (counts[place, None, None] * part.residues).swapaxes(0, 1)
@@ -178,6 +165,21 @@ def _gathered(
         series=series[0],
         series_sizes=series[1],
         series_errors=series[2],
+    )
+
+
+def _balanced(space: StateSpace, place: NDArray[np.intp], scale: Floats) -> StateSpace:
+    """Return some sites over states in other units, powers of two so that nothing is rounded."""
+    inverse = (1.0 / scale)[:, None]
+    return StateSpace(
+        m=space.m[place] * inverse * scale,
+        b=space.b[place] * inverse,
+        s=space.s[place] * scale,
+        d=space.d[place],
+        m_error=space.m_error[place] * inverse * scale,
+        b_error=space.b_error[place] * inverse,
+        s_error=space.s_error[place] * scale,
+        d_error=space.d_error[place],
     )
 
 

@@ -240,8 +240,8 @@ def _beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
 
 
 def _arcs(function: Characteristic) -> int:
-    """Return how many arcs to begin with: f turns as often as its longest delay has frames, at least."""
-    return max(FIRST_ARCS, 8 * max(function.lags, default=0))
+    """Return how many arcs to begin with: f turns as often as its longest delay has frames."""
+    return max(FIRST_ARCS, 2 * max(function.lags, default=0))
 
 
 def _outside(

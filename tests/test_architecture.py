@@ -83,7 +83,8 @@ ORDER = (
     "apc.runtime.ensemble",
     # the stable region of two parameters
     *("apc.runtime.eigenpairs", "apc.runtime.surrogate", "apc.runtime.cells", "apc.runtime.curves"),
-    *("apc.runtime.boundary", "apc.runtime.staircase", "apc.runtime.region", "apc.runtime.region_panels"),
+    *("apc.runtime.boundary_points", "apc.runtime.boundary", "apc.runtime.staircase"),
+    *("apc.runtime.region_axes", "apc.runtime.region", "apc.runtime.region_panels"),
     *("apc.runtime.region_report", "apc.runtime.region_figure", "apc.runtime.region_files"),
     "apc.runtime.report",
     # what a person calls

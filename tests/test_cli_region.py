@@ -13,7 +13,8 @@ import pytest
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.runtime import region_files
-from apc.runtime.region import parse_axes, region
+from apc.runtime.region import region
+from apc.runtime.region_axes import parse_axes
 from apc.runtime.region_figure import stable_outlines
 from apc.runtime.region_panels import compare_regions, gain_factor, parse_panel, parse_vary
 from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced

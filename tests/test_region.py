@@ -15,7 +15,8 @@ from apc.runtime.analysis import analyze
 from apc.runtime.boundary import relative_to
 from apc.runtime.curves import between
 from apc.runtime.parameters import Override, apply
-from apc.runtime.region import Region, parse_axes, region
+from apc.runtime.region import Region, region
+from apc.runtime.region_axes import parse_axes
 from tests.paper_limit import limit
 from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced
 
@@ -169,6 +170,19 @@ def test_a_mass_and_a_damping_can_be_axes(average: CompiledSystem) -> None:
     for x, y in zip(random.uniform(0.02, 0.3, 15), random.uniform(0.5, 8, 15), strict=True):
         overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
         assert found.contains(x, y) == analyze(apply(average, overrides)).stable
+
+
+def test_a_scene_linearized_at_its_start_has_a_region_too() -> None:
+    text = (ROOT / "models" / "scenes" / "experiment-average.yaml").read_text(encoding="utf-8")
+    system = compiled(text.partition("\n")[2])
+    spans = ("contact.stiffness=100 N/m:6000 N/m", "coordination.stiffness=100 N/m:4000 N/m")
+    found = region(system, parse_axes(system, *spans), cells=6)
+    assert found.curves
+    assert "holds near its start values only" in str(found)
+    random = np.random.default_rng(2)
+    for x, y in random.uniform([100, 100], [6000, 4000], (8, 2)).tolist():
+        overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
+        assert found.contains(x, y) == analyze(apply(system, overrides)).stable
 
 
 def test_over_a_delay_the_boundary_is_known_to_a_cell(average: CompiledSystem) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze_dense, lifted_groups
+from apc.runtime.analysis import analyze, lifted_groups
 from apc.runtime.modes import dense
 from apc.runtime.simulation import blocks, prepare
 from apc.runtime.trajectory import Trajectory, simulate

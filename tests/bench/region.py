@@ -19,7 +19,8 @@ from apc.runtime.boundary import relative_to
 from apc.runtime.curves import between
 from apc.runtime.evaluator import evaluator
 from apc.runtime.parameters import Free, apply, parse_override
-from apc.runtime.region import Region, parse_axes, region
+from apc.runtime.region import Region, region
+from apc.runtime.region_axes import parse_axes
 from apc.runtime.threads import single_threaded
 from tests.bench.naive_region import stable_grid
 from tests.paper_limit import limit

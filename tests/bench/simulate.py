@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from apc.runtime.analysis import analyze_dense, lifted_groups
+from apc.runtime.analysis import analyze, lifted_groups
 from apc.runtime.modes import dense
 from apc.runtime.simulation import blocks, prepare
 from apc.runtime.threads import single_threaded
