@@ -1,6 +1,7 @@
 """How far a simulation is from the scene's true motion: the same played again, more closely.
 
-Takes: a `CompiledSystem`, how it was played. Gives: `Comparison`, `SignalError`, `ErrorEstimate`, `compare_with`.
+Takes: a `Simulation`.
+Gives: `Comparison`, `SignalError`, `ErrorEstimate`, `compare_with`, `error_text`.
 Guarantees: the two runs hear the same packets; the memory used does not grow with the duration.
 Does not: prove a bound: where a motion is unstable, or contacts are lost and made, both runs go ways of their
 own, and the estimate says so by its size.
@@ -29,7 +30,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class SignalError:
-    """The largest error of a signal, in SI, when it was, and the signal's range; `relative` is their ratio."""
+    """The largest error of a signal, in SI, at `at` seconds; `relative` is its ratio to the range `span`."""
 
     name: str
     unit: str
@@ -113,7 +114,7 @@ def compare_with(simulation: Simulation, *, signals: Sequence[str] = (), jit: bo
     jit
         Whether to compile to machine code where there is a C compiler.
     """
-    method, factor = finer(simulation.method, all_linear=simulation.all_linear)
+    method, factor = finer(simulation.method, all_linear=not simulation.tolerances)
     closer = prepare(
         simulation.system,
         simulation.duration,
@@ -127,6 +128,16 @@ def compare_with(simulation: Simulation, *, signals: Sequence[str] = (), jit: bo
     if method.step is not None:
         return Comparison(closer, "method", f"half the step, {method}", factor)
     return Comparison(closer, "method", f"tolerance {method.tolerance:g}", factor)
+
+
+def error_text(estimate: ErrorEstimate) -> str:
+    """Return what a person reads of an estimate: the signal that is worst, and what it was compared with."""
+    worst = estimate.worst
+    about = "none but rounding; about " if estimate.kind == "rounding" else "about "
+    if worst is None or not worst.error:
+        return f"{about}0 in every signal ({estimate.compared})"
+    size = f"{worst.error:.1g} {worst.unit} in {worst.name} at {worst.at:g} s"
+    return f"{about}{size}, {worst.relative:.1g} of its range ({estimate.compared})"
 
 
 def _rows(played: Iterator[Block]) -> Iterator[Floats]:

@@ -36,10 +36,10 @@ LISTED, LISTED_OF_MANY, MANY = 6, 1, 20_000
 NEAR_POLES = 6
 
 # Peers of a crowd whose copies, all equal, tell where its common zeros may be.
-SAMPLES = 3
+SAMPLES = 2
 
-# Smaller eigenvalues of these decide nothing.
-LEAST_START = 0.5
+# Smaller eigenvalues of these decide nothing, and those this near to 1 are rigid.
+LEAST_START, SAME_START = 0.5, 1e-9
 
 # Zeros of a loop that Newton's method starts from, the largest by their estimate.
 STARTS = 32
@@ -162,7 +162,8 @@ def _common_starts(listed: Sequence[Crowd], exchange: Exchange) -> Complexes:
         own = np.tile(weight * senders, (len(few), 1))
         alike = hear_themselves(some_rows(crowd.lifted, few), crowd.schedule, own, 0 * own)
         values = np.linalg.eigvals(alike.m).astype(np.complex128).ravel()
-        found.append(values[(values.imag >= 0) & (np.abs(values) > LEAST_START)])
+        kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
+        found.append(values[kept])
     return np.concatenate(found)
 
 

@@ -20,8 +20,8 @@ from apc.runtime.pseudospectrum import PRODUCT_ROUNDINGS, norms
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-# Powers of the block are squared so often: the 64th is nothing.
-SQUARINGS = 6
+# Powers of the block are squared so often, or until they are this small: the rest is a geometric series.
+SQUARINGS, SETTLED = 6, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +56,13 @@ def block_diagonal(
     basis, dual, small = _block_basis(matrices, values, vectors, large)
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
     weight, size = np.abs(dual), np.abs(basis)
-    form = np.zeros((sites, n, n), np.complex128)
-    form[:, range(large), range(large)] = values[:, :large]
-    form[:, large:, large:] = small
-    doubt = np.abs(matrices @ basis - basis @ form) + errors @ size
-    doubt += charge * (np.abs(matrices) @ size + size @ np.abs(form))
+    own = values[:, None, :large]
+    formed = np.concatenate([basis[:, :, :large] * own, basis[:, :, large:] @ small], axis=2)
+    formed_size = np.concatenate(
+        [size[:, :, :large] * np.abs(own), size[:, :, large:] @ np.abs(small)], axis=2
+    )
+    doubt = np.abs(matrices @ basis - formed) + (errors + charge * np.abs(matrices)) @ size
+    doubt += charge * formed_size
     # The computed inverse is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X, and |(I − F)⁻¹| ≤ 1 + 2|F|.
     wrong = (np.abs(np.eye(n) - dual @ basis) + charge * (weight @ size)).sum(axis=2).max(axis=1)
     grown = np.where(wrong < 0.25, 1 + 2 * n * wrong, np.inf)[:, None, None]
@@ -106,10 +108,12 @@ def block_norms(square: Floats, large: int) -> Floats:
 def block_resolvent(small: Complexes, radius: float) -> Floats:
     """Return a bound on ‖(ζ − T₂)⁻¹‖ for |ζ| ≥ radius: Σ_j ‖T₂^j‖ radius^(−j−1), doubling by doubling."""
     total = np.full(len(small), 1.0 / radius)
-    power, scale = small / radius, np.ones(len(small))
+    power = small / radius
+    size = norms(power)
     for _ in range(SQUARINGS):
-        size = norms(power) * scale
+        if np.all(size < SETTLED):
+            break
         total *= 1 + size
         power = power @ power
-    last = norms(power)
-    return np.where(last < 0.5, total / (1 - np.minimum(last, 0.5)), np.inf) * (1 + 1e-6)
+        size = norms(power)
+    return np.where(size < 0.5, total / (1 - np.minimum(size, 0.5)), np.inf) * (1 + 1e-6)

@@ -28,6 +28,7 @@ import numpy as np
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.methods import DEFAULT, Method
 from apc.runtime.simulation import Simulation, blocks, prepare
 from apc.runtime.summary import Watch
 from apc.runtime.threads import single_threaded
@@ -144,6 +145,7 @@ def play_many(
     seed: int | None = None,
     jobs: int = 1,
     jit: bool = True,
+    method: Method = DEFAULT,
     progress: Callable[[int], None] | None = None,
 ) -> Ensemble:
     """Play a scene many times, each time with other packets.
@@ -162,6 +164,8 @@ def play_many(
         How many processes share the work; 1: this one alone.
     jit
         Whether to compile to machine code where there is a C compiler.
+    method
+        How the continuous states move between events.
     progress
         Is told how many runs are done.
 
@@ -179,9 +183,9 @@ def play_many(
     done: list[Run] = []
     interrupted = False
     if jobs == 1:
-        work = _here(system, duration, seed, jit, parts)
+        work = _here(system, duration, seed, jit, method, parts)
     else:
-        work = _shared(system, duration, seed, jit, parts, jobs)
+        work = _shared(system, duration, seed, jit, method, parts, jobs)
     try:
         for found in work:
             done += found
@@ -196,15 +200,21 @@ def play_many(
 
 
 def _here(
-    system: CompiledSystem, duration: Fraction, seed: int, jit: bool, parts: Sequence[range]
+    system: CompiledSystem, duration: Fraction, seed: int, jit: bool, method: Method, parts: Sequence[range]
 ) -> Iterator[list[Run]]:
-    simulation = prepare(system, duration, jit=jit, seed=seed)
+    simulation = prepare(system, duration, jit=jit, seed=seed, method=method)
     for part in parts:
         yield [_played(simulation, number) for number in part]
 
 
 def _shared(
-    system: CompiledSystem, duration: Fraction, seed: int, jit: bool, parts: Sequence[range], jobs: int
+    system: CompiledSystem,
+    duration: Fraction,
+    seed: int,
+    jit: bool,
+    method: Method,
+    parts: Sequence[range],
+    jobs: int,
 ) -> Iterator[list[Run]]:
     """Yield the runs as processes, each started afresh, get them done."""
     with tempfile.TemporaryDirectory() as folder:
@@ -213,7 +223,9 @@ def _shared(
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(min(jobs, len(parts)), context, _ignore_interrupts)
         try:
-            waiting = [pool.submit(_part, str(path), str(duration), seed, jit, part) for part in parts]
+            waiting = [
+                pool.submit(_part, str(path), str(duration), seed, jit, method, part) for part in parts
+            ]
             for future in as_completed(waiting):
                 yield future.result()
         except BrokenProcessPool:
@@ -228,15 +240,15 @@ def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _part(path: str, duration: str, seed: int, jit: bool, part: range) -> list[Run]:
+def _part(path: str, duration: str, seed: int, jit: bool, method: Method, part: range) -> list[Run]:
     with single_threaded():
-        simulation = _opened(path, duration, seed, jit)
+        simulation = _opened(path, duration, seed, jit, method)
         return [_played(simulation, number) for number in part]
 
 
 @lru_cache(maxsize=1)
-def _opened(path: str, duration: str, seed: int, jit: bool) -> Simulation:
-    return prepare(store.load(Path(path)), Fraction(duration), jit=jit, seed=seed)
+def _opened(path: str, duration: str, seed: int, jit: bool, method: Method) -> Simulation:
+    return prepare(store.load(Path(path)), Fraction(duration), jit=jit, seed=seed, method=method)
 
 
 def _played(simulation: Simulation, number: int) -> Run:

@@ -320,9 +320,11 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     assert site.affine and not site.edges, "the start matters"
     zeros = [np.zeros(site.function.numel_in(argument)) for argument in range(4)]
     rows = np.empty((len(parameters), site.function.numel_out(0)))
+    many = None
     for start in range(0, len(parameters), MAPPED):
         some = parameters[start : start + MAPPED]
-        many = site.function.map(len(some))
+        if many is None or len(some) != MAPPED:
+            many = site.function.map(len(some))
         flats = many(*(np.repeat(zero[:, None], len(some), axis=1) for zero in zeros), some.T, 0.0)
         rows[start : start + MAPPED] = np.asarray(flats, dtype=np.float64).reshape(-1, len(some)).T
     return rows + 0.0  # −0 and 0 are one number

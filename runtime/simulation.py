@@ -27,7 +27,7 @@ from apc.runtime.flow import Flow, Tolerance, flow_of, rows_to_move
 from apc.runtime.forcing import SiteForcing, forcing_of, impulses, site_forcing
 from apc.runtime.gathering import Gate, Places, build_gates, kept_links
 from apc.runtime.linearize import SiteJacobians, jacobians
-from apc.runtime.methods import DEFAULT, Method, check_step
+from apc.runtime.methods import CVODES, DEFAULT, EXACT, WHERE_NEEDED, Method, check_step
 from apc.runtime.native import native
 from apc.runtime.parameters import Numbers, resolve
 from apc.runtime.population import (
@@ -39,7 +39,7 @@ from apc.runtime.population import (
     refuse_unheard_of,
 )
 from apc.runtime.program import LocalSignal, Program, build_program, local_signals
-from apc.runtime.propagate import Transitions, nonlinear_rows, rates, shaken, transitions
+from apc.runtime.propagate import Transitions, rates, shaken, transitions
 from apc.runtime.scales import state_scales
 from apc.runtime.schedule import Propagate, Schedule, build_schedules
 from apc.runtime.signals import Choice, Signal, choose, signals_of
@@ -92,9 +92,11 @@ class Simulation:
     chunk: Any  # casadi.Function
 
     @property
-    def all_linear(self) -> bool:
-        """Whether every continuous equation is linear."""
-        return not any(nonlinear_rows(kind) for kind in self.system.kinds)
+    def how(self) -> str:
+        """The method in words of a command line; what is exact throughout is called so."""
+        if self.method.name != WHERE_NEEDED:
+            return str(self.method)
+        return f"{self.method}, {CVODES}:{self.method.tolerance:g} elsewhere" if self.tolerances else EXACT
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -301,7 +303,10 @@ def _check_step(
 ) -> None:
     fastest = min((numbers.timings[one.period] for one in system.clocks), default=ROW)
     lengths = [
-        event.duration * one.quantum for one in schedules for event in one.events if isinstance(event, Propagate)
+        event.duration * one.quantum
+        for one in schedules
+        for event in one.events
+        if isinstance(event, Propagate)
     ]
     check_step(system, method, fastest, max(lengths, default=fastest))
 
@@ -434,7 +439,11 @@ class _Runner:
         if stop < len(rows):
             name = simulation.signals[int(np.argmin(finite[stop]))].name
             return Block(time[:stop], values[:stop], self.done, name, float(time[stop]))
-        if self.failed is None and instants[-1] <= last and not all(np.isfinite(one).all() for one in self.state):
+        if (
+            self.failed is None
+            and instants[-1] <= last
+            and not all(np.isfinite(one).all() for one in self.state)
+        ):
             return Block(time, values, self.done, "what is not recorded", float(time[-1]))
         return Block(time, values, self.done)
 

@@ -26,9 +26,7 @@ from apc.runtime.methods import RK4, Method
 Rate = Callable[[Any, Any], Any]  # (x, t) -> dx/dt
 
 
-def stepped(
-    function: Any, method: Method, duration: Fraction, integrals: Sequence[tuple[int, int]]
-) -> Any:
+def stepped(function: Any, method: Method, duration: Fraction, integrals: Sequence[tuple[int, int]]) -> Any:
     """Return (x, u, p, t) -> x after `duration`.
 
     Parameters

@@ -269,8 +269,18 @@ _WORDS = {
 }
 
 
-def summary_text(topology: str, summary: Summary) -> str:
-    """Return what `apc simulate` prints."""
+def summary_text(topology: str, summary: Summary, notes: Sequence[tuple[str, str]] = ()) -> str:
+    """Return a summary in words.
+
+    Parameters
+    ----------
+    topology
+        The scene's name.
+    summary
+        What is to be told.
+    notes
+        Titles and texts that stand at the end.
+    """
     swing = ""
     if summary.swing:
         name, size, rate = summary.swing
@@ -298,7 +308,7 @@ def summary_text(topology: str, summary: Summary) -> str:
         rows.append(("work put in", f"{done} by held forces"))
     rows.append(("recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"))
     lines.append("")
-    for title, text in rows:
+    for title, text in [*rows, *notes]:
         lines += textwrap.wrap(
             f"{title:<15}{text}",
             WIDTH,

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.methods import DEFAULT, Method
+from apc.runtime.accuracy import ErrorEstimate, compare_with, error_text
+from apc.runtime.flow import Tolerance
+from apc.runtime.methods import DEFAULT, EXACT, Method
 from apc.runtime.signals import Signal
 from apc.runtime.simulation import Block, Simulation, blocks, prepare
 from apc.runtime.summary import Summary, Watch, summary_text
@@ -38,6 +40,7 @@ class Provenance:
     texts: str
     duration_s: str
     method: str
+    tolerances: tuple[Tolerance, ...]
     seed: int
     parameters: tuple[tuple[str, float, str], ...]
     timings: tuple[tuple[str, str], ...]
@@ -50,6 +53,10 @@ class Provenance:
             "sha256": self.texts,
             "duration_s": self.duration_s,
             "method": self.method,
+            "tolerances": {
+                one.state: {"relative": one.relative, "absolute": one.absolute, "unit": one.unit}
+                for one in self.tolerances
+            },
             "seed": self.seed,
             "parameters": {name: {"value": value, "unit": unit} for name, value, unit in self.parameters},
             "timings_s": dict(self.timings),
@@ -65,7 +72,8 @@ class Provenance:
 class Trajectory:
     """Rows over time: `time` (rows,) in seconds, `values` (rows, signals) in SI, a column a signal.
 
-    A row holds what was before the tick at its time. `interrupted` says that it ended before its time.
+    A row holds what was before the tick at its time. `interrupted` says that it ended before its time;
+    `error` is there if it was asked for.
     """
 
     topology: str
@@ -75,10 +83,11 @@ class Trajectory:
     summary: Summary
     provenance: Provenance
     interrupted: bool = False
+    error: ErrorEstimate | None = None
 
     def __str__(self) -> str:
         """Return the summary in words."""
-        return summary_text(self.topology, self.summary)
+        return result_text(self.topology, self.summary, self.provenance, self.error)
 
     def __getitem__(self, name: str) -> Floats:
         """Return the column of a signal (rows,). Raises KeyError if there is none of that name."""
@@ -89,7 +98,7 @@ class Trajectory:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, ready for JSON; the rows are not in it."""
-        return result_document(self.topology, self.summary, self.provenance, self.interrupted)
+        return result_document(self.topology, self.summary, self.provenance, self.interrupted, self.error)
 
     def to_pandas(self) -> Any:
         """Return a pandas DataFrame: index `time [s]`, a column a signal, headings with units."""
@@ -131,8 +140,29 @@ def need(module: str, extra: str) -> Any:
         raise ApcError(Mistake("E875", Place("apc"), what, hint=f"pip install 'apc[{extra}]'")) from error
 
 
+def result_text(
+    topology: str, summary: Summary, provenance: Provenance, error: ErrorEstimate | None = None
+) -> str:
+    """Return what `apc simulate` prints: the summary, the method if it is not exact, the error if known."""
+    notes = [] if provenance.method == EXACT else [("method", method_text(provenance))]
+    return summary_text(topology, summary, notes + ([("error", error_text(error))] if error else []))
+
+
+def method_text(provenance: Provenance) -> str:
+    """Return the method with its tolerances, of each unit the smallest."""
+    smallest: dict[str, float] = {}
+    for one in provenance.tolerances:
+        smallest[one.unit] = min(smallest.get(one.unit, one.absolute), one.absolute)
+    absolute = ", ".join(f"{value:.1g} {unit}" for unit, value in smallest.items())
+    return provenance.method + (f"; absolute tolerances from {absolute}" if absolute else "")
+
+
 def result_document(
-    topology: str, summary: Summary, provenance: Provenance, interrupted: bool
+    topology: str,
+    summary: Summary,
+    provenance: Provenance,
+    interrupted: bool,
+    error: ErrorEstimate | None = None,
 ) -> dict[str, Any]:
     """Return what `apc simulate --json` prints."""
 
@@ -165,6 +195,7 @@ def result_document(
             }
             for one in summary.extents
         ],
+        "error_estimate": None if error is None else error.to_dict(),
         "provenance": provenance.to_dict(),
     }
 
@@ -187,7 +218,8 @@ def provenance_of(simulation: Simulation) -> Provenance:
         topology=system.name,
         texts=hashlib.sha256(texts.encode()).hexdigest(),
         duration_s=str(simulation.duration),
-        method=str(simulation.method),
+        method=simulation.how,
+        tolerances=simulation.tolerances,
         seed=simulation.seed,
         parameters=tuple(parameters),
         timings=tuple((one.name, str(one.value)) for one in system.timings),
@@ -264,6 +296,7 @@ def simulate(
     jit: bool = True,
     seed: int | None = None,
     method: Method = DEFAULT,
+    error: bool = False,
 ) -> Trajectory:
     """Play a scene in time and keep its rows.
 
@@ -281,19 +314,31 @@ def simulate(
         Of what is random; the experiment's if not given.
     method
         How the continuous states move between events.
+    error
+        Whether to estimate the error, by a second run.
 
     Raises
     ------
     ApcError
         E877 no duration is known, E876 too many numbers to keep; and those of `simulation.prepare`.
     """
-    simulation = prepare(system, duration_of(system, duration), signals=signals, jit=jit, seed=seed, method=method)
+    simulation = prepare(
+        system, duration_of(system, duration), signals=signals, jit=jit, seed=seed, method=method
+    )
     keeper = Keeper(simulation)
-    summary, interrupted = play(simulation, [keeper])
-    return trajectory_of(simulation, keeper, summary, interrupted)
+    comparison = compare_with(simulation, signals=signals, jit=jit) if error else None
+    summary, interrupted = play(simulation, [keeper, *([comparison] if comparison else [])])
+    estimate = comparison.estimate() if comparison else None
+    return trajectory_of(simulation, keeper, summary, interrupted, estimate)
 
 
-def trajectory_of(simulation: Simulation, keeper: Keeper, summary: Summary, interrupted: bool) -> Trajectory:
+def trajectory_of(
+    simulation: Simulation,
+    keeper: Keeper,
+    summary: Summary,
+    interrupted: bool,
+    error: ErrorEstimate | None = None,
+) -> Trajectory:
     """Return what was kept as a trajectory."""
     return Trajectory(
         topology=simulation.system.name,
@@ -303,6 +348,7 @@ def trajectory_of(simulation: Simulation, keeper: Keeper, summary: Summary, inte
         summary=summary,
         provenance=provenance_of(simulation),
         interrupted=interrupted,
+        error=error,
     )
 
 

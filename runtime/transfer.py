@@ -212,7 +212,7 @@ def _split(space: StateSpace, values: Complexes, vectors: Complexes, large: int,
     weight, size = np.abs(dual), np.abs(basis)
 
     a, b = space.s @ basis, dual @ space.b
-    a_doubt = space.s_error @ size + charge * (np.abs(space.s) @ size)
+    a_doubt = (space.s_error + charge * np.abs(space.s)) @ size
     b_doubt = weight @ (space.b_error * grown + charge * np.abs(space.b))
     b_doubt += (grown - 1) * np.abs(b).max(axis=1, keepdims=True)
     a_size, b_size = np.abs(a), np.abs(b)

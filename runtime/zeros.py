@@ -39,7 +39,7 @@ CLEAR = 6.0
 ASIDE, NEARER = 1e-7, 30.0
 
 # Arcs about a zero to begin with, and evaluations after which the circle is too small to tell.
-SMALL_ARCS, SMALL_POINTS = 16, 300
+SMALL_ARCS, SMALL_POINTS = 12, 300
 
 # Zeros nearer to one another than this, relatively, are one that was found twice.
 SAME = 1e-11

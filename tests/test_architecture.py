@@ -78,7 +78,8 @@ ORDER = (
     *("apc.runtime.methods", "apc.runtime.guards", "apc.runtime.scales", "apc.runtime.stepping"),
     *("apc.runtime.integrate", "apc.runtime.propagate", "apc.runtime.flow", "apc.runtime.forcing"),
     *("apc.runtime.program", "apc.runtime.native"),
-    *("apc.runtime.population", "apc.runtime.signals", "apc.runtime.simulation", "apc.runtime.summary"),
+    *("apc.runtime.population", "apc.runtime.signals", "apc.runtime.simulation", "apc.runtime.accuracy"),
+    "apc.runtime.summary",
     *("apc.runtime.trajectory", "apc.runtime.recording", "apc.runtime.figures"),
     "apc.runtime.ensemble",
     # the stable region of two parameters

@@ -30,6 +30,15 @@ def test_the_analysis_shown_is_what_analyze_prints(
     assert capsys.readouterr().out == block_after(mark)
 
 
+def test_the_critical_value_shown_is_what_critical_prints(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    words = ["critical", "coordination.stiffness", "models/scenes/three-users-average.yaml"]
+    assert run(words) == 0
+    assert capsys.readouterr().out == block_after(f"<!-- output: apc {' '.join(words)} -->")
+
+
 def test_the_topology_shown_is_a_scene_and_the_error_shown_is_its_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         margins,
         paper_route,
         prove_box,
+        region,
         save,
         schema,
         sensitivities,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from apc.runtime.critical import Critical
     from apc.runtime.margins import Margins
     from apc.runtime.paper import PaperRoute
+    from apc.runtime.region import Region
     from apc.runtime.sensitivity import Sensitivities
     from apc.runtime.sweep import Sweep
     from apc.runtime.trajectory import Trajectory
@@ -55,6 +57,7 @@ _HOMES = {
     "Critical": "apc.runtime.critical",
     "Margins": "apc.runtime.margins",
     "PaperRoute": "apc.runtime.paper",
+    "Region": "apc.runtime.region",
     "Sensitivities": "apc.runtime.sensitivity",
     "Sweep": "apc.runtime.sweep",
     "Trajectory": "apc.runtime.trajectory",
@@ -67,6 +70,7 @@ _HOMES = {
     "margins": "apc.api",
     "paper_route": "apc.api",
     "prove_box": "apc.api",
+    "region": "apc.api",
     "save": "apc.api",
     "schema": "apc.api",
     "sensitivities": "apc.api",
@@ -86,6 +90,7 @@ __all__ = [
     "Critical",
     "Margins",
     "PaperRoute",
+    "Region",
     "Sensitivities",
     "Sweep",
     "Trajectory",
@@ -98,6 +103,7 @@ __all__ = [
     "margins",
     "paper_route",
     "prove_box",
+    "region",
     "save",
     "schema",
     "sensitivities",

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from apc.runtime.critical import Critical
     from apc.runtime.margins import Margins
     from apc.runtime.paper import PaperRoute
+    from apc.runtime.region import Region
     from apc.runtime.sensitivity import Sensitivities
     from apc.runtime.sweep import Sweep
     from apc.runtime.trajectory import Trajectory
@@ -253,6 +254,40 @@ def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | 
     return paper.paper_route(_model(model, set))
 
 
+def region(
+    model: CompiledSystem | str | Path,
+    *,
+    x: str | None = None,
+    y: str | None = None,
+    set: Mapping[str, str] | None = None,
+) -> Region:
+    """Find the boundary of the stable region of two parameters, as curves with their errors.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    x, y
+        A parameter and its range, such as "contact.stiffness=10 N/m:3000 N/m"; those of the scene's
+        `studies: region:` if not given.
+
+    Returns
+    -------
+    Region
+        Its curves, `.stable_area`, `.contains(x, y)` in SI, `.to_dataframe()`, `.plot()`.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.runtime import region as stable_region
+    from apc.runtime.region_axes import parse_axes
+
+    system = _model(model, set)
+    return stable_region.region(system, parse_axes(system, x, y))
+
+
 def sweep(
     model: CompiledSystem | str | Path,
     over: Mapping[str, str | Sequence[str]],
@@ -303,6 +338,8 @@ def simulate(
     signals: Sequence[str] = (),
     jit: bool = True,
     seed: int | None = None,
+    method: str | None = None,
+    error: bool = False,
 ) -> Trajectory:
     """Play a scene in time.
 
@@ -320,6 +357,11 @@ def simulate(
         Whether to compile to machine code where there is a C compiler.
     seed
         Of the packets that get lost or come late; that of the scene's experiment if not given.
+    method
+        "exact", "rk4:STEP", "semi-implicit:STEP" or "cvodes:RTOL", such as "rk4:0.1 ms"; exact where linear
+        and by CVODES elsewhere if not given.
+    error
+        Whether to estimate the error, by a second run.
 
     Returns
     -------
@@ -332,9 +374,17 @@ def simulate(
         The input is at fault.
     """
     from apc.runtime import trajectory
+    from apc.runtime.methods import DEFAULT, parse_method
 
-    seconds = trajectory.parse_duration(duration) if duration is not None else None
-    return trajectory.simulate(_model(model, set), duration=seconds, signals=signals, jit=jit, seed=seed)
+    return trajectory.simulate(
+        _model(model, set),
+        duration=trajectory.parse_duration(duration) if duration is not None else None,
+        signals=signals,
+        jit=jit,
+        seed=seed,
+        method=parse_method(method) if method is not None else DEFAULT,
+        error=error,
+    )
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

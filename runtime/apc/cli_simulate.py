@@ -75,6 +75,13 @@ LONG = 1.0  # seconds of work after which progress is shown
     metavar="NUMBER",
     help="Processes that share the runs.",
 )
+@click.option(
+    "--method",
+    metavar="METHOD",
+    help="exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL; exact where linear and CVODES elsewhere if "
+    "not given.",
+)
+@click.option("--error", is_flag=True, help="Play it a second time, more closely, and say how far off it is.")
 def simulate_command(
     file: str | None,
     duration: str | None,
@@ -87,23 +94,28 @@ def simulate_command(
     seed: int | None,
     runs: int | None,
     jobs: int,
+    method: str | None,
+    error: bool,
 ) -> None:
     """Play a scene in time.
 
     FILE is a topology or a compiled model. Devices move by their exact
     transition from event to event, forces are computed at their ticks,
-    packets arrive when they are due; there is no step size. A row is written
-    for every tick of the fastest clock, with the values before the tick.
+    packets arrive when they are due; there is no step size. What is not
+    linear between the ticks is integrated by CVODES. A row is written for
+    every tick of the fastest clock, with the values before the tick.
 
     \b
         apc simulate --duration "3 s" --plot run.png
         apc simulate --signals cube.x --out run.csv
         apc simulate --runs 1000 --seed 1 --jobs 4
+        apc simulate --method "semi-implicit:1 ms" --error
     """
     from apc.inputs import find_input, load_or_compile
+    from apc.runtime.accuracy import compare_with
+    from apc.runtime.methods import DEFAULT, parse_method
     from apc.runtime.recording import open_recording
     from apc.runtime.simulation import prepare
-    from apc.runtime.summary import summary_text
     from apc.runtime.trajectory import (
         Keeper,
         duration_of,
@@ -111,11 +123,13 @@ def simulate_command(
         play,
         provenance_of,
         result_document,
+        result_text,
         trajectory_of,
     )
 
-    if runs is not None and (signals or out or plot):
-        raise click.UsageError("--runs keeps no rows: --signals, --out and --plot are for one run")
+    if runs is not None and (signals or out or plot or error):
+        raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
+    chosen = parse_method(method) if method is not None else DEFAULT
     if plot is not None:
         from apc.runtime.figures import check_format
 
@@ -131,18 +145,26 @@ def simulate_command(
 
         with _progress(runs, "runs") as progress:
             many = play_many(
-                system, seconds, runs=runs, seed=seed, jobs=jobs, jit=not no_jit, progress=progress
+                system,
+                seconds,
+                runs=runs,
+                seed=seed,
+                jobs=jobs,
+                jit=not no_jit,
+                method=chosen,
+                progress=progress,
             )
         as_text = json.dumps(many.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
         click.echo(as_text if as_json else str(many))
         if many.interrupted:
             raise click.Abort
         return
-    simulation = prepare(system, seconds, signals=signals, jit=not no_jit, seed=seed)
+    simulation = prepare(system, seconds, signals=signals, jit=not no_jit, seed=seed, method=chosen)
+    comparison = compare_with(simulation, signals=signals, jit=not no_jit) if error else None
     recording = open_recording(out, simulation) if out is not None else None
     try:
         keeper = Keeper(simulation) if plot is not None else None
-        sinks = [sink for sink in (recording, keeper) if sink is not None]
+        sinks = [sink for sink in (recording, keeper, comparison) if sink is not None]
         with _progress(float(seconds)) as progress:
             summary, interrupted = play(simulation, sinks, progress=progress)
         if recording is not None:
@@ -155,15 +177,16 @@ def simulate_command(
         if recording is not None:
             recording.discard()
         raise
+    estimate = comparison.estimate() if comparison is not None else None
     if plot is not None and keeper is not None:
         from apc.runtime.figures import save
 
         save(trajectory_of(simulation, keeper, summary, interrupted), plot)
     if as_json:
-        document = result_document(system.name, summary, provenance_of(simulation), interrupted)
+        document = result_document(system.name, summary, provenance_of(simulation), interrupted, estimate)
         click.echo(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
     else:
-        click.echo(summary_text(system.name, summary))
+        click.echo(result_text(system.name, summary, provenance_of(simulation), estimate))
         for written in (out, plot):
             if written is not None:
                 click.echo(f"  {written} is written")
