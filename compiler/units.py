@@ -3,7 +3,7 @@
 Takes: the text of a unit (`N*s/m`) or of a quantity (`500 N/m`), and where it stands.
 Gives: `Unit`, `Quantity` and `Dimension`, and their text.
 Guarantees: values are exact rationals (0.1 kg is 1/10; an angle in degrees uses π to 50 digits); the cost of
-a text is bounded; pint, which knows what every unit is, is imported when the first unit is read.
+a text is bounded; pint, which knows what every unit is, is imported when the first rare unit is read.
 Does not: know which quantity wants which unit, or check expressions (see `dimensions`).
 
 The grammar of a unit, and of a quantity:
@@ -528,7 +528,30 @@ def _scaled(name: str) -> _Factor | None:
     return scale, _dimension(tuple(factors))
 
 
+def _of_haptics() -> dict[str, _Factor]:
+    """Return the units that scenes are written in; pint says the same of each, and need not be loaded."""
+    newton = (("kg", 1), ("m", 1), ("s", -2))
+    units: dict[str, tuple[tuple[tuple[str, Fraction | int], ...], Fraction]] = {
+        "m": ((("m", 1),), Fraction(1)),
+        "s": ((("s", 1),), Fraction(1)),
+        "g": ((("kg", 1),), Fraction(1, 1000)),
+        "N": (newton, Fraction(1)),
+        "Hz": ((("s", -1),), Fraction(1)),
+    }
+    prefixes = {"": Fraction(1), "m": Fraction(1, 1000), "k": Fraction(1000), "u": Fraction(1, 10**6)}
+    return {
+        prefix + name: (factor * scale, Dimension(exponents))
+        for name, (exponents, scale) in units.items()
+        for prefix, factor in prefixes.items()
+    }
+
+
+_OF_HAPTICS = _of_haptics()
+
+
 def _look_up(name: str, offset: int) -> _Factor:
+    if name in _OF_HAPTICS:
+        return _OF_HAPTICS[name]
     if len(name) > 40 or _full_name(name) is None:
         hint = _proposal(name)
         raise _FaultError("E223", offset, f"there is no unit {_cut(name)}", hint=hint)

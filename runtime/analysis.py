@@ -1,7 +1,7 @@
 """Is it stable, and by how much: the whole road from a compiled system to its spectrum.
 
 Takes: a `CompiledSystem`.
-Gives: `Analysis`, `analyze`, `METHODS`; `Prepared`, `prepare` for many analyses of one system.
+Gives: `Analysis`, `analyze`; `Prepared`, `prepare` for many analyses of one system.
 Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
 delay; of equal input comes equal output.
 Does not: read files, or draw.
@@ -10,7 +10,7 @@ Does not: read files, or draw.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -23,40 +23,18 @@ from apc.runtime.determinant_spectrum import solve_crowds, solve_loops
 from apc.runtime.discretize import TOO_LARGE
 from apc.runtime.exchange import Exchange, build_exchange
 from apc.runtime.krylov import solve_sparse
-from apc.runtime.large_graph import large_graph, with_the_rest
+from apc.runtime.large_graph import deciding_loops, with_the_rest
 from apc.runtime.linearize import SiteJacobians, jacobians
-from apc.runtime.modes import Arrangement, Loop, arrange, close_loop, dense_loop
+from apc.runtime.modes import Loop, close_loop
 from apc.runtime.packets import nominal_notes
 from apc.runtime.parameters import Numbers, resolve
-from apc.runtime.peers import (
-    MOST_STATES,
-    PeerGroup,
-    more_differ,
-    peer_groups,
-    states_of,
-    too_large,
-    used_ways,
-)
+from apc.runtime.peers import PeerGroup, peer_groups, states_of
+from apc.runtime.plan import make_plan
 from apc.runtime.schedule import ORDER, Schedule, build_schedules
 from apc.runtime.spectrum import Mode, Spectrum, solve_spectrum
 from apc.runtime.threads import single_threaded
 from apc.runtime.translation import common_translation, count_translations
 from apc.runtime.trouble import finite_equations
-
-METHODS = ("auto", "modes", "dense", "determinant", "krylov")
-
-# Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
-# says more.
-FEW_STATES = 200
-
-# Up to so many peers a complete graph is written out as arcs.
-MOST_FULL = 500
-
-# Equal peers on a graph without a closed form: of so many, its eigenvalues are not computed.
-MANY_PEERS = 1500
-
-# From so many packets on their way on, leaving them out of the state is quicker.
-LONG_LINES = 120
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +55,7 @@ class Prepared:
 class Analysis:
     """The answer of an analysis; `spectral_radius` is per frame, rigid modes removed.
 
-    `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `METHODS`.
+    `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `plan.METHODS`.
     `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
     say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided.
     """
@@ -163,10 +141,11 @@ def analyze(
     system
         The compiled scene, with the numbers to analyse (see `parameters.apply`).
     method
-        One of `METHODS`. "modes": a few small systems, where equal peers and the graph allow that; "dense":
-        all peers as one matrix, the check on all else, at the cost of N³; "determinant": the zeros of a small
-        characteristic function, for peers that all differ on complete graphs and for delays of any length;
-        "krylov": the largest eigenvalues of one sparse matrix, for peers that differ on sparse graphs.
+        One of `plan.METHODS`. "modes": a few small systems, where equal peers and the graph allow that;
+        "dense": all peers as one matrix, the check on all else, at the cost of N³; "determinant": the
+        zeros of a small characteristic function, for peers that all differ on complete graphs and for delays
+        of any length; "krylov": the largest eigenvalues of one sparse matrix, for peers that differ on sparse
+        graphs.
     prepared
         From `prepare`, of this system with any numbers; saves building the Jacobians again.
     certify
@@ -178,162 +157,73 @@ def analyze(
         E804 a system of too many states for its matrix, E806 numbers beyond floats, E850 a method that can't
         serve this scene; and those of `peers.peer_groups`.
     """
-    assert method in METHODS, f"no such method: {method}"
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         numbers = resolve(system)
         prepared = _timed(system, prepared or prepare(system), numbers)
         exchange = build_exchange(system, numbers.timings)
-        if method in ("auto", "determinant", "krylov"):
-            reason = _not_crowds(system, prepared)
-            if method == "krylov" and reason:
-                raise _cannot(system, method, reason)
-            if not reason and (method == "krylov" or _many(system, prepared, numbers, exchange)):
-                return _analyze_crowds(system, prepared, numbers, exchange, method)
-        groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
-        large = large_graph(groups, exchange) if method in ("auto", "modes") else None
-        found = large.arrangement if large else _arranged(system, groups, exchange, method)
-        if found.method == "determinant":
-            spectrum = solve_loops(found.loops)
+        plan = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange, method)
+        if not plan.groups:
+            spectrum, notes = _solve_crowds(system, prepared, numbers, exchange, plan.method)
+        elif plan.ring:
+            spectrum, notes = _solve_ring(system, plan.groups, exchange, certify=certify)
+        elif plan.method == "determinant":
+            spectrum, notes = solve_loops(plan.loops), ()
         else:
-            closed = tuple(close_loop(loop) for loop in _small_enough(found.loops, exchange))
-            if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
-                raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
-            spectrum = solve_spectrum(closed, certify=certify)
-        if large:
-            spectrum = with_the_rest(spectrum, large)
-        states = max(states_of(group.schedule, group.jacobians) for group in groups)
-        affine = all(group.site.affine for group in groups)
-        return _answer(system, exchange, prepared, found.method, spectrum, states, affine, found.notes)
-
-
-def _answer(
-    system: CompiledSystem,
-    exchange: Exchange,
-    prepared: Prepared,
-    method: str,
-    spectrum: Spectrum,
-    states: int,
-    affine: bool,
-    notes: tuple[str, ...],
-) -> Analysis:
-    """Put an analysis together."""
+            spectrum, notes = _solve_closed(system, plan.loops, certify=certify), ()
+        if certify and (not plan.groups or plan.method == "determinant"):
+            notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
     return Analysis(
         topology=system.name,
         peers=exchange.peers,
         frame_s=float(prepared.schedules[0].frame_s),
-        states_per_peer=states,
-        method=method,
+        states_per_peer=max(
+            states_of(schedule, prepared.jacobians[group.kind])
+            for schedule, group in zip(prepared.schedules, system.groups, strict=True)
+        ),
+        method=plan.method,
         verdict=spectrum.verdict,
         stable=spectrum.stable,
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,
         rigid_modes=spectrum.rigid_modes,
         modes=spectrum.modes,
-        linearized=not affine,
-        notes=(*notes, *spectrum.notes, *nominal_notes(system)),
+        linearized=not all(prepared.jacobians[group.kind].affine for group in system.groups),
+        notes=(*plan.notes, *notes, *spectrum.notes, *nominal_notes(system)),
         proof=spectrum.proof,
     )
 
 
-def _cannot(system: CompiledSystem, method: str, reason: str) -> ApcError:
-    """Return the refusal of a method that can't serve a scene."""
-    what = f"method {method} can't serve this scene: {reason}"
-    return ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto"))
+def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: bool) -> Spectrum:
+    """Solve loops by their matrices."""
+    closed = tuple(close_loop(loop) for loop in loops)
+    if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
+        raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
+    return solve_spectrum(closed, certify=certify)
 
 
-def _not_crowds(system: CompiledSystem, prepared: Prepared) -> str:
-    """Say why peers can't be taken by the thousand, "" if they can."""
-    for kind, site in zip(system.kinds, prepared.jacobians, strict=True):
-        if site.edges:
-            return f"{kind.name} looks at each sender by itself"
-        if not site.affine:
-            return f"{kind.name} is not linear, so that each peer is linearized where it starts"
-    return ""
+def _solve_ring(
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, certify: bool
+) -> tuple[Spectrum, tuple[str, ...]]:
+    """Solve equal peers on a large ring: those of its loops that decide."""
+    ring = deciding_loops(groups, exchange)
+    spectrum = _solve_closed(system, ring.arrangement.loops, certify=certify)
+    return with_the_rest(spectrum, ring), ring.arrangement.notes
 
 
-def _many(system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange) -> bool:
-    """Say whether so many peers differ that they are not worth an object each."""
-    closed_form = all(
-        exchange.links[way.link].graph.shape in ("complete", "ring", "star")
-        for way in used_ways(prepared.schedules)
-    )
-    if not closed_form and exchange.peers > MANY_PEERS:
-        return True
-    states = sum(
-        len(rows) * len(system.kinds[group.kind].states)
-        for rows, group in zip(numbers.parameters, system.groups, strict=True)
-    )
-    if states <= FEW_STATES:
-        return False
-    most = max(len(kind.states) for kind in system.kinds)
-    return more_differ(system, prepared.jacobians, numbers, exchange, FEW_STATES // most)
-
-
-def _arranged(
-    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, method: str
-) -> Arrangement:
-    """Split the whole into loops, and say by which method they are solved."""
-    if method == "dense":
-        if exchange.peers * min(len(group.jacobians.kind.states) for group in groups) > MOST_STATES:
-            states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
-            raise too_large(exchange, f"{exchange.peers:,} peers", states)
-        return Arrangement("dense", (dense_loop(groups, exchange),), ())
-    found = arrange(groups, exchange)
-    if method == "modes" and found.method != "modes":
-        raise _cannot(system, method, found.notes[0])
-    packets = max(sum(sum(group.schedule.depths) for group in loop.sites) for loop in found.loops)
-    if method == "determinant":
-        return replace(found, method="determinant")
-    if method == "auto" and packets > LONG_LINES:
-        note = f"{packets:,} packets are on their way at a time, none of which is made a state"
-        return replace(found, method="determinant", notes=(*found.notes, note))
-    return found
-
-
-def _small_enough(loops: Sequence[Loop], exchange: Exchange) -> Sequence[Loop]:
-    """Refuse loops whose matrix would be too large."""
-    for loop in loops:
-        if loop.states > MOST_STATES:
-            raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
-    return loops
-
-
-def _analyze_crowds(
+def _solve_crowds(
     system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange, method: str
-) -> Analysis:
-    """Analyse peers that all differ."""
-    graphs = [way.link for way in used_ways(prepared.schedules) if not exchange.is_complete(way.link)]
-    if method == "auto":
-        method = "krylov" if graphs else "determinant"
-    if method == "determinant" and graphs:
-        raise _cannot(
-            system, method, f"the peers differ, and not all of them hear all others over {graphs[0]}"
-        )
+) -> tuple[Spectrum, tuple[str, ...]]:
+    """Solve peers that all differ."""
     listed = crowds(system, prepared.jacobians, prepared.schedules, numbers)
-    different = sum(len(crowd.parameters) for crowd in listed)
-    states = max(states_of(crowd.schedule, crowd.jacobians) for crowd in listed)
     if method == "krylov":
-        _refuse_full_graphs(system, exchange, prepared)
         motions = common_translation(listed, exchange)
-        notes = [f"{different:,} peers of different numbers, as one sparse matrix"]
-        if motions is None:
-            notes.append("peers move freely one by one, or the first as not all others do: left open")
         spectrum = solve_sparse(listed, exchange, motions)
-    else:
-        rigid = count_translations(listed, exchange)
-        notes = [f"{different:,} peers of different numbers, by one determinant of what is sent in a frame"]
-        if rigid is None:
-            notes.append("the first peer moves freely in a way that not all others do: left open")
-        spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
-    return _answer(system, exchange, prepared, method, spectrum, states, True, tuple(notes))
-
-
-def _refuse_full_graphs(system: CompiledSystem, exchange: Exchange, prepared: Prepared) -> None:
-    """Refuse complete graphs of so many peers that their arcs are no sparse matrix."""
-    full = [way.link for way in used_ways(prepared.schedules) if exchange.is_complete(way.link)]
-    if full and exchange.peers > MOST_FULL:
-        reason = f"all of {exchange.peers:,} peers hear each other over {full[0]}: nothing is sparse"
-        raise _cannot(system, "krylov", reason)
+        free = "peers move freely one by one, or the first as not all others do: left open"
+        return spectrum, () if motions is not None else (free,)
+    rigid = count_translations(listed, exchange)
+    spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
+    free = "the first peer moves freely in a way that not all others do: left open"
+    return spectrum, () if rigid is not None else (free,)
 
 
 def lifted_groups(

@@ -154,7 +154,7 @@ def _phi(x: Matrix) -> Matrix:
     found = unit + 0 * x
     for term in range(TERMS, 0, -1):
         found = unit + (x / (term + 1)) @ found
-    return found
+    return np.asarray(found)
 
 
 def compose_rows(site: LinearSite, schedule: Schedule, steps: Mapping[int, Matrix]) -> tuple[Matrix, Matrix]:
@@ -216,5 +216,5 @@ def compose_rows(site: LinearSite, schedule: Schedule, steps: Mapping[int, Matri
         value[Value(one.partition, one.output, one.index + schedule.ticks[one.partition])]
         for one in schedule.carried
     ]
-    rows = [np.broadcast_to(row, (many, n_z + n_r))[:, None] for row in after]
-    return np.concatenate([moving[:, :n_x], *rows], axis=1), sent
+    kept = [np.broadcast_to(row, (many, n_z + n_r))[:, None] for row in after]
+    return np.concatenate([moving[:, :n_x], *kept], axis=1), sent

@@ -58,7 +58,8 @@ class Characteristic:
 
 def weights_at(function: Characteristic, points: Complexes) -> Complexes:
     """Return W (z, n_r, n_s)."""
-    return np.einsum("zl,lrs->zrs", points[:, None] ** -np.array(function.lags), function.weights)
+    powers = points[:, None] ** -np.array(function.lags)
+    return np.asarray(np.einsum("zl,lrs->zrs", powers, function.weights))
 
 
 def _bounded(function: Characteristic, points: Complexes, reach: Floats) -> tuple[Complexes, Floats]:
@@ -98,16 +99,31 @@ def characteristic_ball(function: Characteristic, points: Complexes, reach: Floa
     with np.errstate(all="ignore"):
         matrix, doubt = _bounded(function, points, reach)
         n = matrix.shape[-1]
-        fine = np.isfinite(doubt).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2))
+        fine = np.asarray(np.isfinite(doubt).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2)))
         matrix = np.where(fine[:, None, None], matrix, np.eye(n))
         sign, logarithm = np.linalg.slogdet(matrix)
         fine &= np.isfinite(logarithm)
         matrix = np.where(fine[:, None, None], matrix, np.eye(n))
-        inverse = np.abs(np.linalg.inv(matrix)) * (1 + 1e-6)
+        inverse, wrong = _inverse(matrix)
+        fine &= wrong < 0.5
         doubt = np.where(fine[:, None, None], doubt, 0.0)
         share = _scaled_norm(inverse @ doubt)
         change = np.where(fine, np.expm1(n * np.log1p(share / np.sqrt(n))) * (1 + 1e-9), np.inf)
     return Ball(sign, change)
+
+
+def _inverse(matrix: Complexes) -> tuple[Floats, Floats]:
+    """Return bounds on |A⁻¹| (z, n, n), good while the computed inverse Y is: F = I − Y A, ‖F‖ (z,) < 1/2.
+
+    A⁻¹ = (I − F)⁻¹ Y, and |(I − F)⁻¹| is at most I + 2‖F‖ in every entry.
+    """
+    n = matrix.shape[-1]
+    inverse = np.linalg.inv(matrix)
+    size = np.abs(inverse)
+    off = np.abs(np.eye(n) - inverse @ matrix)
+    off += PRODUCT_ROUNDINGS * (n + 2) * UNIT * (size @ np.abs(matrix))
+    wrong = off.sum(axis=2).max(axis=1)
+    return size + 2 * wrong[:, None, None] * size.max(axis=1, keepdims=True), wrong
 
 
 def _scaled_norm(matrices: Floats) -> Floats:
@@ -141,7 +157,11 @@ def count_around(
 
 
 def refine(
-    function: Characteristic, starts: Sequence[complex] | Complexes, poles: Complexes | None = None
+    function: Characteristic,
+    starts: Sequence[complex] | Complexes,
+    *,
+    poles: Complexes,
+    found: Complexes | None = None,
 ) -> Complexes:
     """Return zeros of f by Newton's method from many starts; where it does not arrive, NaN.
 
@@ -152,19 +172,22 @@ def refine(
     starts
         Where to begin (z,).
     poles
-        A pole of f near each start, taken out: Newton's method on (ζ − p) f.
+        Poles of f to take out (m,), with their conjugates: Newton's method on Π (ζ − p) f, which they no
+        longer turn away.
+    found
+        Zeros that are known, taken out with their conjugates (Maehly), so that others are found.
     """
     points = np.array(starts, dtype=np.complex128)
     steps = np.full(len(points), np.inf)
     active = np.flatnonzero(np.isfinite(points))
+    out, known = (_whole(np.zeros(0, np.complex128) if one is None else one) for one in (poles, found))
     with np.errstate(all="ignore"):
         for _ in range(STEPS):
             if not len(active):
                 break
             now = points[active]
             rate = _log_rate(function, now)
-            if poles is not None:
-                rate = rate + 1 / (now - poles[active])
+            rate = rate + (1 / (now[:, None] - out)).sum(axis=1) - (1 / (now[:, None] - known)).sum(axis=1)
             step = -1 / rate
             longest = LONGEST * np.abs(now)
             step = np.where(np.abs(step) > longest, step / np.abs(step) * longest, step)
@@ -180,6 +203,11 @@ def refine(
             active = active[~lost & ~arrived]
         # Rounding may keep it from standing still; who has found a zero is told by the bounds.
         return np.where(steps < NEAR, points, np.nan)
+
+
+def _whole(upper: Complexes) -> Complexes:
+    """Return points of the upper half plane with their conjugates."""
+    return np.concatenate([upper, upper[upper.imag != 0].conj()])
 
 
 def _log_rate(function: Characteristic, points: Complexes) -> Complexes:

@@ -8,7 +8,7 @@ Does not: find its zeros (see `zeros`).
 
 A peer on a complete graph hears r_i = c_i L(ζ) (σ − s_i), with σ the sum of what all send and L the delays:
 hearing −c_i of itself makes it a site T_i, s_i = T_i L σ, and det(I − Σ_i T_i L) = 0. Sites that hear each
-other by weights, r_g = Σ_h W_gh ζ^(−lag) s_h, are det(I − T W) = 0, T = diag(T_g), with no state for a packet.
+other by weights, r_g = Σ_h W_gh ζ^(−lag) s_h, are det(I − T W) = 0, T = diag(T_g): no state for a packet.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def heard_weights(listed: Sequence[Crowd], exchange: Exchange) -> list[Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where in s and r of the whole the rows of each crowd's are; `own`, what it weighs its own packets by."""
+    """Where in s and r of the whole each crowd's rows are; what it weighs its own packets and others' by."""
 
     sent: tuple[Integers, ...]
     heard: tuple[Integers, ...]

@@ -23,7 +23,7 @@ from apc.runtime.lift import LiftedSite
 from apc.runtime.modes import Loop
 from apc.runtime.rigid import find_rigid_modes
 from apc.runtime.spectrum import Mode, Spectrum, judge, oscillation, turned_along
-from apc.runtime.transfer import CHUNK, StateSpace, differentiate
+from apc.runtime.transfer import CHUNK, differentiate
 from apc.runtime.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]
@@ -42,7 +42,7 @@ SAMPLES = 2
 LEAST_START, SAME_START = 0.5, 1e-9
 
 # Zeros of a loop that Newton's method starts from, the largest by their estimate.
-STARTS = 32
+STARTS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def solve_crowds(listed: Sequence[Crowd], exchange: Exchange, *, rigid: int) -> 
         _common_starts(listed, exchange),
         rigid=rigid,
         listed=LISTED_OF_MANY if peers > MANY else LISTED,
-        pole_starts=near_poles(function, NEAR_POLES),
+        near=NEAR_POLES,
     )
     modes = _with_conjugates(_crowd_mode(function, places, listed, zero) for zero in zeros.found)
     return _spectrum([_Solved(zeros, rigid, 0, modes)], [1])
@@ -117,9 +117,9 @@ def _solve_loop(loop: Loop) -> _Solved:
     prompt = _without_packets(loop)
     rigid, drifts = find_rigid_modes(prompt, with_drifts=False).directions.shape[1], 0
     starts = _delay_starts(function)
-    zeros = find_zeros(function, starts, rigid=rigid, listed=LISTED)
+    zeros = find_zeros(function, starts, rigid=rigid, listed=LISTED, near=0)
     if rigid and not zeros.rigid_counted and (drifts := find_rigid_modes(prompt).drifts):
-        zeros = find_zeros(function, starts, rigid=rigid + drifts, listed=LISTED)
+        zeros = find_zeros(function, starts, rigid=rigid + drifts, listed=LISTED, near=0)
     modes = _with_conjugates(_loop_mode(function, loop, zero) for zero in zeros.found)
     return _Solved(zeros, rigid, drifts, modes)
 
@@ -179,8 +179,8 @@ def _loop_mode(function: Characteristic, loop: Loop, zero: Zero) -> Mode:
         rows = slice(s_start, s_start + len(one.s))
         lines = slice(r_start, r_start + one.q.shape[1])
         s_start, r_start = rows.stop, lines.stop
-        space = StateSpace(*(block[None] for block in (one.p, one.q, one.s, one.d)), *EMPTY)
-        motions.append(_move(space, value, heard[None, lines], weight[rows]))
+        blocks = (one.p[None], one.q[None], one.s[None], one.d[None])
+        motions.append(_move(blocks, value, heard[None, lines], weight[rows]))
         felt.append(motions[-1].felt[0])
     waiting = _waiting(function, value, np.concatenate(felt), max(function.lags))
     lags = np.arange(1, len(waiting) + 1)[:, None]
@@ -265,10 +265,6 @@ def _own_mode(crowd: Crowd, places: Places, zero: Zero, site: tuple[int, int]) -
     return _mode(zero, lifted, state, w, shares, f"{crowd.name} by itself", zero.multiplicity)
 
 
-# The errors of a `StateSpace` that is asked for its motion only.
-EMPTY = (np.zeros((1, 0, 0)),) * 4
-
-
 @dataclass(frozen=True, slots=True)
 class _Motion:
     """Sites in a mode: their states z (k, n), what weighs these, w (k, n), and what they hear, r (k, n_r).
@@ -282,16 +278,19 @@ class _Motion:
     felt: Complexes
 
 
-def _move(space: StateSpace, value: complex, heard: Complexes, weight: Complexes) -> _Motion:
+def _move(
+    blocks: tuple[Floats, Floats, Floats, Floats], value: complex, heard: Complexes, weight: Complexes
+) -> _Motion:
     """Return how sites move at ζ, hearing r (k, n_r) from outside, with what they send weighed by χ (n_s,).
 
     (ζ − M) z = B r and w (ζ − M) = χ S; w B + χ D weighs r.
     """
-    shifted = value * np.eye(space.m.shape[-1]) - space.m
-    z = np.linalg.solve(shifted, space.b @ heard[..., None])[..., 0]
-    covector = (weight @ space.s)[..., None]
-    w = np.linalg.solve(shifted.swapaxes(1, 2), covector)[..., 0]
-    return _Motion(z, w, heard, (w[:, None, :] @ space.b)[:, 0] + weight @ space.d)
+    m, b, s, d = blocks
+    shifted = value * np.eye(m.shape[-1]) - m
+    z: Complexes = np.linalg.solve(shifted, b @ heard[..., None])[..., 0].astype(np.complex128)
+    covector = (weight @ s)[..., None]
+    w: Complexes = np.linalg.solve(shifted.swapaxes(1, 2), covector)[..., 0].astype(np.complex128)
+    return _Motion(z, w, heard, (w[:, None, :] @ b)[:, 0] + weight @ d)
 
 
 def _move_crowd(
@@ -304,7 +303,7 @@ def _move_crowd(
         some = some_rows(crowd.lifted, slice(start, start + CHUNK))
         k = len(some.p)
         space = hear_themselves(some, crowd.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
-        moved = _move(space, value, np.tile(heard, (k, 1)), weight)
+        moved = _move((space.m, space.b, space.s, space.d), value, np.tile(heard, (k, 1)), weight)
         sent = (space.s @ moved.z[..., None] + space.d @ moved.r[..., None])[..., 0]
         packets = moved.z[:, some.p.shape[-1] :]
         received = others * heard + own * (sent @ now.T + packets @ before.T)

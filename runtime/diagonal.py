@@ -52,7 +52,7 @@ def block_diagonal(
     large
         How many of the eigenvalues, the first L, are taken one by one.
     """
-    sites, n = values.shape
+    n = values.shape[1]
     basis, dual, small = _block_basis(matrices, values, vectors, large)
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
     weight, size = np.abs(dual), np.abs(basis)

@@ -100,11 +100,11 @@ def write_figure(figure: Any, path: Path) -> None:
     write_atomically(path, write)
 
 
-def check_format(path: Path) -> None:
+def check_format(path: Path, option: str = "--plot") -> None:
     """Refuse a picture that can't be drawn: E878 no such format, E875 matplotlib is not installed."""
     if path.suffix.lower() not in FORMATS:
         expected, got = f"one of {', '.join(FORMATS)}", path.suffix or "none"
-        what = "the suffix of --plot"
+        what = f"the suffix of {option}"
         raise ApcError(Mistake("E878", Place(str(path)), what, expected, got, f"{path.stem}.png"))
     need("matplotlib", "plot")
 

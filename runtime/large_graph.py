@@ -1,7 +1,7 @@
 """Equal peers on a graph of very many eigenvalues: only the systems that decide are solved.
 
 Takes: one group of equal peers and the exchange between them.
-Gives: `LargeGraph`, `large_graph`, `with_the_rest`.
+Gives: `LargeGraph`, `is_large_ring`, `deciding_loops`, `with_the_rest`.
 Guarantees: the systems left out are shown to have all their eigenvalues below a bound, see `extremes`; the
 spectrum's radius holds for them too.
 Does not: take a graph that is no ring, or whose eigenvalues are not real.
@@ -34,20 +34,26 @@ class LargeGraph:
     rigid: int
 
 
-def large_graph(groups: Sequence[PeerGroup], exchange: Exchange) -> LargeGraph | None:
-    """Choose the loops of equal peers on a large ring that decide; None for anything else.
+def is_large_ring(groups: Sequence[PeerGroup], exchange: Exchange) -> bool:
+    """Say whether all peers are equal, on one ring of many."""
+    ways = used_ways(group.schedule for group in groups)
+    shapes = {exchange.links[way.link].graph.shape for way in ways}
+    if len(groups) > 1 or shapes != {"ring"} or exchange.peers <= 2 * MANY:
+        return False
+    return not common_graph(ways, exchange)
+
+
+def deciding_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> LargeGraph:
+    """Choose the loops of equal peers on a large ring that decide.
 
     Parameters
     ----------
     groups
-        All peers, see `peers.peer_groups`.
+        All peers, one group (see `is_large_ring`).
     exchange
         The links.
     """
     ways = used_ways(group.schedule for group in groups)
-    shapes = {exchange.links[way.link].graph.shape for way in ways}
-    if len(groups) > 1 or shapes != {"ring"} or exchange.peers <= 2 * MANY or common_graph(ways, exchange):
-        return None
     [group] = groups
     scale = graph_scale(group, ways, exchange)
     n = exchange.peers
@@ -63,8 +69,8 @@ def large_graph(groups: Sequence[PeerGroup], exchange: Exchange) -> LargeGraph |
     named = " and ".join(f"{link} (ring)" for link in dict.fromkeys(way.link for way in ways))
     how = "shown" if found.proved else "estimated"
     note = (
-        f"{n // 2 + 1:,} systems, one an eigenvalue of the graph of {named}: {len(loops)} of them are solved, "
-        f"all others are {how} to die out faster"
+        f"{n // 2 + 1:,} systems, one an eigenvalue of the graph of {named}: {len(loops)} of them are"
+        f" solved, all others are {how} to die out faster"
     )
     return LargeGraph(
         Arrangement("modes", tuple(loops), (note,)), found.below, left_out * free.directions.shape[1]

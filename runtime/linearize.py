@@ -211,7 +211,7 @@ def _edge(kind: Kind, partition: ClockPartition, receive: Receive) -> Edge:
     p, t = symbol("p", len(kind.parameters)), symbol("t")
     value = s[receive.channel] if receive.edge is None else receive.edge(x, u, m, s, p, t)
     slopes = casadi.densify(casadi.jacobian(value, casadi.vertcat(x, u, m, s)).T)
-    smooth = receive.operator in ("sum", "mean", "count")
+    smooth = receive.operator in ("sum", "mean")
     moves = casadi.depends_on(slopes, casadi.vertcat(x, u, m, s, t)) if slopes.numel() else False
     function = casadi.Function("edge", [x, u, m, s, p, t], [casadi.vertcat(casadi.densify(value), slopes)])
     return Edge(function, smooth and not moves)
@@ -234,9 +234,8 @@ def _listening(
         symbols = function.sx_in()
         moving = casadi.vertcat(*symbols[:4])
         depends = _pattern(casadi.jacobian(function(*symbols)[0], moving))[0]
-        counts = receive.operator == "count"  # however many they are, it is what they are
-        own.append(depends[:inside] & (not counts))
-        channels.append(() if counts else tuple(np.flatnonzero(depends[inside:]).tolist()))
+        own.append(depends[:inside])
+        channels.append(tuple(np.flatnonzero(depends[inside:]).tolist()))
     return own, tuple(channels)
 
 
@@ -331,7 +330,7 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
 
 
 def sites_of_rows(site: SiteJacobians, rows: NDArray[np.float64]) -> LinearSite:
-    """Return the sites of many rows (k, …) of `linearize_rows` as one, its matrices with a leading axis (k)."""
+    """Return the sites of many rows (k, …) of `linearize_rows` as one, matrices with a leading axis (k)."""
     matrices, start = [], 0
     for height, width in site.shapes:
         block = rows[:, start : start + height * width].reshape(len(rows), width, height)
@@ -401,7 +400,7 @@ def rational_floats(site: LinearSite) -> LinearSite:
 
 
 def magnitudes(site: LinearSite) -> LinearSite:
-    """Return the site with every entry replaced by its absolute value; its matrices may have a leading axis."""
+    """Return the site with every entry replaced by its absolute value, a leading axis or none."""
     channels = [tick.channels for tick in site.ticks]
     return _assemble(site.kind, site.affine, [np.abs(matrix) for matrix in _matrices(site)], channels)
 

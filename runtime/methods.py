@@ -1,6 +1,6 @@
 """How the motion between events is computed: by which method, in what steps, to what tolerance.
 
-Takes: words such as `rk4:0.1 ms`. Gives: `Method`, `DEFAULT`, `parse_method`, `finer`, `check_step`.
+Takes: words such as `rk4:0.1ms`. Gives: `Method`, `DEFAULT`, `parse_method`, `finer`, `check_step`.
 Guarantees: a step is an exact rational of a second.
 Does not: compute any motion (see `propagate`, `stepping`, `integrate`).
 
@@ -24,7 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place, nearest
 
 EXACT, RK4, SEMI_IMPLICIT, CVODES = "exact", "rk4", "semi-implicit", "cvodes"
 WHERE_NEEDED = "exact where linear"
-EXAMPLES = {EXACT: "exact", RK4: "rk4:0.1 ms", SEMI_IMPLICIT: "semi-implicit:1 ms", CVODES: "cvodes:1e-10"}
+EXAMPLES = {EXACT: "exact", RK4: "rk4:0.1ms", SEMI_IMPLICIT: "semi-implicit:1ms", CVODES: "cvodes:1e-10"}
 ORDERS = {RK4: 4, SEMI_IMPLICIT: 1}
 
 # Of the default. CVODES holds the error of each step below it; over the restarts of a run, hundreds to
@@ -65,7 +65,7 @@ def parse_method(text: str) -> Method:
     Parameters
     ----------
     text
-        Such as "exact", "rk4:0.1 ms", "semi-implicit:1/3 ms" or "cvodes:1e-8".
+        Such as "exact", "rk4:0.1 ms", "semi-implicit:1ms" or "cvodes:1e-8".
 
     Raises
     ------
@@ -77,10 +77,12 @@ def parse_method(text: str) -> Method:
     if name not in EXAMPLES:
         meant = nearest(name, EXAMPLES) or EXACT
         expected = f"one of {', '.join(EXAMPLES)}"
-        raise ApcError(Mistake("E910", place, "the method", expected, text[:80], EXAMPLES[meant]))
+        got = text[:80] or "nothing"
+        raise ApcError(Mistake("E910", place, "the method", expected, got, EXAMPLES[meant]))
     if name == EXACT:
         if colon:
-            raise ApcError(Mistake("E910", place, "exact has no step size", got=text[:80], hint=EXACT))
+            expected = "exact alone, which has no step"
+            raise ApcError(Mistake("E910", place, "the method", expected, text[:80], EXACT))
         return Method(EXACT)
     if name == CVODES:
         return Method(CVODES, tolerance=_tolerance(size, place))

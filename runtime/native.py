@@ -86,9 +86,8 @@ def _is_worth_it(function: Any) -> bool:
     called = [function, *function.find_functions(-1)]
     if not all(one.class_name() in STRAIGHT for one in called):
         return False
-    return (
-        sum(one.n_instructions() for one in called if one.class_name() in STRAIGHT[:2]) <= MOST_INSTRUCTIONS
-    )
+    own = [one for one in called if not one.class_name().startswith("Map")]
+    return bool(sum(one.n_instructions() for one in own) <= MOST_INSTRUCTIONS)
 
 
 def _renamed(function: Any, name: str) -> Any:

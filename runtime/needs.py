@@ -1,7 +1,7 @@
 """What a scene needs: the states, delays and packets its analysis keeps, and nothing else.
 
 Takes: a `CompiledSystem`. Gives: `Needs`.
-Guarantees: the counts are those of the systems that are analysed.
+Guarantees: the counts are those of the systems that are analysed; none of them is built.
 Does not: analyse.
 """
 
@@ -14,10 +14,14 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import Prepared, lifted_groups, prepare
+from apc.runtime.analysis import prepare
+from apc.runtime.exchange import build_exchange
 from apc.runtime.linearize import edge_name
-from apc.runtime.modes import split
+from apc.runtime.parameters import resolve
+from apc.runtime.plan import make_plan
 from apc.runtime.trouble import finite_equations
+
+_NOUNS = {"determinant": "determinant", "krylov": "sparse system"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,16 +50,17 @@ class SiteNeeds:
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What a scene keeps: `sites` one a kind, `ticks` of each clock in a frame, `systems` as (count, size).
+    """What a scene keeps: `sites` one a kind, `ticks` of each clock in a frame.
 
-    `refused` says why there are no systems, where there are none; `pairs` names the receives that are
-    evaluated once a pair of peers.
+    It is analysed by `method` as `systems`, (count, size); `refused` says why there are none, where there are
+    none. `pairs` names the receives that are evaluated once a pair of peers.
     """
 
     peers: int
     frame: Fraction  # s
     sites: tuple[SiteNeeds, ...]
     ticks: tuple[tuple[str, int], ...]
+    method: str
     systems: tuple[tuple[int, int], ...]
     refused: str
     pairs: tuple[str, ...]
@@ -64,7 +69,7 @@ class Needs:
         """Return it in one sentence."""
         sites = "; ".join(f"{site.name}: {site}" if len(self.sites) > 1 else str(site) for site in self.sites)
         whole = self.peers > 1 and sum(count for count, _ in self.systems) == 1
-        noun = "system" if whole else "mode"
+        noun = _NOUNS.get(self.method, "system" if whole else "mode")
         systems = " and ".join(
             f"{count} {noun}{'' if count == 1 else 's'} of {size}" for count, size in self.systems
         )
@@ -91,16 +96,21 @@ def _needs(system: CompiledSystem) -> Needs:
         )
         for place, kind in enumerate(system.kinds)
     )
+    numbers = resolve(system)
+    exchange = build_exchange(system, numbers.timings)
     try:
-        systems, refused = _systems(system, prepared), ""
+        with np.errstate(over="ignore", invalid="ignore"):  # the sizes count here, not the numbers
+            found = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange)
+        method, systems, refused = found.method, found.systems, ""
     except ApcError as error:  # a scene that can't be analysed may still be run
-        systems, refused = (), error.mistakes[0].sentence
+        method, systems, refused = "", (), error.mistakes[0].sentence
     frame = prepared.schedules[0].frame_s
     return Needs(
         system.peers,
         frame,
         sites,
         tuple((clock.name, int(frame / prepared.timings[clock.period])) for clock in system.clocks),
+        method,
         systems,
         refused,
         tuple(
@@ -109,18 +119,7 @@ def _needs(system: CompiledSystem) -> Needs:
                 for kind in system.kinds
                 for partition in kind.clocks
                 for receive in partition.receives
-                if edge_name(partition, receive) and receive.operator != "count"
+                if edge_name(partition, receive)
             )
         ),
     )
-
-
-def _systems(system: CompiledSystem, prepared: Prepared) -> tuple[tuple[int, int], ...]:
-    """Return how many systems of which size are analysed."""
-    found: dict[int, int] = {}
-    with np.errstate(over="ignore", invalid="ignore"):  # the sizes count here, not the numbers
-        systems = split(*lifted_groups(system, prepared=prepared)).systems
-    for closed in systems:
-        size = len(closed.names)
-        found[size] = found.get(size, 0) + 1
-    return tuple((count, size) for size, count in found.items())

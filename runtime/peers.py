@@ -458,10 +458,7 @@ class _Sites:
                 senders = self.senders(receive.link, g)
                 ways = schedule.ways(p, place)
                 name = edge_name(partition, receive)
-                if receive.operator == "count":
-                    values.append(Fraction(sum(number for _, _, number in senders)))
-                    own.append(None)
-                elif not name:
+                if not name:
                     heard = [
                         (weight, self.sent[h][receive.link][receive.channel]) for h, weight, _ in senders
                     ]

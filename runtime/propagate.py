@@ -90,9 +90,10 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
     slopes = casadi.jacobian(speed, moving)
     type_ = type(moving)
     at_rest = kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
+    still = type_.zeros(n_x, 1)
+    for row in rest:
+        still[row] = at_rest[row]
     kept = casadi.diag(casadi.DM([float(row in rest) for row in range(n_x)]))
-    # A product with a structural zero is one, whatever an equation gives at the origin.
-    still = casadi.densify(casadi.sparsify(kept) @ casadi.sparsify(at_rest))
     slopes = casadi.sparsify(kept) @ slopes
     timed = bool(still.numel() and casadi.depends_on(still, t))
     constant = type_.zeros(*still.shape) if timed else still
@@ -207,11 +208,14 @@ def _nonlinear(kind: Kind, rows: Sequence[int], speed: Any, moving: Any, p: Any)
     involved = []
     for row in rows:
         guards = guards_of(speed[row], moving) if isinstance(speed, casadi.SX) else []
-        varies = casadi.vertcat(casadi.jacobian(speed[row], moving).T, *guards)
+        bends = casadi.jacobian(casadi.jacobian(speed[row], moving).T, moving)
+        varies = casadi.vertcat(casadi.vec(bends), *guards)
         reads = casadi.which_depends(varies, p, 1, False) if p.numel() else ()
         parts = {name.rpartition(".")[0] for name, read in zip(kind.parameters, reads, strict=True) if read}
         involved.append(parts - {""})
     shared = set.intersection(*involved) or set.union(*involved)
+    # What moves is named already; the force that moves it is of another part, if of any.
+    shared = shared - {state.name.rpartition(".")[0] for state in kind.states} or shared
     through = f" through {' and '.join(sorted(shared))}" if shared else ""
     names = ", ".join(kind.states[row].name for row in rows)
     what = (

@@ -48,17 +48,17 @@ class Residues:
         return Residues((self.column - self._other(other)) % self.prime, self.prime)
 
     def __rsub__(self, other: Any) -> Residues:
-        return -(self - other)
+        return Residues((self._other(other) - self.column) % self.prime, self.prime)
 
     def __mul__(self, other: Any) -> Residues:
         return Residues(self.column * self._other(other) % self.prime, self.prime)
 
     def __truediv__(self, other: Any) -> Residues:
-        below = Residues(np.broadcast_to(self._other(other), self.column.shape), self.prime)
-        return self * below.inverse()
+        below = Residues(np.broadcast_to(self._other(other), self.column.shape), self.prime).inverse()
+        return Residues(self.column * below.column % self.prime, self.prime)
 
     def __rtruediv__(self, other: Any) -> Residues:
-        return self.inverse() * other
+        return Residues(self.inverse().column * self._other(other) % self.prime, self.prime)
 
     __radd__ = __add__
     __rmul__ = __mul__

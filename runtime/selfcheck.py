@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -154,6 +153,9 @@ def _frame(kind: Kind, schedule: Schedule, p: Floats, z: Floats, r: Floats) -> t
 
 def _propagate(kind: Kind, x: Floats, u: Floats, p: Floats, duration: float) -> Floats:
     """Return x after `duration` seconds with u constant: dx/dt = A x + c, exactly, A column by column."""
+    # Imported here: reading what was skipped, as an analysis's report does, needs no SciPy.
+    from scipy.linalg import expm
+
     n = len(x)
     constant = _vector(kind.derivative(np.zeros(n), u, p, 0.0))
     block = np.zeros((n + 1, n + 1))

@@ -151,9 +151,10 @@ def prepare(
     Raises
     ------
     ApcError
-        E870 a continuous equation is not linear and the method is exact, E913 a step that does not fit, E871 a reduction looks at each pair of peers, E873 a pattern
-        fits nothing, E874 the peers are too many, E893 a peer has nothing of its own to stand in for a
-        missing packet; and those of `build_schedules`, `build_population` and `routes_of`.
+        E870 a continuous equation is not linear and the method is exact, E871 a reduction looks at each pair
+        of peers, E873 a pattern fits nothing, E874 the peers are too many, E893 a peer has nothing of its own
+        to stand in for a missing packet, E913 a step that does not fit; and those of `build_schedules`,
+        `build_population` and `routes_of`.
     """
     refuse_unheard_of(system)
     numbers = resolve(system)
@@ -374,8 +375,8 @@ def _unsolved(simulation: Simulation, frame: int) -> ApcError:
         return ApcError(Mistake("E872", place, what))
     states = ", ".join(one.state for one in simulation.tolerances[:MOST_NAMED])
     what = (
-        f"the motion of {states} can't be integrated {at}: it grows without measure, an equation there has no "
-        "value, or a force jumps to and fro without end"
+        f"the motion of {states} can't be integrated {at}: it grows without measure, an equation there has "
+        "no value, or a force jumps to and fro without end"
     )
     hint = "dry friction by tanh in the place of sign; --method semi-implicit:0.1ms shows what happens"
     return ApcError(Mistake("E915", place, what, hint=hint))

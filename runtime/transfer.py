@@ -33,8 +33,8 @@ Complexes = NDArray[np.complex128]
 # gains a bit a term, (inner/|ζ|)^k < 2^−k.
 INNER = 0.3
 
-# Terms of the block's power series: at twice `inner`, 2^−60 of the first is left. It is cut where what is left
-# is this share of a rounding.
+# Terms of the block's power series: at twice `inner`, 2^−60 of the first is left. It is cut where what is
+# left is this share of a rounding.
 SERIES, CUT = 60, 2.0**-7
 
 # A pole nearer than the inverse of this is looked at by itself.
@@ -369,7 +369,7 @@ def _reaction(one: Transfer, chunk: slice, near: Floats) -> Floats:
         circle = (wide[:, 0] * one.loop[chunk][site]).sum(axis=1)
         sent = (wide @ left[site])[:, 0] / np.where(circle < 1, 1 - circle, 0.0)[:, None]
         np.add.at(total, place, sent[:, :, None] * (wide @ right[site])[:, 0][:, None, :])
-    return total
+    return np.asarray(total)
 
 
 def differentiate(transfers: Sequence[Transfer], points: Complexes) -> tuple[Complexes, Complexes]:

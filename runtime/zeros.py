@@ -47,6 +47,12 @@ SAME = 1e-11
 # Poles that are eigenvalues themselves, looked at of each structure.
 MOST_HELD = 64
 
+# Poles taken out of f, of each structure, where zeros are looked for: those that crowd about the zeros.
+TAKEN_OUT = 128
+
+# Points on a ring, and poles, to look for missed zeros from.
+RING = 48
+
 # How often zeros that a count has missed are looked for.
 SEARCHES = 4
 
@@ -85,7 +91,7 @@ def find_zeros(
     *,
     rigid: int,
     listed: int,
-    pole_starts: Complexes | None = None,
+    near: int,
 ) -> Zeros:
     """Find the largest eigenvalues and prove that there is none beyond.
 
@@ -99,22 +105,25 @@ def find_zeros(
         How many eigenvalues are exactly 1 for a known reason.
     listed
         How many of the largest eigenvalues to report.
-    pole_starts
-        Poles that zeros are expected close to (z,).
+    near
+        How many of the largest poles, of each structure, zeros are looked for close to.
     """
     rigid_radius = _rigid_radius(function, rigid)
     exact = [one for one in _held_poles(function) if abs(one.value - 1) > rigid_radius]
-    zeros = _distinct(refine(function, starts), rigid_radius)
-    if pole_starts is not None and len(pole_starts):
-        near = refine(function, pole_starts * (1 + 1e-7), pole_starts)
-        zeros = _distinct(np.concatenate([zeros, near]), rigid_radius)
+    poles = near_poles(function, TAKEN_OUT)
+    close = near_poles(function, near) * (1 + 1e-7)
+    zeros = _distinct(refine(function, np.concatenate([starts, close]), poles=poles), rigid_radius)
+    if not len(zeros) and not exact:
+        zeros = _search(function, float(np.abs(poles).max(initial=1.0)), zeros, poles, rigid_radius)
+    rigid_radius = _widened(function, zeros, rigid, rigid_radius)
+    zeros = _distinct(zeros, rigid_radius)
     largest, high, beyond = 0.0, 0.0, -1
     for _ in range(SEARCHES):
         largest, error = _largest(function, zeros, exact)
         high, beyond = _outside(function, largest, error, rigid, rigid_radius)
         if beyond <= 0:
             break
-        more = _search(function, high, rigid_radius)
+        more = _search(function, high, zeros, poles, rigid_radius)
         grown = _distinct(np.concatenate([zeros, more]), rigid_radius)
         if len(grown) == len(zeros):
             break
@@ -149,6 +158,21 @@ def _rigid_radius(function: Characteristic, rigid: int) -> float:
             return radius
         radius *= WIDER
     return WIDEST
+
+
+def _widened(function: Characteristic, zeros: Complexes, rigid: int, radius: float) -> float:
+    """Return a circle about 1 that holds the rigid zeros as Newton's method found them, and no others.
+
+    Where several are one, it arrives at the root of its rounding only.
+    """
+    distances = np.abs(zeros - 1)
+    for distance in np.sort(distances[(distances > radius) & (distances < WIDEST)])[::-1]:
+        wider = 2 * float(distance)
+        inside = count_around(function, 1.0, wider, arcs=SMALL_ARCS, most=SMALL_POINTS)
+        poles = _poles_within(function, 1.0, wider)
+        if rigid and inside is not None and poles is not None and inside + poles == rigid:
+            return wider
+    return radius
 
 
 def _held_poles(function: Characteristic) -> list[Zero]:
@@ -247,7 +271,7 @@ def _arcs(function: Characteristic) -> int:
 def _outside(
     function: Characteristic, largest: float, error: float, rigid: int, rigid_radius: float
 ) -> tuple[float, int]:
-    """Return a circle just outside of the largest zero and how many eigenvalues are beyond; −1: no telling."""
+    """Return a circle just outside of the largest zero, and how many eigenvalues are beyond, or −1."""
     width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
     for _ in range(TRIES):
         radius = max(largest + width, function.innermost * (1 + 1e-9))
@@ -273,11 +297,16 @@ def _enclosing(function: Characteristic, radius: float, rigid: int, rigid_radius
     return float(np.inf)
 
 
-def _search(function: Characteristic, radius: float, rigid_radius: float) -> Complexes:
-    """Return zeros found from all over a wider ring."""
-    angles = np.linspace(0.0, np.pi, 48)
-    starts = np.concatenate([scale * radius * np.exp(1j * angles) for scale in (1.0, 1.03, 1.3)])
-    return _distinct(refine(function, starts), rigid_radius)
+def _search(
+    function: Characteristic, radius: float, zeros: Complexes, poles: Complexes, rigid_radius: float
+) -> Complexes:
+    """Return zeros that were missed, from all over a wider ring and from the largest poles."""
+    angles = np.linspace(0.0, np.pi, RING)
+    rings = [scale * radius * np.exp(1j * angles) for scale in (1.0, 1.03, 1.3)]
+    starts = np.concatenate([*rings, near_poles(function, RING) * (1 + 1e-3)])
+    known = np.append(zeros, 1.0) if rigid_radius else zeros
+    found = refine(function, starts, poles=poles, found=known)
+    return _distinct(refine(function, found, poles=poles), rigid_radius)
 
 
 def near_poles(function: Characteristic, most: int) -> Complexes:

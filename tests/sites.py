@@ -204,7 +204,7 @@ def edged(system: CompiledSystem, operator: str = "sum", *, cubic: float = 0.0) 
     [kind] = system.kinds
     [partition] = kind.clocks
     x, p, t = casadi.SX.sym("x", 4), casadi.SX.sym("p", len(NAMES)), casadi.SX.sym("t")
-    u, m, s, r = (casadi.SX.sym(name, size) for name, size in (("u", 2), ("m", 0), ("s", 2), ("r", 2)))
+    u, m, s, r = (casadi.SX.sym(name, size) for name, size in (("u", 2), ("m", 0), ("s", 2), ("r", 1)))
     named = dict(zip(NAMES, casadi.vertsplit(p), strict=True))
     apart = x[2] - s[0]
     pull = named["coordination.stiffness"] * apart + named["coordination.damping"] * (x[3] - s[1])
@@ -214,9 +214,8 @@ def edged(system: CompiledSystem, operator: str = "sum", *, cubic: float = 0.0) 
     contact = partition.tick(x, u, m, casadi.SX.zeros(2), p, t)[0]
     clock = replace(
         partition,
-        receives=(Receive("pull", operator, "lan", 0, edge), Receive("others", "count", "lan", 0)),
-        # The count is read, and changes nothing that moves.
-        tick=casadi.Function("tick", [x, u, m, r, p, t], [casadi.vertcat(contact, r[0] + 0.5 * r[1])]),
+        receives=(Receive("pull", operator, "lan", 0, edge),),
+        tick=casadi.Function("tick", [x, u, m, r, p, t], [casadi.vertcat(contact, r[0])]),
     )
     return replace(system, kinds=(replace(kind, clocks=(clock,)),))
 

@@ -70,6 +70,13 @@ def test_json_is_one_document_with_what_made_it(capsys: pytest.CaptureFixture[st
         (["--duration", "1 s", "--signals", "cube.y"], "three-users-average: E873 no signal fits 'cube.y';"),
         (["--duration", "1 s", "--out", "run.doc"], "run.doc: E878 the suffix of --out wants one of .csv,"),
         (["--duration", "1 s", "--out", "no/run.csv"], "no/run.csv: E879 can't be written: No such file"),
+        (["--duration", "1 s", "--method", "euler:1ms"], "--method: E910 the method wants one of exact,"),
+        (
+            ["--duration", "1 s", "--method", "rk4:-1 ms"],
+            "--method: E911 the step of rk4 wants more than 0 s",
+        ),
+        (["--duration", "1 s", "--method", "rk4:3 ms"], "three-users-average: E913 the step of rk4 wants at"),
+        (["--duration", "1 s", "--still", "run.doc"], "run.doc: E878 the suffix of --still wants one of"),
         (["--duration", "1 s", "--plot", "run.doc"], "run.doc: E878 the suffix of --plot wants one of .png,"),
     ],
 )
@@ -111,3 +118,21 @@ def test_ctrl_c_keeps_what_is_done(
     assert "run.csv is written" in out
     assert err.startswith("stopped at 0.079 s of 1 s; what was done is kept")
     assert len(Path("run.csv").read_text(encoding="utf-8").splitlines()) == 81
+
+
+def test_the_error_and_the_method_are_told_if_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    scene(MOVED)
+    assert run(["simulate", "--duration", "0.1 s", "--error"]) == 0
+    out = capsys.readouterr().out
+    assert "  error          none but rounding; about " in out
+    assert "method" not in out
+    assert run(["simulate", "--duration", "0.1 s", "--error", "--method", "semi-implicit:1/2ms"]) == 0
+    out = capsys.readouterr().out
+    assert "  method         semi-implicit:0.5 ms\n" in out
+    assert "(half the step, semi-implicit:0.25 ms)" in " ".join(out.split())
+    assert all(len(line) <= 80 for line in out.splitlines())
+    assert run(["simulate", "--duration", "0.1 s", "--error", "--method", "rk4:1ms", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["provenance"]["method"] == "rk4:1 ms"
+    assert document["error_estimate"]["kind"] == "method"
+    assert len(document["error_estimate"]["signals"]) == len(document["signals"])

@@ -64,3 +64,17 @@ def test_the_cache_is_where_the_system_keeps_such_things(monkeypatch: pytest.Mon
     assert cache_folder() == Path("/somewhere/apc")
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     assert cache_folder() == Path.home() / ".cache" / "apc"
+
+
+@needs_compiler
+def test_steps_that_repeat_are_compiled_and_solvers_are_left_as_they_are(cache: Path) -> None:
+    x = casadi.SX.sym("x")
+    step = casadi.Function("step", [x], [x - 0.01 * casadi.sin(x)])
+    whole = casadi.MX.sym("whole")
+    many = casadi.Function("many", [whole], [2 * step.fold(1000)(whole)])
+    solver = casadi.integrator("solver", "cvodes", {"x": x, "ode": -x}, 0, 1)
+    solved = casadi.Function("solved", [whole], [solver(x0=whole)["xf"]])
+    quick, same = native([many, solved])
+    assert quick is not many
+    assert same is solved
+    assert float(quick(1.5)) == float(many(1.5))

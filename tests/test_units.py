@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from apc.compiler import units
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.units import (
     DIMENSIONLESS,
@@ -210,9 +211,15 @@ def test_any_text_is_a_quantity_or_refused_and_nothing_else(text: str) -> None:
             assert len(error.mistakes) == 1
 
 
-def test_pint_is_imported_only_when_a_unit_is_read() -> None:
+def test_pint_is_imported_only_when_a_rare_unit_is_read() -> None:
     code = (
-        "import sys; from apc.compiler.units import Dimension, format_si;"
-        " format_si(1.0, Dimension((('m', 1),))); assert 'pint' not in sys.modules"
+        "import sys; from apc.compiler.errors import Place; from apc.compiler.units import parse_quantity;"
+        " parse_quantity('500 N*s/m', Place('x', 1, 1)); assert 'pint' not in sys.modules;"
+        " parse_quantity('1 inch', Place('x', 1, 1)); assert 'pint' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("name", sorted(units._OF_HAPTICS))
+def test_a_unit_known_without_pint_is_what_pint_says(name: str) -> None:
+    assert units._scaled(name) == units._OF_HAPTICS[name]

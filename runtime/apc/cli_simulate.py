@@ -53,6 +53,12 @@ LONG = 1.0  # seconds of work after which progress is shown
     metavar="FILE",
     help="Draw them, a panel a quantity: .png, .svg or .pdf.",
 )
+@click.option(
+    "--still",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 @click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
 @click.option(
@@ -89,6 +95,7 @@ def simulate_command(
     signals: tuple[str, ...],
     out: Path | None,
     plot: Path | None,
+    still: Path | None,
     as_json: bool,
     no_jit: bool,
     seed: int | None,
@@ -109,7 +116,7 @@ def simulate_command(
         apc simulate --duration "3 s" --plot run.png
         apc simulate --signals cube.x --out run.csv
         apc simulate --runs 1000 --seed 1 --jobs 4
-        apc simulate --method "semi-implicit:1 ms" --error
+        apc simulate --method semi-implicit:1ms --error
     """
     from apc.inputs import find_input, load_or_compile
     from apc.runtime.accuracy import compare_with
@@ -134,11 +141,19 @@ def simulate_command(
         from apc.runtime.figures import check_format
 
         check_format(plot)
+    if still is not None:
+        from apc.runtime.figures import check_format
+
+        check_format(still, "--still")
     system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
     if settings:
         from apc.runtime.parameters import apply, parse_override
 
         system = apply(system, [parse_override(system, text) for text in settings])
+    if still is not None:
+        from apc.runtime.still import save_still
+
+        save_still(system, still)
     seconds = duration_of(system, parse_duration(duration) if duration is not None else None)
     if runs is not None:
         from apc.runtime.ensemble import play_many
@@ -187,7 +202,7 @@ def simulate_command(
         click.echo(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
     else:
         click.echo(result_text(system.name, summary, provenance_of(simulation), estimate))
-        for written in (out, plot):
+        for written in (out, plot, still):
             if written is not None:
                 click.echo(f"  {written} is written")
     if interrupted:

@@ -1,0 +1,126 @@
+"""The three-user scene in Drake's simulator and in ours, error beside time: `python -m tests.bench.drake`.
+
+Drake (drake.mit.edu, `pip install drake`) is given the scene as a diagram of its own C++ systems: one linear
+plant of 12 states, gains, delays and holds; nothing of it is Python while it runs. The forces' delay is a
+DiscreteTimeDelay of one tick. A packet is taken by a hold at its network tick and handed on by a second one
+half a millisecond before it is due: in Drake what is read at a coincident tick is what was before, so that a
+hold that switched at the very tick would be read a tick late.
+
+Both record all states at every tick. The error is the distance from a loop over the ticks in NumPy, whose
+steps are exact.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.simulation import blocks, prepare
+from apc.runtime.threads import single_threaded
+from tests.bench.simulate import MOVED, best, numpy_loop
+from tests.topologies import compiled
+
+SECONDS = 10
+FAST, SLOW = 1e-3, 8e-3
+USERS = 3
+
+
+def matrices() -> tuple[NDArray[np.float64], ...]:
+    """Return A (12, 12), B (12, 6), the forces' gain on the states (6, 12) and on what is heard (6, 3)."""
+    one = np.zeros((4, 4))
+    one[0, 1] = one[2, 3] = 1
+    one[1, 1], one[3, 3] = -50.0, -25.0
+    push = np.zeros((4, 2))
+    push[1, 0], push[3, 0], push[3, 1] = -10.0, 5.0, -5.0
+    own = np.array([[1000.0, 0, -1000.0, 0], [0, 0, 500.0, 0]])
+    others = np.zeros((2 * USERS, USERS))
+    others[1::2] = -500.0 * (np.ones((USERS, USERS)) - np.eye(USERS)) / (USERS - 1)
+    users = np.eye(USERS)
+    return np.kron(users, one), np.kron(users, push), np.kron(users, own), others
+
+
+def diagram() -> tuple[Any, Any, Any]:
+    """Return the scene as a diagram, its plant and its log."""
+    from pydrake.systems.framework import DiagramBuilder
+    from pydrake.systems.primitives import (
+        Adder,
+        DiscreteTimeDelay,
+        LinearSystem,
+        LogVectorOutput,
+        MatrixGain,
+        ZeroOrderHold,
+    )
+
+    a, b, own, others = matrices()
+    builder = DiagramBuilder()
+    add, connect = builder.AddSystem, builder.Connect
+    plant = add(LinearSystem(a, b, np.eye(12), np.zeros((12, 6))))
+    of_states, of_heard, total = add(MatrixGain(own)), add(MatrixGain(others)), add(Adder(2, 6))
+    delay = add(DiscreteTimeDelay(FAST, 1, 6))
+    cubes = add(MatrixGain(np.kron(np.eye(USERS), [[0.0, 0, 1, 0]])))
+    taken = add(ZeroOrderHold(period_sec=SLOW, vector_size=USERS))
+    due = add(ZeroOrderHold(period_sec=SLOW, vector_size=USERS, offset_sec=SLOW - FAST / 2))
+    connect(plant.get_output_port(), of_states.get_input_port())
+    connect(plant.get_output_port(), cubes.get_input_port())
+    connect(cubes.get_output_port(), taken.get_input_port())
+    connect(taken.get_output_port(), due.get_input_port())
+    connect(due.get_output_port(), of_heard.get_input_port())
+    connect(of_states.get_output_port(), total.get_input_port(0))
+    connect(of_heard.get_output_port(), total.get_input_port(1))
+    connect(total.get_output_port(), delay.get_input_port())
+    connect(delay.get_output_port(), plant.get_input_port())
+    log = LogVectorOutput(plant.get_output_port(), builder, publish_period=FAST)
+    return builder.Build(), plant, log
+
+
+def played_by_drake(accuracy: float | None) -> tuple[NDArray[np.float64], float]:
+    """Return the states at every tick (ticks, 12) and the seconds that the run took."""
+    from pydrake.systems.analysis import Simulator
+
+    built, plant, log = diagram()
+    simulator = Simulator(built)
+    context = simulator.get_mutable_context()
+    start = np.zeros(12)
+    start[0] = 0.01
+    plant.GetMyMutableContextFromRoot(context).SetContinuousState(start)
+    if accuracy is not None:
+        simulator.get_mutable_integrator().set_target_accuracy(accuracy)
+    simulator.Initialize()
+    began = time.perf_counter()
+    simulator.AdvanceTo(float(SECONDS))
+    taken = time.perf_counter() - began
+    return log.FindLog(context).data().T.copy(), taken
+
+
+def main() -> None:
+    """Print the comparison, or why there is none."""
+    if importlib.util.find_spec("pydrake") is None:
+        print("Drake is not installed (pip install drake): nothing to compare with")
+        return
+    with single_threaded():
+        expected = numpy_loop(1000 * SECONDS + 1)[:, :, :4].reshape(-1, 12)
+        ready = prepare(compiled(MOVED), Fraction(SECONDS), signals=["*.x", "*.v"])
+        run: Callable[[], list[Any]] = lambda: list(blocks(ready))  # noqa: E731 -- a name for what is timed
+        ours = best(run)
+        rows = np.concatenate([block.values for block in run()])
+        print(f"{SECONDS} s of three users, 12 states at every tick")
+        error = np.abs(rows - expected).max()
+        print(f"  {'this project':<22}  {1e3 * ours:8.2f} ms   error {error:.1e} m, m/s")
+        for accuracy in (None, 1e-8):
+            found, taken = played_by_drake(accuracy)
+            error = np.abs(found - expected).max()
+            name = "Drake as it comes" if accuracy is None else f"Drake, accuracy {accuracy:g}"
+            print(
+                f"  {name:<22}  {1e3 * taken:8.2f} ms   error {error:.1e} m, m/s   "
+                f"{taken / ours:.0f} times ours"
+            )
+
+
+if __name__ == "__main__":
+    main()

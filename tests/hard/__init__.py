@@ -1,0 +1,1 @@
+"""Scenes that are hard for a computer, each with its truth."""

@@ -1,0 +1,43 @@
+"""Populations for tests: peers of the paper's scene that all differ, and what they are made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis import prepare
+from apc.runtime.crowds import Crowd, crowds
+from apc.runtime.exchange import Exchange, build_exchange
+from apc.runtime.parameters import resolve
+from tests.sites import columned, linked, paper
+
+
+def different(
+    peers: int,
+    operator: str = "mean",
+    graph: Any = "complete",
+    *,
+    seed: int = 0,
+    spread: float = 0.3,
+    **values: Any,
+) -> CompiledSystem:
+    """Return peers whose masses, dampings and contacts all differ; a sum's gains are shared among the others."""
+    gains = {"kt": 400.0, "bt": 1.0, "kc": 1000.0, "bc": 1.0, **values}
+    if operator == "sum":
+        gains |= {"kt": gains["kt"] / peers, "bt": gains["bt"] / peers}
+    random = np.random.default_rng(seed)
+    return columned(
+        linked(paper(operator, peers=peers, **gains), graph),
+        device__mass=0.1 * (1 + spread * random.random(peers)),
+        device__damping=5 * (1 + spread * random.random(peers)),
+        contact__stiffness=gains["kc"] * (1 + spread * random.random(peers)),
+    )
+
+
+def crowded(system: CompiledSystem) -> tuple[tuple[Crowd, ...], Exchange]:
+    """Return the crowds of a system and the exchange between them."""
+    prepared, numbers = prepare(system), resolve(system)
+    found = crowds(system, prepared.jacobians, prepared.schedules, numbers)
+    return found, build_exchange(system, numbers.timings)

@@ -1,0 +1,272 @@
+"""`integrate` and `flow`: what is not linear moves as it should, to the tolerance, and pays alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import casadi
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from apc.compiler.errors import ApcError
+from apc.runtime.integrate import integrated
+from apc.runtime.methods import Method, parse_method
+from apc.runtime.propagate import nonlinear_rows
+from apc.runtime.simulation import blocks, prepare
+from apc.runtime.trajectory import Trajectory, simulate
+from tests.sites import alone
+from tests.topologies import compiled, library
+
+CROSSLEY = """\
+topology: impact
+peers: {user: {count: 1, set: {device.x: -5 mm, device.v: 0.5 m/s}}}
+masses: {device: {mass: 0.1 kg}}
+couplers:
+  contact:
+    {type: HuntCrossleyContact, a: device, b: ground, stiffness: 2e5 N/m^(3/2), damping: 1e5 N*s/m^(5/2)}
+hands: {hand: {type: ConstantForce, flange: device, force: 2 N}}
+experiment: {duration: 0.3 s}
+"""
+STOP = """\
+component: Stop
+about: A wall that acts at every moment.
+source: none
+connectors: {flange: Flange}
+parameters:
+  stiffness: {unit: N/m, min: 0, about: force per depth}
+  damping:   {unit: N*s/m, min: 0, default: 0 N*s/m, about: force per rate of depth}
+  place:     {unit: m, default: 0 m, about: of the wall}
+equations:
+  - flange.f = if flange.x > place then stiffness*(flange.x - place) + damping*der(flange.x) else 0
+"""
+IMPACT = """\
+topology: stop
+peers: {user: {count: 1, set: {device.x: -5.3 mm, device.v: 0.5 m/s}}}
+masses: {device: {mass: 0.1 kg}}
+couplers: {stop: {type: Stop, flange: device, stiffness: 3000 N/m}}
+experiment: {duration: 40 ms}
+"""
+
+
+def dense_output(laws: object, start: list[float], times: np.ndarray) -> np.ndarray:
+    """Integrate piece by piece: `laws(inside)` is a right-hand side, pieces end where x changes sign."""
+
+    def surface(t: float, x: np.ndarray) -> float:
+        return float(x[0])
+
+    surface.terminal = True  # type: ignore[attr-defined]
+    rows, x, t, inside = [start], np.array(start), times[0], start[0] > 0
+    for end in times[1:]:
+        while t < end:
+            law = laws(inside)  # type: ignore[operator]
+            found = solve_ivp(law, (t, end), x, "DOP853", rtol=3e-14, atol=1e-17, events=surface)
+            t, x = found.t[-1], found.y[:, -1]
+            if found.status == 1:
+                inside = not inside
+                h = min(1e-12, end - t)
+                x, t = x + h * np.array(laws(inside)(t, x)), t + h  # type: ignore[operator]
+        rows.append(x.tolist())
+    return np.array(rows)
+
+
+def test_hunt_and_crossleys_impact_is_that_of_an_independent_integration() -> None:
+    def laws(inside: bool) -> object:
+        def law(t: float, x: np.ndarray) -> list[float]:
+            push = max(x[0], 0) ** 1.5 * max(2e5 + 1e5 * x[1], 0) if inside else 0.0
+            return [x[1], (2 - push) / 0.1]
+
+        return law
+
+    system = compiled(CROSSLEY)
+    found = simulate(system)
+    true = dense_output(laws, [-0.005, 0.5], found.time)
+    assert np.abs(found.values - true).max(axis=0) == pytest.approx([0, 0], abs=3e-7)
+    assert np.abs(found.values[:, 0] - true[:, 0]).max() < 2e-9
+    loose, tight = (
+        np.abs(simulate(system, method=Method("cvodes", tolerance=one)).values - true).max()
+        for one in (1e-6, 1e-12)
+    )
+    assert 1e-5 < loose < 1e-2
+    assert tight < 3e-8
+
+
+def test_tolerances_follow_the_scenes_scales_and_are_reported() -> None:
+    found = simulate(compiled(CROSSLEY))
+    assert found.provenance.method == "exact where linear, cvodes:1e-10 elsewhere"
+    absolute = {one.state: one.absolute for one in found.provenance.tolerances}
+    assert absolute == pytest.approx({"device.x": 5e-13, "device.v": 5e-11})
+    assert "absolute\n                 tolerances from 5e-13 m, 5e-11 m/s" in str(found)
+
+
+def test_a_wall_without_damping_is_left_after_half_a_sine(tmp_path: Path) -> None:
+    found = simulate(compiled(IMPACT, library(tmp_path, STOP)))
+    t, x, v = found.time, found["user[1].device.x"], found["user[1].device.v"]
+    begin, omega = 0.0053 / 0.5, np.sqrt(3000 / 0.1)
+    end = begin + np.pi / omega
+    inside, after = (t > begin) & (t < end), t > end
+    assert inside.sum() > 10
+    assert x[inside] == pytest.approx(0.5 / omega * np.sin(omega * (t[inside] - begin)), abs=1e-10)
+    assert x[after] == pytest.approx(-0.5 * (t[after] - end), abs=2e-10)
+    assert v[after] == pytest.approx(-0.5, abs=2e-8)
+
+
+def test_a_force_that_jumps_is_met_at_the_jump(tmp_path: Path) -> None:
+    text = IMPACT.replace("3000 N/m", "2000 N/m, damping: 2 N*s/m").replace("40 ms", "200 ms")
+    text += "hands: {hand: {type: ConstantForce, flange: device, force: 2 N}}\n"
+
+    def laws(inside: bool) -> object:
+        return lambda t, x: [x[1], (2 - (2000 * x[0] + 2 * x[1] if inside else 0)) / 0.1]
+
+    found = simulate(compiled(text, library(tmp_path, STOP)))
+    true = dense_output(laws, [-0.0053, 0.5], found.time)
+    assert np.abs(found.values - true).max() < 3e-7
+
+
+def test_between_two_walls_a_mass_goes_to_and_fro_with_the_period_of_the_closed_form(tmp_path: Path) -> None:
+    text = """\
+topology: cage
+peers: {user: {count: 1, set: {device.v: 0.5 m/s}}}
+masses: {device: {mass: 0.1 kg}}
+couplers:
+  right: {type: Stop, flange: device, stiffness: 1e5 N/m, place: 10 mm}
+  left:  {type: Left, flange: device, stiffness: 1e5 N/m, place: -10 mm}
+experiment: {duration: 1 s}
+"""
+    left = STOP.replace("component: Stop", "component: Left").replace("flange.x > place", "flange.x < place")
+    found = simulate(compiled(text, library(tmp_path, STOP, left)))
+    omega = 1e3
+    fly, press = 0.02 / 0.5, np.pi / omega
+    phase = (found.time + fly / 2) % (2 * (fly + press))  # from the left wall's surface, to the right
+    back = phase > fly + press
+    phase = np.where(back, phase - fly - press, phase)
+    way = np.where(
+        phase < fly, -0.01 + 0.5 * phase, 0.01 + 0.5 / omega * np.sin(omega * np.maximum(phase - fly, 0))
+    )
+    assert np.abs(found["user[1].device.x"] - np.where(back, -way, way)).max() < 1e-7
+
+
+def test_an_elastic_contact_keeps_the_energy() -> None:
+    # K d^1.5 over the depth d is 2/5 K d^2.5.
+    text = CROSSLEY.replace(", damping: 1e5 N*s/m^(5/2)", "").replace("force: 2 N", "force: 0 N")
+    found = simulate(compiled(text), duration=Fraction(1, 10))
+    x, v = found["user[1].device.x"], found["user[1].device.v"]
+    energy = 0.05 * v**2 + 0.4 * 2e5 * np.maximum(x, 0) ** 2.5
+    assert energy == pytest.approx(np.full(len(x), 0.0125), rel=1e-7)
+    assert v[-1] == pytest.approx(-0.5, abs=1e-7)
+
+
+def test_a_motion_that_is_not_linear_feels_held_forces_from_when_they_act() -> None:
+    # With y = x - 1: y' = f - y^2, f = 1 from half a tick on. Until then 1/y grows by t, then y is a coth.
+    system = alone(lambda x, u: u[0] - (x - 1) ** 2, lambda x, u, m: 0 * x + 1, delay=Fraction(1, 2000))
+    found = simulate(system, duration=Fraction(1, 100))
+    expected = 1 + 1 / np.tanh(found.time[1:] - 5e-4 + np.arctanh(-1 + 5e-4))
+    assert found["peer[1].x"][1:] == pytest.approx(expected, rel=1e-8)
+
+
+def test_a_crossing_is_found_even_if_the_force_is_a_blow() -> None:
+    # x' = 1 until x = 0.3, then 1000: 2 ms later x is 0.3 + 1000 (2 ms - 0.3 ms).
+    x, u, p, t = (casadi.SX.sym(n, k) for n, k in (("x", 1), ("u", 0), ("p", 0), ("t", 1)))
+    blow = casadi.Function("rate", [x, u, p, t], [casadi.if_else(x < 0.3e-3, 1.0, 1000.0)])
+    move = integrated(blow, np.array([1e-3]), 1e-10, Fraction(2, 1000))
+    assert float(move(0.0, [], [], 0.0)) == pytest.approx(0.3e-3 + 1000 * 1.7e-3, rel=1e-9)
+
+
+def test_a_switch_in_time_is_met_too() -> None:
+    x, u, p, t = (casadi.SX.sym(n, k) for n, k in (("x", 1), ("u", 0), ("p", 0), ("t", 1)))
+    step = casadi.Function("rate", [x, u, p, t], [casadi.if_else(t < 1.00037, 0.0, x)])
+    move = integrated(step, np.ones(1), 1e-10, Fraction(1, 1000))
+    assert float(move(1.0, [], [], 1.0)) == pytest.approx(np.exp(0.00063), rel=1e-9)
+
+
+MIXED = """\
+topology: mixed
+clocks: {haptic: 1 ms}
+peers:
+  hard: {count: 1, set: {device.x: -1 mm, device.v: 0.5 m/s}}
+  free: {count: 2, set: {device.x: [5 mm, 3 mm]}}
+masses:
+  device: {mass: 0.1 kg, damping: 1 N*s/m}
+  tool:   {mass: 0.2 kg, damping: 2 N*s/m}
+couplers:
+  contact: {type: HuntCrossleyContact, at: [hard], a: device, b: ground, stiffness: 2e5 N/m^(3/2)}
+  spring:  {type: SampledSpringDamper, a: device, b: tool, stiffness: 300 N/m, clock: haptic}
+experiment: {duration: 50 ms}
+"""
+
+
+def columns(trajectory: Trajectory, start: str) -> np.ndarray:
+    kept = [i for i, one in enumerate(trajectory.signals) if one.name.startswith(start)]
+    return trajectory.values[:, kept]
+
+
+def test_linear_peers_and_parts_keep_their_exact_motion() -> None:
+    system = compiled(MIXED)
+    hard = system.kinds[system.groups[0].kind]
+    assert [hard.states[row].name for row in nonlinear_rows(hard)] == ["device.x", "device.v"]
+    found = simulate(system)
+    assert [one.state for one in found.provenance.tolerances] == ["device.x", "device.v"]
+    linear = MIXED.replace("  hard: {count: 1, set: {device.x: -1 mm, device.v: 0.5 m/s}}\n", "")
+    linear = "".join(line for line in linear.splitlines(True) if "contact" not in line)
+    assert (columns(found, "free") == columns(simulate(compiled(linear)), "free")).all()
+
+
+def test_what_jumps_without_a_slope_is_not_linear() -> None:
+    system = alone(lambda x, u: 1 - 2 * (x > 5e-3), None)
+    assert nonlinear_rows(system.kinds[0]) == (0,)
+    with pytest.raises(ApcError, match="E870 the motion of x is not linear between the ticks: only"):
+        prepare(system, Fraction(1, 10), method=Method("exact"))
+
+
+@pytest.mark.parametrize(
+    ("law", "rows", "last"),
+    [  # the rows of whole frames: here a frame is a millisecond
+        (lambda x: 50 * (x + 1) ** 2, 19, 9.0),  # 1/(1 - 50 t) - 1: a pole at 20 ms; 18 ms is the last row
+        (lambda x: -20 * casadi.sqrt(x + 0.01) - 1, 4, None),  # the root has no value after 4.2 ms
+        (lambda x: 1 - 2 * casadi.sign(x - 5e-3), 1, None),  # pushed to and fro at 5 mm, after 1.7 ms
+    ],
+)
+def test_what_cant_be_integrated_on_is_kept_until_there(
+    law: object, rows: int, last: float | None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    played = blocks(prepare(alone(lambda x, u: law(x)), Fraction(1, 10)))  # type: ignore[operator]
+    block = next(played)
+    assert len(block.time) == rows
+    if last is not None:
+        assert block.values[-1, 0] == pytest.approx(last, rel=1e-6)
+    with pytest.raises(ApcError, match=r"E915 the motion of x can't be integrated after 0\.0\d+ s: it grows"):
+        next(played)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_cvodes_moves_a_linear_scene_too_to_its_tolerance() -> None:
+    linear = MIXED.partition("couplers:")[0].replace("hard:", "first:")
+    linear += "couplers: {spring: {type: SpringDamper, a: device, b: tool, stiffness: 3000 N/m}}\n"
+    system = compiled(linear)
+    exact = simulate(system, duration=Fraction(1, 10))
+    for tolerance in (1e-6, 1e-9):
+        found = simulate(system, duration=Fraction(1, 10), method=parse_method(f"cvodes:{tolerance:g}"))
+        assert 0.1 * tolerance < np.abs(found.values - exact.values).max() < 1000 * tolerance
+
+
+def test_a_loop_that_newtons_method_solves_may_be_part_of_the_motion() -> None:
+    # x' = 10 y - x^2 with y = cos(x - y).
+    system = alone(lambda x, u: 0 * x)
+    [kind] = system.kinds
+    y, x = casadi.SX.sym("y"), casadi.SX.sym("x")
+    loop = {"x": y, "p": x, "g": y - casadi.cos(x - y)}
+    solver = casadi.rootfinder("loop", "newton", loop, {"abstol": 1e-14, "abstolStep": 0.0})
+    arguments = [casadi.MX.sym(f"a{i}", *kind.derivative.size_in(i)) for i in range(4)]
+    rate = 10 * solver(x0=0.5, p=arguments[0])["x"] - arguments[0] ** 2
+    moving = replace(kind, derivative=casadi.Function("derivative", arguments, [rate]))
+    found = simulate(replace(system, kinds=(moving,)), duration=Fraction(1, 5))
+
+    def law(t: float, x: np.ndarray) -> list[float]:
+        root = brentq(lambda y: y - np.cos(x[0] - y), -2, 2, xtol=1e-15)
+        return [10 * root - x[0] ** 2]
+
+    true = solve_ivp(law, (0, 0.2), [0.0], "DOP853", rtol=1e-12, atol=1e-13).y[0, -1]
+    assert found["peer[1].x"][-1] == pytest.approx(true, abs=1e-7)

@@ -1,0 +1,84 @@
+"""Claims about `apc.runtime.transfer`: what sites answer, within its bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from apc.runtime.transfer import StateSpace, build_transfer, differentiate, respond
+
+
+def _sites(seed: int, *, error: float = 0.0, chain: int = 2) -> StateSpace:
+    """Return sites with two slow pairs and a chain that runs empty, in units far apart."""
+    random = np.random.default_rng(seed)
+    k, n = 7, 4 + chain
+    m = np.zeros((k, n, n))
+    for site in m:
+        for place, angle in ((0, 0.3), (2, 1.1)):
+            size = 0.8 + 0.19 * random.random()
+            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            site[place : place + 2, place : place + 2] = size * turn
+        site[4 + np.arange(1, chain), 4 + np.arange(chain - 1)] = 1.0
+        mix = np.eye(n) + 0.2 * random.standard_normal((n, n))
+        site[:] = np.linalg.inv(mix) @ site @ mix
+    units = 10.0 ** random.integers(-3, 4, n)
+    m = m / units[:, None] * units
+    b, s = random.standard_normal((k, n, 2)) / units[:, None], random.standard_normal((k, 2, n)) * units
+    d = random.standard_normal((k, 2, 2))
+    return StateSpace(m, b, s, d, error * np.abs(m), error * np.abs(b), error * np.abs(s), error * np.abs(d))
+
+
+def _answer(space: StateSpace, counts: np.ndarray, point: complex) -> np.ndarray:
+    n = space.m.shape[-1]
+    one = space.d + space.s @ np.linalg.solve(point * np.eye(n) - space.m, space.b.astype(complex))
+    return np.tensordot(counts, one, 1)
+
+
+POINTS = np.array([1.02, 0.9 + 0.5j, -1.1j, 3.0, 0.995 * np.exp(0.31j)])
+COUNTS = np.array([1.0, 2.0, 1.0, 5.0, 1.0, 1.0, 3.0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("reach", [0.0, 1e-4, 1e-3])
+def test_the_answer_is_within_its_bound_anywhere_in_the_disc(seed: int, reach: float) -> None:
+    space = _sites(seed)
+    random = np.random.default_rng(seed)
+    transfer = build_transfer(space, COUNTS)
+    value, doubt = respond([transfer], POINTS, np.full(len(POINTS), reach))
+    for point, centre, bound in zip(POINTS, value, doubt, strict=True):
+        for _ in range(6):
+            inside = point + reach * np.sqrt(random.random()) * np.exp(2j * np.pi * random.random())
+            # The truth itself is computed in floats, far better than the bound but for reach 0.
+            assert np.all(np.abs(_answer(space, COUNTS, inside) - centre) <= bound + 1e-12 * np.abs(centre))
+    assert np.all(doubt <= 1e-7 * np.abs(value).max()) or reach
+
+
+def test_the_bound_covers_what_the_matrices_may_be_off_by() -> None:
+    space = _sites(3, error=1e-9)
+    random = np.random.default_rng(1)
+    value, doubt = respond([build_transfer(space, COUNTS)], POINTS, np.zeros(len(POINTS)))
+    for _ in range(20):
+        off = {
+            name: getattr(space, name)
+            + random.choice([-1, 1], getattr(space, name).shape) * getattr(space, f"{name}_error")
+            for name in ("m", "b", "s", "d")
+        }
+        moved = StateSpace(**off, m_error=0, b_error=0, s_error=0, d_error=0)  # type: ignore[arg-type]
+        for point, centre, bound in zip(POINTS, value, doubt, strict=True):
+            assert np.all(np.abs(_answer(moved, COUNTS, point) - centre) <= bound)
+
+
+def test_the_derivative_is_the_derivative() -> None:
+    transfer = build_transfer(_sites(2), COUNTS)
+    _, slope = differentiate([transfer], POINTS)
+    h = 1e-6
+    ahead, _ = differentiate([transfer], POINTS + h)
+    behind, _ = differentiate([transfer], POINTS - h)
+    np.testing.assert_allclose((ahead - behind) / (2 * h), slope, rtol=1e-5, atol=1e-5 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("chain", [0, 1, 5])
+def test_a_queue_of_any_length_does_not_spoil_the_bound(chain: int) -> None:
+    transfer = build_transfer(_sites(4, chain=chain), COUNTS)
+    value, doubt = respond([transfer], POINTS, np.zeros(len(POINTS)))
+    assert np.all(doubt <= 1e-7 * np.abs(value).max())

@@ -1,0 +1,52 @@
+"""Claims about `apc.runtime.translation`: what nothing holds back, for every peer with its own numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from apc.runtime.analysis import lifted_groups
+from apc.runtime.modes import dense
+from apc.runtime.rigid import find_rigid_modes
+from apc.runtime.translation import common_translation, count_translations
+from tests.populations import crowded, different
+from tests.sites import columned, grouped, linked, paper
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize(
+    ("values", "expected"), [({}, 1), ({"kt": 0.0}, 6), ({"kc": 0.0}, 7), ({"kc": 0.0, "kt": 0.0}, 12)]
+)
+def test_motions_are_counted_as_for_the_whole_matrix(
+    operator: str, values: dict[str, float], expected: int
+) -> None:
+    system = different(6, operator, **values)
+    whole = find_rigid_modes(dense(*lifted_groups(system)))
+    assert count_translations(*crowded(system)) == expected == whole.directions.shape[1]
+
+
+def test_a_motion_that_one_peer_does_not_share_is_not_told() -> None:
+    contacts = [1000.0] * 5
+    free = columned(paper(peers=5), contact__stiffness=[0.0, *contacts[1:]])
+    assert count_translations(*crowded(free)) is None
+
+
+def test_groups_of_different_peers_translate_together() -> None:
+    system = grouped(paper(), ("left", 4, {"device.mass": 0.3}), ("right", 3, {"contact.stiffness": 700.0}))
+    assert count_translations(*crowded(system)) == 1
+
+
+@pytest.mark.parametrize("graph", ["ring", "star", [(0, 1, 0.5), (1, 0, 2.0), (1, 2, 1.0), (2, 1, 1.0)]])
+def test_on_any_graph_the_common_motion_is_a_fixed_point_of_the_whole(graph: Any) -> None:
+    system = columned(linked(paper(peers=3), graph), device__mass=[0.1, 0.2, 0.3])
+    [motions] = common_translation(*crowded(system)) or [np.zeros((0, 0))]
+    assert motions.shape == (8, 1)
+    whole = dense(*lifted_groups(system))
+    moved = np.tile(motions[:, 0], 3)
+    np.testing.assert_allclose(whole.matrix @ moved, moved, atol=1e-12)
+
+
+def test_peers_free_to_move_one_by_one_have_no_common_motion() -> None:
+    assert common_translation(*crowded(different(4, graph="ring", kt=0.0))) is None
