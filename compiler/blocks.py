@@ -21,6 +21,7 @@ import sympy
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.flatten import FlatEquation
 from apc.compiler.symbolic import NOTHING_VANISHES, LinearForm, Vanishing, ZeroTest, linear_form, symbol
+from apc.compiler.words import counted
 
 Assignment = tuple[str, sympy.Expr]
 # An entry of an eliminated block with more nodes than this gets a name of its own: substituted into one
@@ -421,32 +422,42 @@ def report_singular(
     where: str,
     mistakes: Mistakes,
 ) -> None:
-    """Add the mistake E502: which equations and which unknowns are too many."""
+    """Add the mistake E502: which equations and which unknowns are too many.
+
+    Parameters
+    ----------
+    residuals, unknowns
+        The equations, and the names of what they are to give.
+    incidence
+        For each equation the places of its unknowns.
+    match
+        For each unknown the equation that gives it, None where there is none.
+    where
+        Which partition that is, for the message.
+    mistakes
+        Takes the mistake.
+    """
     found = leftovers(incidence, match)
     parts = []
     place = residuals[0].equation.place if residuals else Place("topology")
     if found.over_rows:
         place = next(r for i, r in enumerate(residuals) if i not in match).equation.place
-        count = _count(len(found.over_columns), "unknown")
+        count = counted(len(found.over_columns), "unknown")
         named = [unknowns[j] for j in found.over_columns]
         held = f"hold only {count} ({_some(named)})" if named else "hold no unknown"
         parts.append(
-            f"{_count(len(found.over_rows), 'equation')} {held}: "
+            f"{counted(len(found.over_rows), 'equation')} {held}: "
             f"{_some([residuals[i].shown for i in found.over_rows])}"
         )
     if found.under_columns:
-        count = _count(len(found.under_columns), "unknown")
+        count = counted(len(found.under_columns), "unknown")
         shown = [residuals[i].shown for i in found.under_rows]
-        by = f"only {_count(len(shown), 'equation')}, {_some(shown)}" if shown else "no equation"
+        by = f"only {counted(len(shown), 'equation')}, {_some(shown)}" if shown else "no equation"
         parts.append(
             f"{count} ({_some([unknowns[j] for j in found.under_columns])}) "
             f"{'has' if len(found.under_columns) == 1 else 'have'} {by}"
         )
     mistakes.add("E502", place, f"{where} can't be solved: {'; and '.join(parts)}")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _some(texts: Sequence[str]) -> str:

@@ -59,6 +59,7 @@ from apc.compiler.reading import (
 from apc.compiler.source import Mapping, Node, Scalar, Source, place_in
 from apc.compiler.units import DIMENSIONLESS, Dimension
 from apc.compiler.values import PEERS
+from apc.compiler.words import counted
 
 COMPONENT_KEYS = (
     "component",
@@ -290,7 +291,21 @@ def read_type(
     *,
     example: str = "Mass",
 ) -> Component | None:
-    """Return the component that a part's entry is of; `default` serves when the entry has no type."""
+    """Return the component that a part's entry is of.
+
+    Parameters
+    ----------
+    key, body
+        The part's name and its entry.
+    default
+        The type that serves when the entry has none.
+    library
+        Where components are found.
+    mistakes
+        Takes E201 when there is no type, and what `library` says of one that can't be had.
+    example
+        A type to show in a message.
+    """
     node = body.get("type")
     name = default if node is None else read_text(node, "type", mistakes, hint=f"type: {example}")
     if node is None and name is None:
@@ -450,14 +465,10 @@ def _check_balance(component: Component, mistakes: Mistakes) -> None:
     mistakes.add(
         "E501",
         component.place,
-        f"{component.name} is unbalanced: {_counted(len(component.equations), 'equation')} for "
-        f"{_counted(len(unknowns), 'unknown')} ({', '.join(unknowns) or 'none'})",
+        f"{component.name} is unbalanced: {counted(len(component.equations), 'equation')} for "
+        f"{counted(len(unknowns), 'unknown')} ({', '.join(unknowns) or 'none'})",
         hint="one equation for each variable and one for each flow of a connector",
     )
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 def _check_distinct(

@@ -1,13 +1,14 @@
 """A scene as a graph: parts joined within a peer, peers joined over links; and as Graphviz text.
 
-Takes: `Scene`. Gives: `Diagram`, `draw_dot`.
+Takes: `Scene`. Gives: `Diagram`, `build_diagram`, `draw_dot`; `seconds`, `common_period`.
 Guarantees: every part of the topology is in it, a long array as one node; the same scene gives the same text.
 Does not: place anything on a page (see `picture`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -17,6 +18,7 @@ from apc.compiler.parts import GROUND
 from apc.compiler.scene import DEFAULT_TYPES, Part, Scene, SceneLink
 from apc.compiler.units import Dimension, format_si
 from apc.compiler.values import Value
+from apc.compiler.words import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
 STIFFNESS = Dimension((("kg", 1), ("s", -2)))
@@ -200,6 +202,14 @@ def _quantity(part: Part, own: str, value: Value) -> str:
     return f"{float(value.number / unit.scale):.6g}{text}"
 
 
+def common_period(periods: Iterable[Fraction]) -> Fraction | None:
+    """Return the least common multiple of clocks' periods, None of no clocks."""
+    found = list(periods)
+    if not found:
+        return None
+    return Fraction(math.lcm(*(p.numerator for p in found)), math.gcd(*(p.denominator for p in found)))
+
+
 def seconds(number: Fraction) -> str:
     """Return a time for a person: in ms below a second."""
     return f"{float(number) * 1e3:.6g} ms" if abs(number) < 1 else f"{float(number):.6g} s"
@@ -271,11 +281,6 @@ def draw_dot(diagram: Diagram) -> str:
 def one_of(diagram: Diagram) -> str:
     """Return what the peer drawn is, in words."""
     return "the only peer" if diagram.peers == 1 else f"one of {diagram.peers} peers"
-
-
-def counted(number: int, noun: str) -> str:
-    """Return a number and its noun."""
-    return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 def _quoted(text: str) -> str:

@@ -93,7 +93,13 @@ class Mistakes:
     def add(
         self, code: str, place: Place, what: str, *, expected: str = "", got: str = "", hint: str = ""
     ) -> None:
-        """Record one mistake; the same mistake twice counts once."""
+        """Record one mistake; the same mistake twice counts once.
+
+        Parameters
+        ----------
+        code, place, what, expected, got, hint
+            As `Mistake` has them.
+        """
         self._found[Mistake(code, place, what, expected, got, hint)] = None
 
     def take(self, error: ApcError) -> None:

@@ -33,7 +33,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.evaluation import evaluate
 from apc.compiler.expression import Expr, Name, Number, format_expression, transform
 from apc.compiler.flatten import FlatKind
-from apc.compiler.scene import PeerGroup, Scene, SceneLink
+from apc.compiler.scene import Scene, SceneGroup, SceneLink
 from apc.compiler.units import format_dimension
 from apc.compiler.values import Value
 
@@ -143,7 +143,17 @@ def _channel(link: str, channel: SceneChannel, timings: Timings) -> Channel:
 def used_clocks(
     scene: Scene, kinds: Sequence[Kind], links: Sequence[Link], timings: Timings
 ) -> tuple[list[Clock], list[tuple[str, str]]]:
-    """Return the clocks that something ticks with, and those left out with the reason."""
+    """Return the clocks that something ticks with, and those left out with the reason.
+
+    Parameters
+    ----------
+    scene
+        The scene, all of its clocks.
+    kinds, links
+        What ticks.
+    timings
+        Takes the periods and phases that are used.
+    """
     used = {link.clock for link in links} | {clock.clock for kind in kinds for clock in kind.clocks}
     clocks, dropped = [], []
     for clock in scene.clocks:
@@ -161,7 +171,23 @@ def compiled_groups(
     """Return the groups: a setting that is a timing is in the schedule and no parameter.
 
     How many peers each peer hears over a link, `count(LINK)`, is a parameter of its group, or a column where
-    it differs from peer to peer. Raises ApcError for a graph some of whose peers send nothing.
+    it differs from peer to peer.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    kinds, kind_of
+        The kinds of peers, and the place among them of each group's.
+    links
+        The links that are used.
+    timings
+        What is in the schedule.
+
+    Raises
+    ------
+    ApcError
+        E215 a graph some of whose peers send nothing.
     """
     exact = {timing.name for timing in timings.found}
     found = []
@@ -193,7 +219,7 @@ def _counts(
     kinds: Sequence[Kind],
     kind_of: Mapping[str, int],
     link: Link,
-    group: PeerGroup,
+    group: SceneGroup,
     start: int,
 ) -> NDArray[np.float64]:
     """Return the summed weights of what each peer of a group hears: one number if they are all alike."""

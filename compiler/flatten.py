@@ -29,7 +29,7 @@ from apc.compiler.expression import (
     walk,
 )
 from apc.compiler.parts import GROUND
-from apc.compiler.scene import Part, PeerGroup, Scene
+from apc.compiler.scene import Part, Scene, SceneGroup
 from apc.compiler.source import place_in
 from apc.compiler.units import Dimension
 from apc.compiler.values import Value
@@ -101,7 +101,7 @@ def flatten(scene: Scene) -> FlatSystem:
     """Write out the equations of every kind. Raises ApcError with every mistake found on the way."""
     mistakes = Mistakes()
     delays = _delay_names(scene)
-    structures: dict[object, list[PeerGroup]] = {}
+    structures: dict[object, list[SceneGroup]] = {}
     for group in scene.groups:
         structures.setdefault(_structure(scene, group, delays), []).append(group)
     kinds = tuple(_flatten_kind(scene, groups, delays, mistakes) for groups in structures.values())
@@ -109,7 +109,7 @@ def flatten(scene: Scene) -> FlatSystem:
     return FlatSystem(scene, kinds)
 
 
-def _structure(scene: Scene, group: PeerGroup, delays: set[str]) -> object:
+def _structure(scene: Scene, group: SceneGroup, delays: set[str]) -> object:
     """Return what must be equal for two groups to share their equations: parts, words and delays."""
     present = tuple(part.name for part in scene.parts if group.name in part.groups)
     own = tuple((name, value.number) for name, value in group.values if name in delays)
@@ -130,7 +130,7 @@ def _delay_names(scene: Scene) -> set[str]:
     return found
 
 
-def _flatten_kind(scene: Scene, groups: list[PeerGroup], delays: set[str], mistakes: Mistakes) -> FlatKind:
+def _flatten_kind(scene: Scene, groups: list[SceneGroup], delays: set[str], mistakes: Mistakes) -> FlatKind:
     first = groups[0]
     words = dict(first.words)
     parts = [part for part in scene.parts if first.name in part.groups]

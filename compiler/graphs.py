@@ -1,6 +1,6 @@
 """Who hears whom over a link, and how late: graphs and delays between groups, as a link's entry gives them.
 
-Takes: the YAML nodes of `graph` and `delays`. Gives: `Graph` (as `compiled` has it), `PairDelay`.
+Takes: the YAML nodes of `graph` and `delays`. Gives: `Graph` (as `compiled` has it), `SceneDelay`.
 Guarantees: every peer an edge names exists; weights are finite and not zero.
 Does not: build a matrix: a complete graph, a ring and a star stay words.
 """
@@ -30,7 +30,7 @@ COMPLETE = Graph("complete", np.zeros((0, 2), np.int64), np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
-class PairDelay:
+class SceneDelay:
     """The delay of a link from one group of peers to another."""
 
     sender: str

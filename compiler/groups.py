@@ -64,6 +64,17 @@ def read_counts(
     """Read how many peers each group has.
 
     A group says `count`, or has a `table` with a row a peer, or lists in `set` with a value a peer.
+
+    Parameters
+    ----------
+    node
+        The section `peers`.
+    folder
+        Where its tables are found.
+    mistakes
+        Takes what is at fault.
+    texts
+        Takes the digest of each table read, by its name.
     """
     found: dict[str, GroupBody] = {}
     hint = "peers: {user: {count: 3}}"

@@ -14,10 +14,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from html import escape
 
-from apc.compiler.diagram import Crowd, Diagram, Net, Node, Pulse, counted, one_of, seconds
+from apc.compiler.diagram import Crowd, Diagram, Net, Node, Pulse, common_period, one_of, seconds
+from apc.compiler.words import counted
 
 FONT = "Helvetica, Arial, 'DejaVu Sans', sans-serif"
 SIZE, SMALL, TITLE = 12.0, 10.5, 18.0
@@ -470,12 +470,12 @@ def _legend(
                 y += LINE
             y += LINE * (0 if crowd.settings else 1) + 2
         y += 10
-    if not diagram.pulses:
+    frame = common_period(pulse.period for pulse in diagram.pulses)
+    if frame is None:
         return marks, right, y
     names = [_pulse_text(pulse) for pulse in diagram.pulses]
     start = left + 18 + max(text_width(name, SMALL) for name in names) + 20
     end = max(right, start + 260)
-    frame = _frame(diagram.pulses)
     for pulse, name in zip(diagram.pulses, names, strict=True):
         colour = colours[pulse.name]
         marks.append(Box(left, y - 9, 11, 11, "white", colour, round=3))
@@ -496,14 +496,6 @@ def _legend(
 def _pulse_text(pulse: Pulse) -> str:
     text = f"clock {pulse.name}: every {seconds(pulse.period)}"
     return text + (f", first at {seconds(pulse.phase)}" if pulse.phase else "")
-
-
-def _frame(pulses: Sequence[Pulse]) -> Fraction:
-    """Return the least common multiple of the periods."""
-    return Fraction(
-        math.lcm(*(pulse.period.numerator for pulse in pulses)),
-        math.gcd(*(pulse.period.denominator for pulse in pulses)),
-    )
 
 
 def _filled(crowd: Crowd, width: float) -> list[str]:

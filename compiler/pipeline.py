@@ -40,7 +40,13 @@ def run_stages(path: Path, *, until: Stage) -> StageValue:
 
 def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
     """Run the stages one by one, yielding each one's name and value as soon as it is done."""
-    source = read_source(path)
+    yield from stages_of(read_source(path))
+
+
+def stages_of(source: Source) -> Iterator[tuple[Stage, StageValue]]:
+    """Run the stages one by one on a source that has a path, whether or not its text is what stands there."""
+    assert source.path is not None
+    path = source.path
     yield "source", source
     library = Library(library_folders(source))
     scene = build_scene(source, library)

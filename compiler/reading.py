@@ -34,7 +34,19 @@ def brief(text: str) -> str:
 
 
 def read_mapping(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> Mapping | None:
-    """Return the node when it is a mapping."""
+    """Return the node when it is a mapping.
+
+    Parameters
+    ----------
+    node
+        What to read; None gives None.
+    what
+        What it is the value of, for a message.
+    mistakes
+        Takes E203 when it is none.
+    hint
+        The line to write instead.
+    """
     if node is None or isinstance(node, Mapping):
         return node
     mistakes.add("E203", node.place, what, expected="a mapping of keys to values", got=form(node), hint=hint)
@@ -42,7 +54,13 @@ def read_mapping(node: Node | None, what: str, mistakes: Mistakes, *, hint: str 
 
 
 def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> str | None:
-    """Return the text of a scalar that isn't empty."""
+    """Return the text of a scalar that isn't empty.
+
+    Parameters
+    ----------
+    node, what, mistakes, hint
+        As for `read_mapping`.
+    """
     if node is None:
         return None
     if isinstance(node, Scalar) and node.text.strip() and node.value is not None:
@@ -68,8 +86,21 @@ def read_name(node: Scalar, what: str, mistakes: Mistakes) -> str | None:
 def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: Mistakes) -> Mapping:
     """Record every key that isn't allowed, with the nearest allowed one.
 
-    Returns the mapping as it was meant: a misspelt key reads as the one nearest to it, so that one slip is
-    not reported a second time as something missing.
+    Parameters
+    ----------
+    mapping
+        What to check.
+    allowed
+        The keys it may have.
+    what
+        What it is, for a message.
+    mistakes
+        Takes E202 for each other key.
+
+    Returns
+    -------
+    The mapping as it was meant: a misspelt key reads as the one nearest to it, so that one slip is not
+    reported a second time as something missing.
     """
     meant: dict[str, tuple[Scalar, Node]] = {key.text: (key, node) for key, node in mapping.entries}
     for key, node in mapping.entries:
@@ -87,7 +118,19 @@ def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: 
 def add_unknown(
     code: str, place: Place, what: str, name: str, known: Collection[str], mistakes: Mistakes
 ) -> None:
-    """Record an unknown name, with the nearest known one or, failing that, a list of them."""
+    """Record an unknown name, with the nearest known one or, failing that, a list of them.
+
+    Parameters
+    ----------
+    code, place, what
+        The mistake's code, where it is, and its first words.
+    name
+        The name as written.
+    known
+        The names there are.
+    mistakes
+        Takes the mistake.
+    """
     close = nearest(name, known)
     if close:
         mistakes.add(code, place, f"{what}; the nearest is {close}", hint=close)

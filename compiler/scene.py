@@ -21,7 +21,7 @@ from apc.compiler.component import Component, Number, Option, Reference, Settabl
 from apc.compiler.definitions import RESERVED, read_type
 from apc.compiler.dimensions import SECOND
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.graphs import COMPLETE, PairDelay, read_graph, read_pairs
+from apc.compiler.graphs import COMPLETE, SceneDelay, read_graph, read_pairs
 from apc.compiler.groups import Columns, GroupBody, read_counts, read_settings
 from apc.compiler.library import Library
 from apc.compiler.parts import LARGEST_ARRAY, MOST_PARTS, Scope, read_entry
@@ -120,13 +120,13 @@ class SceneLink:
     clock: str
     delay: Value
     graph: Graph
-    delays: tuple[PairDelay, ...]
+    delays: tuple[SceneDelay, ...]
     channel: SceneChannel | None
     place: Place
 
 
 @dataclass(frozen=True, slots=True)
-class PeerGroup:
+class SceneGroup:
     """`count` peers.
 
     `values` are the group's own settings by whole name (`contact.stiffness`), `words` its own options and
@@ -149,7 +149,7 @@ class Scene:
     about: str
     clocks: tuple[SceneClock, ...]
     parameters: tuple[tuple[str, Value], ...]
-    groups: tuple[PeerGroup, ...]
+    groups: tuple[SceneGroup, ...]
     parts: tuple[Part, ...]
     links: tuple[SceneLink, ...]
     experiment: Experiment
@@ -670,7 +670,7 @@ class _Reader:
             if value is not None and value.number < 0:
                 self.mistakes.add("E207", value.place, "a delay", expected="0 s or more", got=str(value))
             elif value is not None:
-                delays.append(PairDelay(sender, receiver, value))
+                delays.append(SceneDelay(sender, receiver, value))
         if "clock" not in roles or part.component.parameter("delay") is None:
             what = f"{part.name} is a {part.component.name}, which is no link: it has no clock and delay"
             self.mistakes.add("E210", part.place, what, hint="type: Link")
@@ -690,10 +690,10 @@ class _Reader:
             return None  # reported where it is
         return SceneLink(part.name, clock, values["delay"], graph, tuple(delays), channel, part.place)
 
-    def _group(self, group: GroupBody, settable: dict[str, list[tuple[str, Settable]]]) -> PeerGroup:
+    def _group(self, group: GroupBody, settable: dict[str, list[tuple[str, Settable]]]) -> SceneGroup:
         own = {name: items for name, items in settable.items() if not self._is_of_link(name)}
         settings = read_settings(group, own, self.clocks, self._binding_of, self._is_explained, self.mistakes)
-        return PeerGroup(
+        return SceneGroup(
             group.name, group.count, settings.values, settings.words, settings.columns, group.body.place
         )
 

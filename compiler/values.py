@@ -208,7 +208,24 @@ def check_names(
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
 ) -> None:
-    """Raise ApcError for every name of an expression that isn't known."""
+    """Refuse the names of an expression that aren't known.
+
+    Parameters
+    ----------
+    tree, text, place
+        The expression, as it was written, and where.
+    what
+        What it is the value of, for a message.
+    known
+        Gives a name's dimension, None if there is no such name.
+    names_known
+        The names there are, to find the nearest.
+
+    Raises
+    ------
+    ApcError
+        E206 for every name that isn't known.
+    """
     mistakes = Mistakes()
     for node in names(tree):
         if known(node.parts) is None:

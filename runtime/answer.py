@@ -117,7 +117,7 @@ def answer(
     """
     prepared = prepare(system)
     found = judge(system, method=method, certify=certify, prepared=prepared)
-    modes, notes = _contact_modes(system)
+    modes, notes = _contact_modes(system, prepared)
     compared = conventions(system, prepared=prepared, default=found, quick=not every_convention)
     if compared.not_repeated and not every_convention:
         notes = (*notes, compared.not_repeated)
@@ -132,10 +132,10 @@ def answer(
     )
 
 
-def _contact_modes(system: CompiledSystem) -> tuple[ContactModes | None, tuple[str, ...]]:
+def _contact_modes(system: CompiledSystem, prepared: Prepared) -> tuple[ContactModes | None, tuple[str, ...]]:
     """Return the modes of contact, None where nothing switches, and what to say where they can't be had."""
     try:
-        found = contact_modes(system)
+        found = contact_modes(system, prepared=prepared)
     except ApcError as error:
         return None, (f"modes of contact: {error.mistakes[0].sentence}",)
     return (found if found.modes else None), ()

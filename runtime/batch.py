@@ -34,7 +34,7 @@ from apc.runtime.linearize import (
     site_of_row,
     sites_of_rows,
 )
-from apc.runtime.modes import ClosedSystem, close, split
+from apc.runtime.modes import ClosedSystem, Loop, close_loop, split
 from apc.runtime.parameters import Free, free_rows, parameter_of
 from apc.runtime.peers import PeerGroup
 from apc.runtime.schedule import Propagate
@@ -151,8 +151,15 @@ class BatchEvaluator:
             for one in system.sites
             if (new := moved[site_key(one)])
         ]
-        return close(
-            sites, system.coupling, name=system.name, multiplicity=system.multiplicity, doubts=system.doubts
+        return close_loop(
+            Loop(
+                system.name,
+                system.multiplicity,
+                tuple(sites),
+                system.coupling,
+                system.doubts,
+                system.surds,
+            )
         )
 
     def exact_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
@@ -314,7 +321,7 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
     Notes
     -----
     The composition of magnitudes and that of magnitudes with their errors differ by a bound on the error to
-    all orders, as in `modes.close`; the roundings of closing are added to it.
+    all orders, as in `modes.close_loop`; the roundings of closing are added to it.
     """
     assert not evaluator.timed, "the errors of a step belong to its time"
     plain = evaluator.lifted(values)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import with_unit
 from apc.runtime.analysis import lifted_groups, prepare
 from apc.runtime.exact import evaluate_exact
 from apc.runtime.linearize import LinearSite, site_of_row
@@ -51,8 +52,8 @@ class Range:
         return self.name if self.group is None else f"{self.group}.{self.name}"
 
     def __str__(self) -> str:
-        unit = "" if self.unit == "1" else f" {self.unit}"
-        return f"{self.label} from {float(self.low):.9g}{unit} to {float(self.high):.9g}{unit}"
+        low, high = (with_unit(f"{float(one):.9g}", self.unit) for one in (self.low, self.high))
+        return f"{self.label} from {low} to {high}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,8 +171,8 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
         E831 a parameter left open twice, E832 a scene that is no rational function of the parameters.
     """
     for place, one in enumerate(ranges):
-        if any(one.name == other.name and (one.group == other.group or None in (one.group, other.group))
-               for other in ranges[:place]):  # fmt: skip
+        same = [other for other in ranges[:place] if other.name == one.name]
+        if any(other.group == one.group or None in (one.group, other.group) for other in same):
             raise ApcError(Mistake("E831", _PLACE, f"{one.label} is left open twice"))
     prepared = prepare(system)
     if not all(site.affine and not site.edges for site in prepared.jacobians):

@@ -14,7 +14,6 @@ cell. A cell where that fails is halved.
 from __future__ import annotations
 
 import itertools
-import textwrap
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.words import counted, with_unit, wrapped
 from apc.runtime.balls import Balls, compose, frame_steps, precision, rational_ball, reduced_balls, square
 from apc.runtime.box import Box, Range, open_box
 from apc.runtime.certify import schur_cohn
@@ -34,7 +34,7 @@ from apc.runtime.linearize import LinearSite, entrywise
 from apc.runtime.modes import ClosedSystem
 from apc.runtime.pseudospectrum import balance
 from apc.runtime.ratios import Ratio
-from apc.runtime.rigid import RigidModes, find_rigid_modes, independent_places, stays_rigid
+from apc.runtime.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid
 from apc.runtime.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
 from apc.runtime.threads import single_threaded
 
@@ -42,8 +42,6 @@ Floats = NDArray[np.float64]
 Cell = tuple[tuple[Fraction, Fraction], ...]
 
 UNDECIDED = "undecided"
-
-WIDTH = 80  # of what a person reads
 
 # Bits of the proof: those that 1,000 ticks lose, and twice those of a float.
 BITS = 256
@@ -80,19 +78,19 @@ class BoxProof:
         """Return the answer in words, at most 80 columns wide."""
         lines = [f"  {one}" for one in self.ranges]
         if self.stable:
-            said = f"proved {self.verdict} for every value in the box ({_cells(self.cells)})"
+            said = f"proved {self.verdict} for every value in the box ({counted(self.cells, 'cell')})"
         elif self.stable is False:
             said = "not stable in all of the box"
             lines += ["proved unstable at", *(f"  {where}" for where in self._where())]
         else:
-            said = f"undecided, {self.open_share:.2g} of the box is left open ({_cells(self.cells)})"
+            said = f"undecided, {self.open_share:.2g} of the box is left open ({counted(self.cells, 'cell')})"
             lines += ["among others around", *(f"  {where}" for where in self._where())] if self.point else []
         lines += [f"  {note}" for note in self.notes]
-        return "\n".join([f"{self.topology}:", *textwrap.wrap(said, WIDTH), *lines])
+        return "\n".join([f"{self.topology}:", *wrapped(said), *lines])
 
     def _where(self) -> list[str]:
         return [
-            f"{one.label} = {value:.12g}{'' if one.unit == '1' else ' ' + one.unit}"
+            f"{one.label} = {with_unit(f'{value:.12g}', one.unit)}"
             for one, value in zip(self.ranges, self.point, strict=True)
         ]
 
@@ -116,10 +114,6 @@ class BoxProof:
             "open_around": list(self.point) if self.stable is None and self.point else None,
             "notes": list(self.notes),
         }
-
-
-def _cells(count: int) -> str:
-    return "1 cell" if count == 1 else f"{count} cells"
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,9 +201,8 @@ def _answer(
 
 
 def _question(system: ClosedSystem, sites: tuple[LinearSite, ...], free: RigidModes) -> _Question:
-    held = tuple(independent_places(free.basis.T).tolist())
-    rest = tuple(place for place in range(len(system.names)) if place not in held)
-    return _Question(system, sites, free.exact, held, rest)
+    held, rest = relative_places(free.basis)
+    return _Question(system, sites, free.exact, tuple(held.tolist()), tuple(rest.tolist()))
 
 
 def _search(question: _Question, whole: Cell) -> _Found:

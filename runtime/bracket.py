@@ -18,7 +18,7 @@ from apc.runtime.balls import frame_balls, precision, reduced_balls, unprovable
 from apc.runtime.certify import schur_cohn
 from apc.runtime.crossings import Root
 from apc.runtime.modes import ClosedSystem
-from apc.runtime.rigid import RigidModes, independent_places
+from apc.runtime.rigid import RigidModes, relative_places
 
 # Half the width asked of a bracket, relative to the value: half of 1e-12, rounding set aside.
 HALF = 4e-13
@@ -94,8 +94,7 @@ def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Br
 
 def _inside(system: ClosedSystem, free: RigidModes) -> tuple[bool | None, int]:
     """Say whether all eigenvalues but the rigid ones are proved inside the circle, or one outside."""
-    held = independent_places(free.basis.T).tolist()
-    rest = [place for place in range(len(system.names)) if place not in set(held)]
+    held, rest = (places.tolist() for places in relative_places(free.basis))
     for bits in PRECISIONS:
         with precision(bits):
             reduced = reduced_balls(frame_balls(system), free.exact, held, rest)[0]

@@ -58,8 +58,7 @@ class Survey:
 
     `chains` are lists of crossings by number, `closed` says which of them come back to their first. `corners`
     says of the rectangle's corners (0, 0), (1, 0), (0, 1), (1, 1) whether they are stable. `cell` is the side
-    of the coarse cells, `finest` of the smallest looked at. `lattice` and `growth` are the coarse samples:
-    coordinates (n,) and log of the spectral radius (n, n), rows y.
+    of the coarse cells, `finest` of the smallest looked at.
     """
 
     crossings: tuple[Crossing, ...]
@@ -68,7 +67,6 @@ class Survey:
     corners: tuple[bool, bool, bool, bool]
     cell: float
     finest: float
-    samples: int
 
 
 def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: int = HALVINGS) -> Survey:
@@ -306,7 +304,6 @@ def _linked(lattice: _Lattice, leaves: Mapping[Node, int], cells: int) -> Survey
         corners=tuple(lattice.stable(corner) for corner in corners),  # type: ignore[arg-type] # four of them
         cell=1 / cells,
         finest=min(leaves.values(), default=side // cells) / side,
-        samples=len(lattice.values),
     )
 
 

@@ -146,7 +146,15 @@ def _scaled_norm(matrices: Floats) -> Floats:
 def count_around(
     function: Characteristic, centre: float | complex, radius: float, *, arcs: int, most: int
 ) -> int | None:
-    """Return zeros less poles of f within a circle, None if that can't be told; see `wind`."""
+    """Return zeros less poles of f within a circle, None if that can't be told.
+
+    Parameters
+    ----------
+    function
+        f.
+    centre, radius, arcs, most
+        As `counting.wind` has them.
+    """
     return wind(
         lambda points, reach: characteristic_ball(function, points, reach),
         centre,

@@ -12,7 +12,6 @@ several parts switch, each part alone on at every peer.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,6 +20,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.compiler.words import wrapped
 from apc.runtime.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.linearize import SiteJacobians, linearize
 from apc.runtime.parameters import resolve
@@ -30,7 +30,6 @@ from apc.runtime.switches import SwitchedKind, SwitchingPart, bind, find_switche
 EVERYONE = "on at every peer"
 NOBODY = "on at no peer"
 
-WIDTH = 80
 MOST_NAMED = 30  # columns of a mode's name; a longer one has a line of its own
 
 # For each group of the scene, the names of the parts that are on.
@@ -95,7 +94,7 @@ class ContactModes:
         """Return the modes as a table of at most 80 columns, and which is unstable in words."""
         if not self.modes:
             return "\n".join([f"{self.topology}: no part switches", *self.notes])
-        lines = [textwrap.fill(f"{self.topology}: {self.summary}", WIDTH), ""]
+        lines = [*wrapped(f"{self.topology}: {self.summary}"), ""]
         lines += [f"  {name} on: it follows the motion; off: it does not" for name in self.parts]
         width = min(MOST_NAMED, max(len(mode.name) for mode in self.modes))
         lines += ["", f"  {'':<{width}}  {'spectral radius':<19}  {'frequency':>9}  verdict"]
@@ -104,7 +103,7 @@ class ContactModes:
                 lines.append(f"  {mode.name}")
             head = f"  {mode.name if len(mode.name) <= width else '':<{width}}"
             if mode.refusal:
-                lines += [f"{head}  not analysed:", textwrap.indent(textwrap.fill(mode.refusal, 76), "    ")]
+                lines += [f"{head}  not analysed:", *wrapped(mode.refusal, "    ", "    ")]
                 continue
             radius = f"{mode.spectral_radius:.9f} ± {mode.spectral_radius_error:.0e}"
             frequency = f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–"

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import textwrap
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -102,14 +101,13 @@ class Conventions:
 
     @property
     def warning(self) -> str:
-        """A warning, lines of at most 80 columns, if the verdict flips, else ""."""
+        """A warning in one sentence if the verdict flips, else ""."""
         default = self.outcomes[0]
         other = next((one for one in self.outcomes if one.verdict != default.verdict), None)
         if other is None:
             return ""
         verdict = other.verdict or "not analysed"
-        sentence = f"the verdict hangs on a convention: {verdict} if {other.words} (--conventions lists all)"
-        return textwrap.fill(sentence, 80)
+        return f"the verdict hangs on a convention: {verdict} if {other.words} (--conventions lists all)"
 
     def __str__(self) -> str:
         """Return the outcomes as lines of at most 80 columns."""

@@ -17,11 +17,12 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import with_unit
 from apc.runtime.analysis import Prepared, prepare
 from apc.runtime.crossings import CELL
 from apc.runtime.delays import delay_now
 from apc.runtime.evaluator import reaches_time
-from apc.runtime.parameters import Free, find, parameter_of
+from apc.runtime.parameters import Free, find, parameter_of, unit_of
 from apc.runtime.search import Crossing, Search, search, search_delay
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
@@ -71,15 +72,15 @@ class Critical:
 
     def __str__(self) -> str:
         """Return the answer in words."""
-        unit = "" if self.unit == "1" else f" {self.unit}"
-        low, high = (f"{one:.6g}{unit}" for one in self.scanned)
-        lines = [f"{self.topology}: {self.parameter} is {self.present:.6g}{unit}", ""]
+        low, high = (with_unit(f"{one:.6g}", self.unit) for one in self.scanned)
+        present = with_unit(f"{self.present:.6g}", self.unit)
+        lines = [f"{self.topology}: {self.parameter} is {present}", ""]
         if self.value is None:
             lines.append(f"  {self.verdict}")
         for one in self.crossings:
             mark = "→" if one.value == self.value else " "
             error = f" ± {one.error:.0e}" if one.error else ", exact"
-            lines.append(f"{mark} {one.value:.15g}{unit}{error}")
+            lines.append(f"{mark} {with_unit(f'{one.value:.15g}', self.unit)}{error}")
             kind = "jump, " if one.kind == "jump" else ""
             lines.append(f"    {kind}stable {one.stable_side} it, {one.frequency_hz:.4g} Hz, {one.proof}")
         lines += ["", f"  scanned from {low} to {high}"]
@@ -115,7 +116,7 @@ def critical(
     free = Free(known, group)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         timed = reaches_time(system, free)
-        unit = "s" if any(one.name == known for one in system.timings) else parameter_of(system, free).unit
+        unit = unit_of(system, known)
         present = float(delay_now(system, free)) if timed else parameter_of(system, free).value
         limits = [_limit(text, free, unit) for text in (lower, upper)]
         _check_limits(system, free, limits, timed=timed)
@@ -131,7 +132,7 @@ def critical(
     verdict = f"{words} at every value scanned" if found.stable else "undecided at every value scanned"
     return Critical(
         topology=system.name,
-        parameter=known if group is None else f"{group}.{known}",
+        parameter=free.label,
         unit=unit,
         present=present,
         value=chosen.value if chosen else None,

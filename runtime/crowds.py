@@ -118,7 +118,7 @@ def hear_themselves(lifted: LiftedRows, schedule: Schedule, own: Floats, others:
     -----
     The state is z, then the packets on their way, row by row of s, the youngest first. With A₀ and B_p
     picking what each line hears of this frame's packets and of those on their way,
-    r = others·τ + own·(A₀ s + B_p q) and s = S z + D r: as in `modes.close`, D A₀ is nilpotent.
+    r = others·τ + own·(A₀ s + B_p q) and s = S z + D r: as in `modes.close_loop`, D A₀ is nilpotent.
     """
     parts = []
     for start in range(0, len(own), CHUNK):

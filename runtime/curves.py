@@ -29,8 +29,19 @@ RESERVE = 2.0
 
 
 def between(a: Floats, b: Floats, tangent_a: Floats, tangent_b: Floats, share: float | Floats) -> Floats:
-    """Return points (k, 2) of the cubics from a to b (k, 2) with unit tangents at both ends, 0 ≤ share ≤ 1.
+    """Return points (k, 2) of the cubics from a to b with unit tangents at both ends.
 
+    Parameters
+    ----------
+    a, b
+        The ends (k, 2).
+    tangent_a, tangent_b
+        Unit tangents there (k, 2).
+    share
+        How far along, from 0 to 1: one number for all, or one each (k,).
+
+    Notes
+    -----
     The slopes are as long as those that meet a circular arc to sixth order: chord/cos²(θ/4), θ the angle
     between the tangents (de Boor, Höllig and Sabin, High accuracy geometric Hermite interpolation, 1987).
     """

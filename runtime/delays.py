@@ -21,7 +21,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.analysis import Prepared, lifted_groups
 from apc.runtime.batch import BatchEvaluator, batch_evaluator
 from apc.runtime.parameters import Free, Override, apply, resolve
-from apc.runtime.schedule import Propagate, Schedule, build_schedules
+from apc.runtime.schedule import Propagate, Schedule, build_schedules, common_divisor
 
 # Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal
 # there by accident.
@@ -117,7 +117,7 @@ def _grid(system: CompiledSystem, free: Free, place: Place) -> Callable[[Fractio
             raise ApcError(Mistake("E844", place, what))
         lines.append((at[0][name] - slope * now, slope))
     others = [value for name, value in at[0].items() if name not in reached]
-    unit = _common_divisor(others)
+    unit = common_divisor(others)
     pairs = [(a - c, b - d) for i, (a, b) in enumerate(lines) for c, d in lines[:i] if b != d]
 
     def following(value: Fraction) -> Fraction:
@@ -130,12 +130,6 @@ def _grid(system: CompiledSystem, free: Free, place: Place) -> Callable[[Fractio
         return min(found)
 
     return following
-
-
-def _common_divisor(times: list[Fraction]) -> Fraction:
-    """Return the largest rational of which every time is a whole multiple."""
-    denominator = math.lcm(*(time.denominator for time in times))
-    return Fraction(math.gcd(*(int(time * denominator) for time in times)), denominator)
 
 
 def _piece(

@@ -28,6 +28,7 @@ import numpy as np
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import counted
 from apc.runtime.methods import DEFAULT, Method
 from apc.runtime.simulation import Simulation, blocks, prepare
 from apc.runtime.summary import Watch
@@ -272,7 +273,7 @@ def ensemble_text(ensemble: Ensemble) -> str:
     """Return what many runs amount to, in words of at most 80 columns."""
     n = len(ensemble.runs)
     lines = [
-        f"{ensemble.topology[:40]}: {n} run{'' if n == 1 else 's'} of {float(ensemble.duration):g} s, "
+        f"{ensemble.topology[:40]}: {counted(n, 'run')} of {float(ensemble.duration):g} s, "
         f"seed {ensemble.seed}"
     ]
     for verdict, count in ensemble.verdicts:

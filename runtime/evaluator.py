@@ -21,7 +21,7 @@ from apc.runtime.analysis import Prepared, lifted_groups, prepare
 from apc.runtime.batch import BatchEvaluator, batch_evaluator
 from apc.runtime.modes import ClosedSystem, split
 from apc.runtime.parameters import Free, Override, apply, parameter_of
-from apc.runtime.rigid import RigidModes, find_rigid_modes, independent_places
+from apc.runtime.rigid import RigidModes, find_rigid_modes, relative_coordinates
 
 Floats = NDArray[np.float64]
 
@@ -51,11 +51,17 @@ class PointEvaluator:
     prepared: Prepared
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
-        """Return the reduced frame matrices of all systems as blocks (k, n, n) at values (k, m)."""
+        """Return the reduced frame matrices of all systems as blocks (k, n, n) at values (k, m).
+
+        All of a matrix is NaN where there is none: below a parameter's minimum, say.
+        """
         blocks = [self._blocks(value) for value in values]
         size = max((sum(len(one) for one in listed) for listed in blocks), default=0)
         found = np.zeros((len(values), size, size))
+        found[[not all(np.isfinite(one).all() for one in listed) for listed in blocks]] = np.nan
         for matrix, listed in zip(found, blocks, strict=True):
+            if np.isnan(matrix).any():
+                continue
             start = 0
             for one in listed:
                 rows = slice(start, start + len(one))
@@ -64,13 +70,25 @@ class PointEvaluator:
         return (found,)
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
-        """Return the matrices (k, n, n) and their derivatives along directions (k, m)."""
-        size = np.where(along != 0, np.maximum(np.abs(values), 1e-6), np.inf).min(axis=1)
-        step = DIFFERENCE * size / np.abs(along).max(axis=1)
+        """Return the matrices (k, n, n) and their derivatives along directions (k, m).
+
+        At the end of what a parameter may be the derivative is that of the parabola through two points
+        further inside; NaN where there is none.
+        """
+        scale = np.where(values == 0, 1.0, np.maximum(np.abs(values), 1e-6))  # 0 has none: its unit's
+        step = DIFFERENCE * np.where(along != 0, scale, np.inf).min(axis=1) / np.abs(along).max(axis=1)
         moved = step[:, None] * along
         (all_of_them,) = self.matrices(np.concatenate([values, values - moved, values + moved]))
         here, before, after = np.split(all_of_them, 3)
-        return ((here, (after - before) / (2 * step[:, None, None])),)
+        slope = (after - before) / (2 * step[:, None, None])
+        for row in np.flatnonzero(~np.isfinite(slope).all(axis=(1, 2))):
+            way = 1.0 if np.isfinite(after[row]).all() else -1.0
+            far = values[row] + way * np.outer([1.0, 2.0], moved[row])
+            (inside,) = self.matrices(np.concatenate([values[row : row + 1], far]))
+            if inside.shape[1] == slope.shape[1]:
+                first, second, third = inside
+                slope[row] = way * (4 * second - 3 * first - third) / (2 * step[row])
+        return ((here, slope),)
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them."""
@@ -98,9 +116,7 @@ class PointEvaluator:
 
 def _reduced(system: ClosedSystem, free: RigidModes) -> Floats:
     """Return the frame matrix of the coordinates relative to the rigid motions, see `spectrum`."""
-    held = independent_places(free.basis.T)
-    rest = np.delete(np.arange(len(system.names)), held)
-    weights = free.basis[rest] @ np.linalg.inv(free.basis[held])
+    held, rest, weights = relative_coordinates(free.basis)
     return system.matrix[np.ix_(rest, rest)] - weights @ system.matrix[np.ix_(held, rest)]
 
 

@@ -24,7 +24,7 @@ from apc.runtime.diagonal import block_diagonal, block_norms, block_resolvent
 from apc.runtime.discretize import UNIT
 from apc.runtime.peers import PeerGroup
 from apc.runtime.pseudospectrum import balance
-from apc.runtime.rigid import independent_places
+from apc.runtime.rigid import relative_coordinates
 from apc.runtime.transfer import INNER
 
 Floats = NDArray[np.float64]
@@ -114,7 +114,7 @@ class _Family:
 
     def __init__(self, group: PeerGroup, weights: Floats, rigid: Floats, largest: float) -> None:
         self.group, self.weights = group, weights
-        self.held, self.rest, self.mixing = _relative(rigid)
+        self.held, self.rest, self.mixing = relative_coordinates(rigid)
         delayed = all(one.lag for one in group.schedule.heard)
         self.affine = delayed or not group.lifted.d.any()
         ends, error = self._matrices(np.array([0.0, largest]))
@@ -199,16 +199,6 @@ def _dominates(
         good = np.all(reach + np.maximum(beside[:, :large], 0.0) * (1 + 1e-9) < bound, axis=1)
         passed |= good & (block * beside[:, large] < 1)
     return passed
-
-
-def _relative(rigid: Floats) -> tuple[Integers, Integers, Floats]:
-    """Return the places p and r, and W = V_r V_p⁻¹, of rigid motions V (n, d)."""
-    n, count = rigid.shape
-    if not count:
-        return np.zeros(0, np.int64), np.arange(n), np.zeros((n, 0))
-    held = independent_places(rigid.T)
-    rest = np.setdiff1d(np.arange(n), held)
-    return held, rest, rigid[rest] @ np.linalg.inv(rigid[held])
 
 
 def _scaled(matrix: Floats, scale: Floats) -> Floats:

@@ -87,7 +87,6 @@ def write_figure(figure: Any, path: Path) -> None:
     """Write a matplotlib Figure, its format chosen by the suffix; the same figure gives the same bytes."""
     from apc.compiler.store import write_atomically
 
-    matplotlib = need("matplotlib", "plot")
     # No date in the file, and the same names inside it.
     matplotlib = need("matplotlib", "plot")
     dates: dict[str, dict[str, None]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}

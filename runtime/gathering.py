@@ -166,13 +166,23 @@ class Gathering:
 
     def hear(self, listener: int, heard: Heard) -> Any:
         """Return what a member hears at a tick, or the weight of what it misses: one number a peer."""
-        gates = enumerate(self.gates)
-        number = next(n for n, g in gates if (g.route.link, g.route.clock) == (heard.way.link, heard.clock))
-        weights = self._weigh(number, listener, heard)
+        return self.on_ways(heard) @ self._weigh(self._number(heard), listener, heard)
+
+    def on_ways(self, heard: Heard) -> Any:
+        """Return what is heard at a tick on each way of a gate, in a row, or 1 where something is missed."""
+        number = self._number(heard)
         if heard.gap:
-            return self._gaps[number][:, heard.tick].T @ weights
+            return self._gaps[number][:, heard.tick].T
         rows = self._seen[number][:, heard.tick]
-        return self._candidates(number, heard.sent.channel).get_nz(False, rows).T @ weights
+        return self._candidates(number, heard.sent.channel).get_nz(False, rows).T
+
+    def route(self, heard: Heard) -> Route:
+        """Return the ways on which it is heard."""
+        return self.gates[self._number(heard)].route
+
+    def _number(self, heard: Heard) -> int:
+        gates = enumerate(self.gates)
+        return next(n for n, g in gates if (g.route.link, g.route.clock) == (heard.way.link, heard.clock))
 
     def renew(self) -> None:
         """Take notice that something was sent."""

@@ -17,7 +17,7 @@ from fractions import Fraction
 
 from apc.compiler.compiled import PEERS, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.parameters import Override, apply, find
+from apc.runtime.parameters import Override, apply, find, unit_of
 
 PLACE = Place("sweep")
 
@@ -111,7 +111,7 @@ def parse_axis(system: CompiledSystem, name: str, text: str) -> GridAxis:
         quantity; E624 or E625 a value out of the parameter's bounds.
     """
     known, group = _find(system, name.strip())
-    unit = next((one.unit for one in system.parameters if one.name == known), "s")
+    unit = unit_of(system, known)
     label = f"{group}.{known}" if group else known
     values = _range(label, unit, text) if ":" in text else _list(label, unit, text)
     axis = GridAxis(known, group, unit, values)

@@ -11,14 +11,15 @@ Does not: list more than the largest modes.
 Arnoldi's method (ARPACK) finds the eigenvalues nearest to a few shifts, where copies of some peers, all
 alike, would have their largest ones. The count goes around
 
-    g(ζ) = det(I − R/ζ) / Π_i det(I − M_i/ζ),
+    g(ζ) = det(I − R/ζ) / Π_k (1 − p_k/ζ),
 
-R the whole and M_i the peers by themselves, hearing nothing, whose eigenvalues are known: it goes to 1 as ζ
-goes to infinity, and its argument moves far less than that of the determinant.
+R the whole and p_k the eigenvalues of peers by themselves, hearing nothing, and those of R that are known: it
+goes to 1 as ζ goes to infinity, and its argument moves far less than that of the determinant.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from apc.runtime.crowds import Crowd, hear_themselves, lift_one, some_rows
 from apc.runtime.discretize import UNIT
 from apc.runtime.exchange import Exchange
-from apc.runtime.sparse_system import SparseSystem, relative_matrix, sparse_system
+from apc.runtime.sparse_system import RelativeMatrix, SparseSystem, relative_matrix, sparse_system
 from apc.runtime.spectrum import Mode, Spectrum, judge, oscillation, turned_along
 
 Floats = NDArray[np.float64]
@@ -45,6 +46,9 @@ SHIFTS, APART, ASIDE = 6, 0.02, 1.0 + 3e-5
 # Eigenvalues sought near each shift; if a count says that some were missed, more, and a little farther out.
 NEAREST, FURTHER = (6, 24, 60), 1.002
 
+# What Arnoldi's method is asked for, relatively, before each value is refined by itself, and its restarts.
+FOUND, RESTARTS = 1e-9, 60
+
 # Modes listed.
 LISTED = 4
 
@@ -54,9 +58,13 @@ STEPS, NEAR = 3, 1e-11
 # The circle of the count is so many errors outside of the largest eigenvalue, and at least this far.
 OUTSIDE, FARTHEST = 20.0, 1e-9
 
+# Arcs of the half circle to begin with; eigenvalues this near to the circle, relatively, are not divided by,
+# but looked at, so many of them.
+ARCS, NEAR_CIRCLE, LOOKED_AT = 16, 0.02, 9
+
 # The argument's rate of change is measured over this angle; an arc is settled when two rules for its integral
-# differ by less than that (radians); factorizations after which the count is given up.
-ANGLE, SETTLED, MOST_FACTORS = 1e-7, 0.5, 1500
+# differ by less than that (radians); no arc is narrower, and after so many factorizations it is given up.
+ANGLE, SETTLED, NARROWEST, MOST_FACTORS = 1e-8, 0.5, 1e-12, 1200
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,17 +91,18 @@ def solve_sparse(listed: Sequence[Crowd], exchange: Exchange, motions: Sequence[
     """
     system = sparse_system(listed, exchange)
     rigid = _rigid_directions(system, exchange, motions)
-    matrix, error, rest = relative_matrix(system, rigid)
+    whole = relative_matrix(system, rigid)
     pairs: list[_Pair] = []
     shifts = _shifts(system, listed)
     for nearest in NEAREST:
-        pairs = _largest(matrix, error, shifts, pairs, nearest)
+        pairs = _largest(whole, shifts, pairs, nearest)
         radius, off = abs(pairs[0].value), pairs[0].error
         beyond = radius + max(OUTSIDE * off, FARTHEST)
         if beyond >= 1 > radius + off:
             beyond = (1 + radius) / 2
         # The rigid motions left in: without them, a column for each is full.
-        count = _count_beyond(system.matrix, _alone(listed), beyond)
+        known = np.array([pair.value for pair in pairs] + [1.0] * rigid.shape[1])
+        count = count_beyond(system.matrix, _alone(listed), known, beyond)
         count -= rigid.shape[1] if beyond < 1 and count >= 0 else 0
         if count <= 0:
             break
@@ -109,7 +118,7 @@ def solve_sparse(listed: Sequence[Crowd], exchange: Exchange, motions: Sequence[
         if count < 0
         else f"{count} larger eigenvalues were counted but not found"
     )
-    modes = tuple(_mode(system, listed, rigid, rest, pair) for pair in pairs)
+    modes = tuple(_mode(system, listed, rigid, whole.places, pair) for pair in pairs)
     return Spectrum(modes, radius, radius_error, rigid.shape[1], 0, verdict, stable, "", tuple(notes))
 
 
@@ -156,22 +165,25 @@ def _shifts(system: SparseSystem, listed: Sequence[Crowd]) -> list[complex]:
 
 
 def _largest(
-    matrix: Any, error: Any, shifts: Sequence[complex], found: Sequence[_Pair], nearest: int
+    whole: RelativeMatrix, shifts: Sequence[complex], found: Sequence[_Pair], nearest: int
 ) -> list[_Pair]:
     """Return the largest eigenvalues near some shifts, or found before, each once, conjugates left out."""
     import scipy.sparse.linalg
 
-    n = matrix.shape[0]
-    complex_matrix = matrix.astype(np.complex128)
+    n = whole.matrix.shape[0]
     start = np.ones(n) + np.linspace(0.0, 1.0, n)
     values = [np.array([pair.value for pair in found], np.complex128)]
     vectors = [np.stack([pair.right for pair in found], axis=1) if found else np.zeros((n, 0), np.complex128)]
     for shift in shifts:
-        factors = _factored(complex_matrix, shift)
-        inverse = scipy.sparse.linalg.LinearOperator((n, n), factors.solve, dtype=np.complex128)
+        factors = whole.factor(shift)
+        inverse = scipy.sparse.linalg.LinearOperator(
+            (n, n), lambda right, factors=factors: _solved(factors, right), dtype=np.complex128
+        )
+        sought = min(nearest, n - 2)
         try:
-            sought = min(nearest, n - 2)
-            near, right = scipy.sparse.linalg.eigs(inverse, k=sought, v0=start, ncv=min(n, 4 * sought))
+            near, right = scipy.sparse.linalg.eigs(
+                inverse, k=sought, v0=start, ncv=min(n, 4 * sought), tol=FOUND, maxiter=RESTARTS
+            )
         except scipy.sparse.linalg.ArpackNoConvergence as partial:
             near, right = partial.eigenvalues, partial.eigenvectors
         values.append(shift + 1 / near)
@@ -181,72 +193,94 @@ def _largest(
     for place in np.argsort(-np.abs(value), kind="stable"):
         one = complex(value[place])
         known = [pair.value for pair in pairs]
-        if any(min(abs(one - other), abs(one.conjugate() - other)) <= 1e-9 * abs(one) for other in known):
+        if any(min(abs(one - other), abs(one.conjugate() - other)) <= 10 * FOUND for other in known):
             continue
-        pairs.append(_paired(complex_matrix, error, one, vector[:, place]))
+        pairs.append(_paired(whole, one, vector[:, place]))
         if len(pairs) == LISTED:
             break
     return sorted(pairs, key=lambda pair: -abs(pair.value))
 
 
-def _factored(matrix: Any, shift: complex) -> Any:
-    import scipy.sparse
-    import scipy.sparse.linalg
+def _solved(factors: Any, right: Complexes, trans: str = "N") -> Complexes:
+    """Solve with R − shift or its transpose by the factors of what is bordered."""
+    whole = np.zeros(factors.shape[0], np.complex128)
+    whole[: len(right)] = right
+    return np.asarray(factors.solve(whole, trans=trans)[: len(right)])
 
-    return scipy.sparse.linalg.splu((matrix - shift * scipy.sparse.identity(matrix.shape[0])).tocsc())
 
-
-def _paired(matrix: Any, error: Any, value: complex, right: Complexes) -> _Pair:
+def _paired(whole: RelativeMatrix, value: complex, right: Complexes) -> _Pair:
     """Refine an eigenvalue with its left vector: Rayleigh's quotient is right to the vectors' square."""
-    factors = _factored(matrix, value * (1 + NEAR))
+    factors = whole.factor(value * (1 + NEAR))
     left = right.conj()
     for _ in range(STEPS):
-        left = factors.solve(left, trans="T")
+        left = _solved(factors, left, "T")
         left /= np.linalg.norm(left)
-        right = factors.solve(right)
+        right = _solved(factors, right)
         right /= np.linalg.norm(right)
     scale = abs(left @ right)
-    moved = matrix @ right
+    moved = whole.matrix @ right
     value = complex((left @ moved) / (left @ right))
     residual = np.abs(left) @ np.abs(moved - value * right)
-    off = np.abs(left) @ (error @ np.abs(right)) + residual
+    off = np.abs(left) @ (whole.error @ np.abs(right)) + residual
     if abs(value.imag) <= off / scale:
         value = complex(value.real)
     return _Pair(value, right, left, float(off / scale) + 8 * UNIT * abs(value))
 
 
-def _alone(listed: Sequence[Crowd]) -> list[tuple[Complexes, Floats]]:
-    """Return the eigenvalues (k, n) of the peers of each crowd when they hear nothing, and their counts."""
-    return [
-        (np.linalg.eigvals(crowd.lifted.p).astype(np.complex128).ravel(),
-         np.repeat(crowd.counts, crowd.lifted.p.shape[-1]))
-        for crowd in listed
-    ]  # fmt: skip
+def _alone(listed: Sequence[Crowd]) -> tuple[Complexes, Floats]:
+    """Return the eigenvalues of all peers when they hear nothing, and how often each is there."""
+    values = [np.linalg.eigvals(crowd.lifted.p).astype(np.complex128).ravel() for crowd in listed]
+    counts = [np.repeat(crowd.counts, crowd.lifted.p.shape[-1]) for crowd in listed]
+    return np.concatenate(values), np.concatenate(counts)
 
 
-def _count_beyond(matrix: Any, alone: Sequence[tuple[Complexes, Floats]], radius: float) -> int:
+def count_beyond(matrix: Any, alone: tuple[Complexes, Floats], known: Complexes, radius: float) -> int:
     """Return how many eigenvalues are larger than a radius, −1 if it can't be told.
 
-    The argument of g is followed around the upper half of the circle; its change along an arc is known up to
-    whole turns from its ends, and its rate tells the turns: Simpson's rule, as far as the trapezoidal rule on
-    half the arc agrees.
+    Parameters
+    ----------
+    matrix
+        R.
+    alone
+        The eigenvalues of the peers by themselves and how often each is there.
+    known
+        Eigenvalues of R, conjugates left out.
+    radius
+        The circle's.
+
+    Notes
+    -----
+    g is taken with what is far from the circle only, and with the eigenvalues that are known: what is near to
+    the circle turns it in an angle too small to be seen between samples. Its argument is followed around the
+    upper half; the change along an arc is known up to whole turns from its ends, and its rate tells the
+    turns: Simpson's rule, as far as the trapezoidal rule on half the arc agrees.
     """
     complex_matrix = matrix.astype(np.complex128)
-    known: dict[float, tuple[float, float]] = {}
+    values, counts = alone
+    near = np.abs(np.abs(values) - radius) <= NEAR_CIRCLE * radius
+    pairs = np.concatenate([known, known[known.imag != 0].conj()])
+    divided = np.concatenate([values[~near], pairs]), np.concatenate([counts[~near], np.ones(len(pairs))])
+    samples: dict[float, tuple[float, float]] = {}
 
     def sample(angle: float) -> tuple[float, float]:
-        if angle not in known:
+        if angle not in samples:
             here, there = (
-                _argument(complex_matrix, alone, radius * np.exp(1j * one)) for one in (angle, angle + ANGLE)
+                _argument(complex_matrix, divided, radius * np.exp(1j * one))
+                for one in (angle, angle + ANGLE)
             )
-            known[angle] = here, _wrapped(there - here) / ANGLE
-        return known[angle]
+            samples[angle] = here, _wrapped(there - here) / ANGLE
+        return samples[angle]
 
-    edges = np.linspace(0.0, np.pi, 9)
-    pending = list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+    # The eigenvalues that were missed are most likely near those of peers by themselves.
+    there = np.angle(values[near & (values.imag >= 0)])
+    likely = np.quantile(there, np.linspace(0, 1, LOOKED_AT)) if len(there) else there
+    edges = np.unique(
+        np.concatenate([np.linspace(0.0, np.pi, ARCS + 1), likely, np.angle(known[known.imag > 0])])
+    )
+    pending = list(itertools.pairwise(edges.tolist()))
     turned = 0.0
     while pending:
-        if 2 * len(known) > MOST_FACTORS:
+        if 2 * len(samples) > MOST_FACTORS:
             return -1
         a, b = pending.pop()
         middle = (a + b) / 2
@@ -256,27 +290,26 @@ def _count_beyond(matrix: Any, alone: Sequence[tuple[Complexes, Floats]], radius
         exact = simpson + _wrapped(at_b - at_a - simpson)
         if abs(simpson - halves) < SETTLED and abs(exact - simpson) < SETTLED:
             turned += exact
-        elif b - a < 1e-12:
+        elif b - a < NARROWEST:
             return -1
         else:
             pending += [(a, middle), (middle, b)]
-    outside = sum(float(counts[np.abs(values) > radius].sum()) for values, counts in alone)
+    outside = float(divided[1][np.abs(divided[0]) > radius].sum())
     turns = 2 * turned / (2 * np.pi)  # the lower half mirrors the upper
     return round(outside - turns) if abs(turns - round(turns)) < 0.1 else -1
 
 
-def _argument(matrix: Any, alone: Sequence[tuple[Complexes, Floats]], point: complex) -> float:
+def _argument(matrix: Any, divided: tuple[Complexes, Floats], point: complex) -> float:
     """Return the argument of g at a point."""
     import scipy.sparse
     import scipy.sparse.linalg
 
     n = matrix.shape[0]
     factors = scipy.sparse.linalg.splu((scipy.sparse.identity(n) - matrix / point).tocsc())
-    diagonal = factors.U.diagonal()
-    total = float(np.angle(diagonal).sum()) + np.pi * (_odd(factors.perm_r) ^ _odd(factors.perm_c))
-    for values, counts in alone:
-        total -= float(counts @ np.angle(1 - values / point))
-    return _wrapped(total)
+    total = float(np.angle(factors.U.diagonal()).sum())
+    total += np.pi * (_odd(factors.perm_r) ^ _odd(factors.perm_c))
+    values, counts = divided
+    return _wrapped(total - float(counts @ np.angle(1 - values / point)))
 
 
 def _odd(permutation: NDArray[np.int32]) -> bool:

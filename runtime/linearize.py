@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import PEERS, ClockPartition, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.exact import evaluate_exact
+from apc.runtime.guards import guards_of
 
 Matrix = NDArray[Any]
 
@@ -153,12 +154,15 @@ def jacobians(kind: Kind) -> SiteJacobians:
     heard = [symbol("r", len(partition.receives)) for partition in kind.clocks]
 
     derivative = kind.derivative(x, u, p, t)
+    values = [derivative]
     blocks = [casadi.jacobian(derivative, x), casadi.jacobian(derivative, u)]
     for partition, m, r in zip(kind.clocks, memories, heard, strict=True):
         outputs = partition.tick(x, u, m, r, p, t)
+        values.append(outputs)
         blocks += [casadi.jacobian(outputs, of) for of in (x, u, m, r)]
     for sending in kind.sends:
         sent = sending.send(x, u, p, t)
+        values.append(sent)
         blocks += [casadi.jacobian(sent, of) for of in (x, u)]
 
     m_all, r_all = casadi.vertcat(*memories), casadi.vertcat(*heard)
@@ -170,9 +174,12 @@ def jacobians(kind: Kind) -> SiteJacobians:
         for place, receive in enumerate(partition.receives)
         if edge_name(partition, receive)
     }
+    inside = casadi.vertcat(x, u, m_all, r_all)
     affine = (
         plain
         and not (flat.numel() and casadi.depends_on(flat, moving))
+        # A force that jumps has the same slopes on either side.
+        and not guards_of(casadi.vertcat(*values), inside)
         and all(edge.affine for edge in edges.values())
     )
     listening = [_listening(kind, p, edges) for p in range(len(kind.clocks))]
@@ -211,7 +218,7 @@ def _edge(kind: Kind, partition: ClockPartition, receive: Receive) -> Edge:
     p, t = symbol("p", len(kind.parameters)), symbol("t")
     value = s[receive.channel] if receive.edge is None else receive.edge(x, u, m, s, p, t)
     slopes = casadi.densify(casadi.jacobian(value, casadi.vertcat(x, u, m, s)).T)
-    smooth = receive.operator in ("sum", "mean")
+    smooth = receive.operator in ("sum", "mean") and not guards_of(value, casadi.vertcat(x, u, m, s))
     moves = casadi.depends_on(slopes, casadi.vertcat(x, u, m, s, t)) if slopes.numel() else False
     function = casadi.Function("edge", [x, u, m, s, p, t], [casadi.vertcat(casadi.densify(value), slopes)])
     return Edge(function, smooth and not moves)

@@ -156,8 +156,7 @@ def _parameter_margins(
         roots = [root for root in scanned.roots if root.rising and root.value > present]
         crossing = proved_crossing(roots[0], line, scanned) if roots else None
         reached = float(scanned.points[-1]) if len(scanned.points) else present
-        name = one.name if one.group is None else f"{one.group}.{one.name}"
-        found.append(_margin(name, parameter_of(system, one).unit, present, crossing, reached))
+        found.append(_margin(one.label, parameter_of(system, one).unit, present, crossing, reached))
     return found
 
 

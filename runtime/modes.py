@@ -1,8 +1,8 @@
 """Close the loop between peers, as few small systems instead of one large one.
 
 Takes: the groups of equal peers of a scene, and the exchange between them.
-Gives: `Loop`, `arrange`, `complete_loops`, `dense_loop`, `graph_loop`; `ClosedSystem`, `close`; `Split`,
-`split`, `modes`, `dense`.
+Gives: `Loop`, `arrange`, `complete_loops`, `dense_loop`, `graph_loop`; `ClosedSystem`, `close_loop`;
+`Split`, `split`, `modes`, `dense`.
 Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
 `dense`, whatever the number of peers.
 Does not: compute eigenvalues (see `spectrum`).
@@ -84,7 +84,7 @@ class Loop:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the state."""
-        return _layout(self.sites, self.packets)[1]
+        return _layout(self).names
 
     @property
     def states(self) -> int:
@@ -393,74 +393,50 @@ def graph_loop(group: PeerGroup, mode: GraphMode, scale: GraphScale) -> Loop:
 
 
 def close_loop(loop: Loop) -> ClosedSystem:
-    """Build the matrix of a loop."""
-    closed = close(
-        loop.sites, loop.coupling, name=loop.name, multiplicity=loop.multiplicity, doubts=loop.doubts
-    )
-    return replace(closed, surds=loop.surds) if loop.surds else closed
-
-
-def close(
-    sites: Sequence[PeerGroup],
-    coupling: Coupling,
-    *,
-    name: str,
-    multiplicity: int = 1,
-    doubts: Mapping[Way, float] | None = None,
-) -> ClosedSystem:
     """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it.
-
-    Parameters
-    ----------
-    sites
-        The K sites.
-    coupling
-        W (K, K) by way, exact.
-    name, multiplicity
-        What the system is called and how often the whole holds it.
-    doubts
-        By how much each entry of a way's W may be off, where it isn't exact.
 
     Notes
     -----
     Packets heard in the frame they are sent in make a loop within the frame, s = S z + D r and r = W₀ s + …,
     that time orders: D W₀ is nilpotent, and I − D W₀ is solved exactly by as many steps as there are packets.
     """
-    lifted = [group.lifted for group in sites]
-    row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in sites]
-    packets = tuple(
-        Packet(h, row, lag)
-        for h, group in enumerate(sites)
-        for row, depth in enumerate(group.schedule.depths)
-        for lag in range(1, depth + 1)
-    )
-    offsets, names = _layout(sites, packets)
-    place_of = packet_places(sites, packets, offsets)
-    n = len(names)
-    s_start = np.cumsum([0] + [len(site.s) for site in lifted])
-
-    def links(weigh: Callable[[Fraction, float], float]) -> list[tuple[Floats, Floats]]:
-        """Return, for each site, r over the packets sent this frame and over the state."""
-        found = []
-        for g, group in enumerate(sites):
-            now = np.zeros((len(group.schedule.heard), s_start[-1]))
-            before = np.zeros((len(group.schedule.heard), n))
-            for line, one in enumerate(group.schedule.heard):
-                doubt = (doubts or {}).get(one.way, 0.0)
-                for h, weight in enumerate(coupling[one.way][g]):
-                    if weight == 0 and doubt == 0:
-                        continue
-                    row = row_of[h][one.sent]
-                    if one.lag == 0:
-                        now[line, s_start[h] + row] = weigh(weight, doubt)
-                    else:
-                        before[line, place_of[Packet(h, row, one.lag)]] = weigh(weight, doubt)
-            found.append((now, before))
-        return found
-
+    lifted = [group.lifted for group in loop.sites]
+    layout = _layout(loop)
     exact = [(site.p, site.q, site.s, site.d) for site in lifted]
-    matrix, heard = _closed(exact, links(lambda weight, _: float(weight)), offsets, packets, place_of, n)
-    # The magnitudes, and the magnitudes with their errors: the difference bounds the error to all orders.
+    matrix, heard = _closed(exact, _links(loop, layout, lambda weight, _: float(weight)), layout)
+    marks = min(len(site.inside) for site in lifted)
+    inside = np.zeros((marks, sum(site.continuous for site in lifted), len(layout.names)))
+    motion: list[int] = []
+    for site, offset, r in zip(lifted, layout.offsets, heard, strict=True):
+        n_z = len(site.z_names)
+        rows = slice(len(motion), len(motion) + site.continuous)
+        inside[:, rows, offset : offset + n_z] = site.inside[:, :, :n_z]
+        inside[:, rows] += site.inside[:, :, n_z:] @ r
+        motion += range(offset, offset + site.continuous)
+    return ClosedSystem(
+        name=loop.name,
+        multiplicity=loop.multiplicity,
+        sites=loop.sites,
+        coupling=loop.coupling,
+        frame_s=lifted[0].frame_s,
+        names=layout.names,
+        offsets=layout.offsets,
+        packets=layout.packets,
+        matrix=matrix,
+        error=_closing_errors(loop, layout, exact),
+        inside=inside,
+        motion=tuple(motion),
+        doubts=loop.doubts,
+        surds=loop.surds,
+    )
+
+
+def _closing_errors(loop: Loop, layout: _Layout, exact: Sequence[Sequence[Floats]]) -> Floats:
+    """Return bounds on the errors of a closed matrix, entry by entry: its sites', its weights' and rounding.
+
+    The magnitudes, and the magnitudes with their errors: the difference bounds the error to all orders.
+    """
+    lifted = [group.lifted for group in loop.sites]
     large = [tuple(np.abs(block) for block in blocks) for blocks in exact]
     wide = [
         tuple(
@@ -471,89 +447,99 @@ def close(
         )
         for blocks, site in zip(large, lifted, strict=True)
     ]
-    weights = links(lambda weight, _: float(abs(weight)))
-    doubtful = links(lambda weight, doubt: float(abs(weight)) + doubt) if doubts else weights
-    bound, _ = _closed(large, weights, offsets, packets, place_of, n)
-    upper, _ = _closed(wide, doubtful, offsets, packets, place_of, n)
+    weights = _links(loop, layout, lambda weight, _: float(abs(weight)))
+    doubtful = (
+        _links(loop, layout, lambda weight, doubt: float(abs(weight)) + doubt) if loop.doubts else weights
+    )
+    bound, _ = _closed(large, weights, layout)
+    upper, _ = _closed(wide, doubtful, layout)
     # A sum rounds as often as it has terms that are not zero, whatever the size of the whole.
-    listened = max(len(group.schedule.heard) for group in sites)
+    listened = max(len(group.schedule.heard) for group in loop.sites)
     senders = max((int(np.count_nonzero(now, axis=1).max(initial=0)) for now, _ in weights), default=0)
     terms = max(len(site.z_names) for site in lifted) + listened * (1 + senders)
-    roundings = 4 * (terms + 2) * (1 + len(sites[0].schedule.sent)) * UNIT
-    error = (upper - bound) + roundings * upper
+    roundings = 4 * (terms + 2) * (1 + len(loop.sites[0].schedule.sent)) * UNIT
+    return (upper - bound) + roundings * upper
 
-    marks = min(len(site.inside) for site in lifted)
-    inside = np.zeros((marks, sum(site.continuous for site in lifted), n))
-    motion: list[int] = []
-    for g, site in enumerate(lifted):
-        n_z = len(site.z_names)
-        rows = slice(len(motion), len(motion) + site.continuous)
-        inside[:, rows, offsets[g] : offsets[g] + n_z] = site.inside[:, :, :n_z]
-        inside[:, rows] += site.inside[:, :, n_z:] @ heard[g]
-        motion += range(offsets[g], offsets[g] + site.continuous)
-    return ClosedSystem(
-        name=name,
-        multiplicity=multiplicity,
-        sites=tuple(sites),
-        coupling=coupling,
-        frame_s=lifted[0].frame_s,
-        names=names,
-        offsets=offsets,
-        packets=packets,
-        matrix=matrix,
-        error=error,
-        inside=inside,
-        motion=tuple(motion),
-        doubts=doubts or {},
-    )
+
+def _links(
+    loop: Loop, layout: _Layout, weigh: Callable[[Fraction, float], float]
+) -> list[tuple[Floats, Floats]]:
+    """Return, for each site, r over the packets sent this frame and over the state.
+
+    `weigh` makes a number of a weight and by how much it may be off.
+    """
+    row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in loop.sites]
+    starts = np.cumsum([0] + [len(group.lifted.s) for group in loop.sites])
+    found = []
+    for g, group in enumerate(loop.sites):
+        now = np.zeros((len(group.schedule.heard), starts[-1]))
+        before = np.zeros((len(group.schedule.heard), len(layout.names)))
+        for line, one in enumerate(group.schedule.heard):
+            doubt = loop.doubts.get(one.way, 0.0)
+            for h, weight in enumerate(loop.coupling[one.way][g]):
+                if weight == 0 and doubt == 0:
+                    continue
+                row = row_of[h][one.sent]
+                if one.lag == 0:
+                    now[line, starts[h] + row] = weigh(weight, doubt)
+                else:
+                    before[line, layout.places[Packet(h, row, one.lag)]] = weigh(weight, doubt)
+        found.append((now, before))
+    return found
 
 
 def _closed(
-    blocks: Sequence[Sequence[Floats]],
-    links: Sequence[tuple[Floats, Floats]],
-    offsets: Sequence[int],
-    packets: Sequence[Packet],
-    place_of: Mapping[Packet, int],
-    n: int,
+    blocks: Sequence[Sequence[Floats]], links: Sequence[tuple[Floats, Floats]], layout: _Layout
 ) -> tuple[Floats, list[Floats]]:
     """Return the closed matrix and what each site hears, over the state."""
+    n = len(layout.names)
     send_state, send_now = [], []
-    for (p, _, s, d), (now, before), offset in zip(blocks, links, offsets, strict=True):
+    for (p, _, s, d), (now, before), offset in zip(blocks, links, layout.offsets, strict=True):
         row = np.zeros((len(s), n))
         row[:, offset : offset + len(p)] = s
         send_state.append(row + d @ before)
         send_now.append(d @ now)
-    source, loop = np.vstack(send_state), np.vstack(send_now)
-    sent, term = source, loop @ source
-    for _ in range(len(loop)):
+    source, within = np.vstack(send_state), np.vstack(send_now)
+    sent, term = source, within @ source
+    for _ in range(len(within)):
         if not term.any():
             break
-        sent, term = sent + term, loop @ term
+        sent, term = sent + term, within @ term
     assert not term.any(), "a packet is heard before it is sent"
 
     matrix = np.zeros((n, n))
     heard = []
-    for (p, q, _, _), (now, before), offset in zip(blocks, links, offsets, strict=True):
+    for (p, q, _, _), (now, before), offset in zip(blocks, links, layout.offsets, strict=True):
         r = now @ sent + before
         heard.append(r)
         rows = slice(offset, offset + len(p))
         matrix[rows, rows] += p
         matrix[rows] += q @ r
     starts = np.cumsum([0] + [len(s) for _, _, s, _ in blocks])
-    for packet in packets:
-        place = place_of[packet]
+    for packet, place in layout.places.items():
         if packet.lag == 1:
             matrix[place] = sent[starts[packet.site] + packet.row]
         else:
-            matrix[place, place_of[Packet(packet.site, packet.row, packet.lag - 1)]] = 1.0
+            matrix[place, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = 1.0
     return matrix, heard
 
 
-def _layout(sites: Sequence[PeerGroup], packets: Sequence[Packet]) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return where each site's part of the state starts, and the names of the state."""
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """The state of a closed system: where each site's part starts, its names, and where each packet is."""
+
+    offsets: tuple[int, ...]
+    names: tuple[str, ...]
+    packets: tuple[Packet, ...]
+    places: Mapping[Packet, int]
+
+
+def _layout(loop: Loop) -> _Layout:
+    """Lay out the state of a loop: site by site what it is made of, then its packets."""
+    packets = loop.packets
     offsets: list[int] = []
     names: list[str] = []
-    for h, group in enumerate(sites):
+    for h, group in enumerate(loop.sites):
         offsets.append(len(names))
         schedule = group.schedule
         own = list(group.lifted.z_names)
@@ -562,8 +548,9 @@ def _layout(sites: Sequence[PeerGroup], packets: Sequence[Packet]) -> tuple[tupl
                 quanta = schedule.sent_times[packet.row] - packet.lag * schedule.frame
                 when = float(quanta * schedule.quantum * 1000)
                 own.append(f"{schedule.sent_names[packet.row]}({when:.6g} ms)")
-        names += own if len(sites) == 1 else [f"{group.name}.{name}" for name in own]
-    return tuple(offsets), tuple(names)
+        names += own if len(loop.sites) == 1 else [f"{group.name}.{name}" for name in own]
+    places = packet_places(loop.sites, packets, offsets)
+    return _Layout(tuple(offsets), tuple(names), packets, places)
 
 
 def packet_places(

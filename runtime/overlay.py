@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.runtime.parameters import Override, apply, find
+from apc.runtime.parameters import Override, apply, find, unit_of
 from apc.runtime.passivity import CONDITIONS, MEANINGS, UNITS, PublishedCondition
 
 Floats = NDArray[np.float64]
@@ -97,7 +97,7 @@ def _role(system: CompiledSystem, symbol: str, player: str) -> Role:
         value = quantity(player, _PLACE, what=symbol, unit=UNITS[symbol]).value
         return Role(symbol, None, None, float(value))
     name, group = find(system, player, _PLACE)
-    unit = next((one.unit for one in system.parameters if one.name == name), "s")
+    unit = unit_of(system, name)
     if parse_unit(unit, _PLACE).dimension != parse_unit(UNITS[symbol], _PLACE).dimension:
         what = f"{symbol}, the {MEANINGS[symbol]},"
         raise ApcError(Mistake("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))

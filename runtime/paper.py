@@ -32,7 +32,7 @@ from apc.runtime.discretize import UNIT
 from apc.runtime.lift import COEFFICIENT_ROUNDINGS
 from apc.runtime.modes import ClosedSystem
 from apc.runtime.openloop import Input, OpenLoop, open_loop, over, whole_system
-from apc.runtime.rigid import RigidModes, find_rigid_modes
+from apc.runtime.rigid import RigidModes, find_rigid_modes, independent_places
 from apc.runtime.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
@@ -363,8 +363,8 @@ def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tu
     basis, doubt = _rigid_basis(loop, whole, rigid)
     moving = rest[:n]
     if basis.shape[1]:
-        held = _pivots(basis[:n])
-        rest = np.setdiff1d(rest, held)
+        held = independent_places(basis[:n].T)
+        rest = np.delete(rest, held)
         moving = rest[rest < n]
         inverse = np.linalg.inv(basis[held])
         weights = basis[rest] @ inverse
@@ -440,17 +440,6 @@ def _rigid_basis(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tupl
         ]
     )
     return basis, doubt
-
-
-def _pivots(rows: Floats) -> NDArray[np.intp]:
-    """Return as many places as there are columns of `rows` (n, m), where these are told apart best."""
-    left = np.array(rows)
-    places = []
-    for column in range(rows.shape[1]):
-        place = int(np.argmax(np.abs(left[:, column])))
-        places.append(place)
-        left = left - np.outer(left[:, column] / left[place, column], left[place])
-    return np.array(sorted(places), dtype=np.intp)
 
 
 def _with_rigid(spectrum: Spectrum, rigid: RigidModes) -> Spectrum:

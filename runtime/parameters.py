@@ -1,7 +1,7 @@
 """The numbers of a compiled system, and changing them without compiling again.
 
 Takes: a `CompiledSystem` and overrides such as `contact.stiffness=800 N/m`.
-Gives: `Override`, `parse_override`, `find`, `apply`; `Numbers`, `resolve`; `Free`, `free_rows`.
+Gives: `Override`, `parse_override`, `find`, `unit_of`, `apply`; `Numbers`, `resolve`; `Free`, `free_rows`.
 Guarantees: what depends on a changed parameter by an expression changes with it, in exact rationals; bounds
 are kept; the rest keeps the very numbers it was compiled with. What depends on a parameter that differs from
 peer to peer is worked out peer by peer, in floats, in a time that grows with the number of peers.
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import PEERS, CompiledSystem, Group, Parameter, Timing
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
+from apc.compiler.words import with_unit
 
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
@@ -79,6 +80,11 @@ class Free:
     name: str
     group: str | None = None
 
+    @property
+    def label(self) -> str:
+        """The name as a person writes it, its group before it."""
+        return self.name if self.group is None else f"{self.group}.{self.name}"
+
 
 @dataclass(frozen=True, slots=True)
 class Override:
@@ -121,7 +127,7 @@ def parse_override(system: CompiledSystem, text: str, place: Place = _PLACE) -> 
         form = "contact.stiffness=800 N/m"
         raise ApcError(Mistake("E621", place, "an override", "NAME=VALUE", text[:80], form))
     known, group = find(system, name, place)
-    unit = _unit_of(system, known)
+    unit = unit_of(system, known)
     found = quantity(
         value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
     )
@@ -449,7 +455,7 @@ class _Scope:
         return Fraction(repr(float(self._parameters[name].value)))
 
 
-def _unit_of(system: CompiledSystem, name: str) -> str:
+def unit_of(system: CompiledSystem, name: str) -> str:
     """Return the unit a parameter or timing wants."""
     for parameter in system.parameters:
         if parameter.name == name:
@@ -486,11 +492,13 @@ def _check(system: CompiledSystem) -> None:
 
 def _check_bounds(parameter: Parameter, name: str, mistakes: Mistakes) -> None:
     """Record a value below the minimum or above the maximum."""
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     low, high, value = parameter.minimum, parameter.maximum, parameter.value
 
+    def told(number: float) -> str:
+        return with_unit(f"{number:g}", parameter.unit)
+
     def out(expected: str, number: float) -> None:
-        mistakes.add("E624", _PLACE, name, expected=f"{expected} {number:g}{unit}", got=f"{value:g}{unit}")
+        mistakes.add("E624", _PLACE, name, expected=f"{expected} {told(number)}", got=told(value))
 
     if low is not None and parameter.open_minimum and value <= low:
         out("more than", low)

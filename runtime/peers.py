@@ -201,7 +201,21 @@ def more_differ(
     exchange: Exchange,
     count: int,
 ) -> bool:
-    """Say whether there are more than `count` peers of different matrices, all affine and without edges."""
+    """Say whether there are more than `count` peers of different matrices, all affine and without edges.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    jacobians
+        One a kind.
+    numbers
+        The scene's numbers.
+    exchange
+        The links.
+    count
+        How many are not too many; with one more the search ends.
+    """
     keys: set[_Key] = set()
     for place, group in enumerate(system.groups):
         parameters = numbers.parameters[place]

@@ -91,7 +91,8 @@ def make_plan(
         reason = _not_crowds(system, jacobians)
         if method == "krylov" and reason:
             raise cannot_serve(system, method, reason)
-        if not reason and (method == "krylov" or _many(system, jacobians, schedules, numbers, exchange)):
+        whole = method == "krylov" or (method == "determinant" and _prompt(schedules, numbers, exchange))
+        if not reason and (whole or _many(system, jacobians, schedules, numbers, exchange)):
             return _plan_crowds(system, jacobians, schedules, exchange, method)
     groups = peer_groups(system, jacobians, schedules, numbers, exchange)
     if method in ("auto", "modes") and is_large_ring(groups, exchange):
@@ -171,6 +172,13 @@ def _many(
         return False
     most = max(len(kind.states) for kind in system.kinds)
     return more_differ(system, jacobians, numbers, exchange, FEW_STATES // most)
+
+
+def _prompt(schedules: Sequence[Schedule], numbers: Numbers, exchange: Exchange) -> bool:
+    """Say whether peers differ, all hear all others, and few packets are on their way."""
+    complete = all(exchange.is_complete(way.link) for way in used_ways(schedules))
+    short = max(sum(schedule.depths) for schedule in schedules) <= LONG_LINES
+    return complete and short and sum(map(len, numbers.parameters)) > 1
 
 
 def _plan_crowds(

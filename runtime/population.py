@@ -3,9 +3,9 @@
 Takes: a `CompiledSystem`, its numbers and schedules, and the programs of its groups.
 Gives: `Population`, `build_population`.
 Guarantees: sums and means over a complete graph cost one addition a peer, over any other graph one product
-an arc; before a packet arrives a receiver holds the sender's start values.
-Does not: run it (see `simulation`), or weigh senders by what they send: a reduction that looks at each pair
-of peers is refused.
+an arc; a reduction that looks at each pair of peers costs one evaluation a pair; before a packet arrives a
+receiver holds the sender's start values.
+Does not: run it (see `simulation`).
 
     (carries, histories, impulses, number of the frame) -> (carries⁺, histories⁺, rows)
 
@@ -28,10 +28,11 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.exchange import Exchange, check_mean
 from apc.runtime.gathering import Gate, Gathering
-from apc.runtime.linearize import SiteJacobians, edge_name, start_sends, start_values
-from apc.runtime.program import Program, Segment
+from apc.runtime.linearize import SiteJacobians, start_sends, start_values
+from apc.runtime.pairs import Pairs
+from apc.runtime.program import Program, Segment, seconds_at
 from apc.runtime.propagate import Transitions
-from apc.runtime.schedule import Heard, Schedule, Sent
+from apc.runtime.schedule import Heard, Propagate, Schedule, Sent, Tick
 
 Floats = NDArray[np.float64]
 Compile = Callable[[Sequence[Any]], Sequence[Any]]  # the kernels in another form, as fast as can be had
@@ -111,32 +112,42 @@ def build_member(
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
-    """Return the instants, in quanta, at which something is sent that is heard in the same frame."""
+    """Return the instants, in quanta, at which peers meet within the frame.
+
+    Something is sent that is heard in the same frame, or a tick looks at each sender by itself.
+    """
     slots = {one.sent for schedule in schedules for one in schedule.heard if one.lag == 0}
     # Over an unreliable link anything may be heard as soon as it is sent.
     any_time = {one.sent.link for schedule in schedules for one in schedule.heard if one.clock}
     slots |= {sent for schedule in schedules for sent in schedule.sent if sent.link in any_time}
-    return tuple(
-        sorted(
-            {
-                schedule.sent_times[place]
-                for schedule in schedules
-                for place, sent in enumerate(schedule.sent)
-                if sent in slots
-            }
-        )
-    )
+    instants = {
+        schedule.sent_times[place]
+        for schedule in schedules
+        for place, sent in enumerate(schedule.sent)
+        if sent in slots
+    }
+    return tuple(sorted(instants.union(*(_looks(schedule) for schedule in schedules))))
+
+
+def _looks(schedule: Schedule) -> set[int]:
+    """Return the instants, in quanta, of the ticks that look at each sender by itself."""
+    now, found = 0, set()
+    for event in schedule.events:
+        if isinstance(event, Propagate):
+            now += event.duration
+        elif isinstance(event, Tick):
+            rows = [row for one in event.heard for row in one]
+            if any(schedule.heard[row].way.edge for row in rows):
+                found.add(now)
+    return found
 
 
 def refuse_unheard_of(system: CompiledSystem) -> None:
-    """Refuse what no packet here can carry: a link that is unreliable, a reduction over pairs of peers."""
+    """Refuse a peer that has nothing of its own to stand in for what an unreliable link loses."""
     zero = {link.name for link in system.links if link.channel and link.channel.on_loss == "zero"}
     for kind in system.kinds:
         for partition in kind.clocks:
             for receive in partition.receives:
-                if edge_name(partition, receive):
-                    what = f"{receive.name} looks at each pair of peers, which can't be simulated yet"
-                    raise ApcError(Mistake("E871", Place(system.name), what))
                 if receive.link in zero and not any(one.link == receive.link for one in kind.sends):
                     what = (
                         f"{receive.name} hears {receive.link}, over which its peer sends nothing: it has no "
@@ -172,7 +183,9 @@ def build_population(
     ApcError
         E801 a mean over nobody, E802 a mean whose weights add up to 0.
     """
-    found = _distinct([segment.kernel for one in members for segment in one.program.segments])
+    segments = [segment for one in members for segment in one.program.segments]
+    looked = [pairwise.pair.function for segment in segments for pairwise in segment.pairs]
+    found = _distinct([*(segment.kernel for segment in segments), *looked])
     ready = dict(zip(found, kernels(list(found.values())), strict=True))
     ear = _Ear(system, exchange, members, gates)
     carries = [casadi.MX.sym(f"carry{g}", len(one.carry[0]), one.count) for g, one in enumerate(members)]
@@ -191,7 +204,13 @@ def build_population(
     rows: list[list[Any]] = [[] for _ in members]
     for index in range(len(members[0].program.segments)):
         # All that is heard in a segment was sent before it began.
-        heard = [ear.hear(g, member.program.segments[index]) for g, member in enumerate(members)]
+        heard = [
+            casadi.vertcat(
+                ear.hear(g, member.program.segments[index]),
+                *ear.look(g, member.program.segments[index], now[g], constants[g], number, ready),
+            )
+            for g, member in enumerate(members)
+        ]
         for g, member in enumerate(members):
             segment = member.program.segments[index]
             size = segment.kernel.numel_in("impulses")
@@ -266,6 +285,7 @@ class _Ear:
             link.name: [any(one.link == link.name for one in m.program.kind.sends) for m in members]
             for link in system.links
         }
+        self.pairs = Pairs(exchange, members, self.sending, self.gathering, self._packet)
 
     def remember(self, histories: Sequence[Any]) -> None:
         """Take in what was sent in earlier frames."""
@@ -300,6 +320,18 @@ class _Ear:
         schedule = self.members[group].program.schedule
         rows = [self._heard(group, schedule.heard[row]) for row in segment.heard]
         return casadi.vertcat(*rows) if rows else casadi.MX(0, self.members[group].count)
+
+    def look(
+        self, group: int, segment: Segment, carry: Any, constants: Any, number: Any, ready: Mapping[int, Any]
+    ) -> list[Any]:
+        """Return what a group hears pair by pair as a segment begins, a column a peer."""
+        schedule, found = self.members[group].program.schedule, []
+        for one in segment.pairs:
+            own = casadi.vertcat(carry[list(one.carry), :], constants[list(one.constants), :])
+            t = seconds_at(schedule, number, one.now)
+            rows = [schedule.heard[row] for row in one.heard]
+            found.append(self.pairs.hear(group, rows, own, t, ready[id(one.pair.function)]))
+        return found
 
     def packet(self, group: int, sent: Sent, ago: int) -> Any:
         """Return what a group sent some frames ago, a column a peer: zeros if that is nothing, or later."""

@@ -1,12 +1,14 @@
 """One frame of one site as compiled steps: the schedule's events written out with the kind's own functions.
 
 Takes: a `Kind`, its `Rates`, its `Flow` if it has one, its `Schedule`, the signals to record.
-Gives: `LocalSignal`, `local_signals`, `Layout`, `Segment`, `Program`, `build_program`.
+Gives: `LocalSignal`, `local_signals`, `Layout`, `Segment`, `Program`, `build_program`,
+`seconds_at`.
 Guarantees: the tick functions themselves are evaluated, not their slopes; a value acts and is heard exactly
 when the schedule says; what was never computed acts as zero.
 Does not: know other peers: what is heard comes in, what is sent goes out (see `population`).
 
-A segment is what happens between two moments at which packets are exchanged within the frame:
+A segment is what happens between two moments at which packets are exchanged within the frame, or peers look
+at each other pair by pair:
 
     (carry, heard, constants, impulses, frame) -> (carry⁺, sent, rows)
 """
@@ -23,6 +25,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.runtime.flow import Flow
+from apc.runtime.linearize import edge_name
+from apc.runtime.pairs import PairFunction, Pairwise, pair_function
 from apc.runtime.propagate import Rates, Transitions
 from apc.runtime.schedule import Act, Event, Propagate, Schedule, Send, Sent, Tick, Value
 
@@ -68,10 +72,14 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch of the frame: `kernel` is the function above; `heard`, `sent` are rows of the schedule."""
+    """A stretch of the frame: `kernel` is the function above; `heard`, `sent` are rows of the schedule.
+
+    After those rows the kernel hears what comes of each of `pairs`.
+    """
 
     kernel: Any  # casadi.Function
     heard: tuple[int, ...]
+    pairs: tuple[Pairwise, ...]
     sent: tuple[int, ...]
 
 
@@ -167,6 +175,12 @@ def _late_holds(schedule: Schedule) -> set[int]:
     return late
 
 
+def seconds_at(schedule: Schedule, frame: Any, now: int) -> Any:
+    """Return the time of an instant of a frame, rounded once: counted in quanta, which are whole numbers."""
+    quanta = frame * schedule.frame + now
+    return quanta * schedule.quantum.numerator / schedule.quantum.denominator
+
+
 def build_program(
     rates: Rates,
     schedule: Schedule,
@@ -185,7 +199,8 @@ def build_program(
     recorded
         The signals to record at every mark of the schedule.
     cuts
-        The instants, in quanta, after whose sends packets are exchanged within the frame.
+        The instants, in quanta, after whose sends packets are exchanged within the frame, and those at which
+        peers look at each other pair by pair.
     flow
         What moves the states that have no exact transition.
     """
@@ -255,6 +270,7 @@ class _Writer:
             *self.layout.later,
             *(("work", part) for part in parts),
         ]
+        self.pair_functions: dict[tuple[int, int], PairFunction] = {}
         self.rest: list[Event] = list(schedule.events)
         self.begun = -1  # the instant of the event before
 
@@ -264,10 +280,12 @@ class _Writer:
         carry = type_.sym("carry", len(self.keys))
         constants = type_.sym("constants", self._constant_rows())
         frame = type_.sym("frame")
-        heard_rows = sorted(
-            {row for _, event in events if isinstance(event, Tick) for rows in event.heard for row in rows}
-        )
-        heard = type_.sym("heard", len(heard_rows))
+        ticks = [(now, event) for now, event in events if isinstance(event, Tick)]
+        pairs = {key: one for now, tick in ticks for key, one in self._pairs(now, tick).items()}
+        assert all(one.now == events[0][0] for one in pairs.values()), "peers look before anything happens"
+        apart = {row for one in pairs.values() for row in one.heard}
+        heard_rows = sorted({row for _, tick in ticks for rows in tick.heard for row in rows} - apart)
+        heard = type_.sym("heard", len(heard_rows) + len(pairs))
         lengths = sum(isinstance(event, Propagate) for _, event in events)
         rows_of_g = int(self.rates.g.sum()) if self.rates.timed else 0
         impulses = type_.sym("impulses", rows_of_g * lengths)
@@ -278,7 +296,7 @@ class _Writer:
         self.inputs = (
             constants,
             frame,
-            dict(zip(heard_rows, casadi.vertsplit(heard), strict=True)),
+            dict(zip([*heard_rows, *pairs], casadi.vertsplit(heard), strict=True)),
             impulses,
         )
         self.sent: dict[int, Any] = {}
@@ -304,7 +322,31 @@ class _Writer:
             ["carry_after", "sent", "rows"],
         )
         assert not last or len(self.keys) == layout.size
-        return Segment(kernel, tuple(heard_rows), tuple(sorted(self.sent)))
+        return Segment(kernel, tuple(heard_rows), tuple(pairs.values()), tuple(sorted(self.sent)))
+
+    def _pairs(self, now: int, tick: Tick) -> dict[Any, Pairwise]:
+        """Return what a tick hears pair by pair, by (tick, receive): what matters of x, u, m and p."""
+        computing, found = self.kind.clocks[tick.partition], {}
+        inside = [
+            *(("x", i) for i in range(self.layout.states)),
+            *(("u", h) for h in range(len(self.kind.holds))),
+            *(("newest", (tick.partition, o)) for o in computing.memories),
+        ]
+        for place, (receive, rows) in enumerate(zip(computing.receives, tick.heard, strict=True)):
+            if not rows or not edge_name(computing, receive):
+                continue
+            key = (tick.partition, place)
+            if key not in self.pair_functions:
+                self.pair_functions[key] = pair_function(self.kind, *key)
+            pair = self.pair_functions[key]
+            found[tick, place] = Pairwise(
+                pair,
+                tuple(self.keys.index(inside[row]) for row in pair.own if row < len(inside)),
+                tuple(row - len(inside) for row in pair.own if row >= len(inside)),
+                rows,
+                now,
+            )
+        return found
 
     def _is_first_at(self, now: int, event: Event) -> bool:
         """Say whether an event is the first at its instant, which is then over."""
@@ -326,10 +368,7 @@ class _Writer:
         return self.inputs[0][: len(self.kind.parameters)]
 
     def _time(self, now: int) -> Any:
-        """Return the time in seconds, rounded once: counted in quanta, which are whole numbers."""
-        quantum = self.schedule.quantum
-        quanta = self.inputs[1] * self.schedule.frame + now
-        return quanta * quantum.numerator / quantum.denominator
+        return seconds_at(self.schedule, self.inputs[1], now)
 
     def _signal(self, signal: LocalSignal) -> Any:
         match signal.role:
@@ -354,7 +393,14 @@ class _Writer:
             case Tick(partition, index, heard):
                 computing = self.kind.clocks[partition]
                 m = _column(self.type_, [self.known["newest", (partition, o)] for o in computing.memories])
-                r = _column(self.type_, [self._sum(now, rows) for rows in heard])
+                values = self.inputs[2]
+                r = _column(
+                    self.type_,
+                    [
+                        values[event, place] if (event, place) in values else self._sum(now, rows)
+                        for place, rows in enumerate(heard)
+                    ],
+                )
                 outputs = computing.tick(self._x(), self._u(), m, r, self._p(), self._time(now))
                 for o in range(len(computing.outputs)):
                     self.known["newest", (partition, o)] = outputs[o]

@@ -16,8 +16,8 @@ from typing import Literal
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.runtime.analysis import Analysis, Prepared, analyze, prepare
-from apc.runtime.parameters import find
+from apc.runtime.analysis import analyze, prepare
+from apc.runtime.parameters import find, unit_of
 
 PLACE = Place("sweep")
 
@@ -86,10 +86,6 @@ def faulty(columns: tuple[ResultColumn, ...], error: ApcError) -> Row:
     return (FAULT + first.code, *(None for _ in columns[1:-1]), first.sentence)
 
 
-def _analysis(system: CompiledSystem, prepared: Prepared) -> Analysis:
-    return analyze(system, prepared=prepared)
-
-
 def _analyze(system: CompiledSystem, argument: str) -> Quantity:
     """Return the verdict, the spectral radius, and how the leading mode moves."""
     if argument:
@@ -106,7 +102,7 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
     prepared = prepare(system)
 
     def evaluate(changed: CompiledSystem) -> Row:
-        found = _analysis(changed, prepared)
+        found = analyze(changed, prepared=prepared)
         leading = found.modes[0] if found.modes else None
         return (
             found.verdict,
@@ -133,11 +129,12 @@ def _critical(system: CompiledSystem, argument: str) -> Quantity:
         form = "--of critical:coordination.stiffness"
         raise ApcError(Mistake("E884", PLACE, "critical", "a parameter", "nothing", form))
     known, _ = find(system, argument, PLACE)
-    unit = next((one.unit for one in system.parameters if one.name == known), "s")
+    unit = unit_of(system, known)
+    shown = "" if unit == "1" else unit
     columns = (
         VERDICT,
-        ResultColumn("value", "" if unit == "1" else unit, "number"),
-        ResultColumn("error", "" if unit == "1" else unit, "number"),
+        ResultColumn("value", shown, "number"),
+        ResultColumn("error", shown, "number"),
         ResultColumn("crossings", "", "count"),
         ResultColumn("proof", "", "text"),
         MESSAGE,

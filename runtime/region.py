@@ -29,7 +29,7 @@ from apc.runtime.eigenpairs import Family, log_magnitudes
 from apc.runtime.evaluator import PointEvaluator, evaluator, reaches_time
 from apc.runtime.parameters import Free, Override, apply
 from apc.runtime.region_axes import PLACE, RegionAxis
-from apc.runtime.rigid import find_rigid_modes, independent_places
+from apc.runtime.rigid import find_rigid_modes, relative_coordinates
 from apc.runtime.spectrum import angle_in_frame
 from apc.runtime.staircase import trace_steps
 from apc.runtime.surrogate import Rectangle, resolve_family
@@ -281,7 +281,6 @@ def _family(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, timed
     """Return the closed systems over the unit square."""
     if isinstance(source, BatchEvaluator):
         return resolve_family(source, rectangle, lambda values: matrix_errors(source, values))
-
     if timed:
         return _Timed(source, rectangle)
     return resolve_family(source, rectangle, lambda values: _point_errors(source, values))
@@ -297,12 +296,10 @@ def _point_errors(source: PointEvaluator, values: Floats) -> tuple[Floats, ...]:
     found = np.zeros(matrix.shape)
     start = 0
     for system in source.closed_at(middle.tolist()):
-        basis = find_rigid_modes(system, with_drifts=False).basis
-        held = independent_places(basis.T)
-        rest = np.delete(np.arange(len(system.names)), held)
-        weights = np.abs(basis[rest] @ np.linalg.inv(basis[held]))
-        error = system.error[np.ix_(rest, rest)] + weights @ system.error[np.ix_(held, rest)]
-        rows = slice(start, min(start + len(rest), found.shape[1]))
+        free = find_rigid_modes(system, with_drifts=False)
+        held, rest, weights = relative_coordinates(free.basis)
+        error = system.error[np.ix_(rest, rest)] + np.abs(weights) @ system.error[np.ix_(held, rest)]
+        rows = slice(start, min(start + len(rest), matrix.shape[-1]))
         found[0, rows, rows] = error[: rows.stop - start, : rows.stop - start]
         start = rows.stop
     return (found,)

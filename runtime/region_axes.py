@@ -15,6 +15,7 @@ from typing import Any
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.grid import parse_axis
+from apc.runtime.parameters import unit_of
 
 PLACE = Place("region")
 
@@ -65,7 +66,7 @@ def parse_axes(
     for letter, text, place in (("x", x, 0), ("y", y, 1)):
         if text is None and len(system.region) == 2:
             own = system.region[place]
-            unit = next((one.unit for one in system.parameters if one.name == own.parameter), "s")
+            unit = unit_of(system, own.parameter)
             text = f"{own.parameter}={float(own.low)!r} {unit}:{float(own.high)!r} {unit}"
         if text is None:
             what = f"the scene has no studies: region:, so that --{letter} must be given"

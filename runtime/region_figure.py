@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from apc.runtime.curves import between
 from apc.runtime.region import Region, side_of_curves
 from apc.runtime.region_axes import RegionAxis
-from apc.runtime.region_panels import Panel, Panels
+from apc.runtime.region_panels import Panel, Panels, panel_letter
 from apc.runtime.trajectory import need
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,6 @@ PANEL = 3.5  # inches: the side of a panel, one column of a paper
 DRAWN = 240  # straight lines a curve is drawn by at least: fewer show their corners
 SEARCHED = 48  # points along each side among which the widest place for a word is looked for
 NO_BREAK = "\N{NO-BREAK SPACE}"
-LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 
 def draw_region(found: Region, ax: Any = None) -> Any:
@@ -77,7 +76,7 @@ def draw_panels(found: Panels) -> Any:
         _panel(ax, panel, found.normalized)
         if place % columns:
             ax.set_ylabel("")
-        letter = f"({LETTERS[place % 26]}) " if count > 1 else ""
+        letter = f"({panel_letter(place)}) " if count > 1 else ""
         title = f"{letter}{_unbroken(panel.title)}".strip()
         if title:
             ax.set_title("\n".join(textwrap.wrap(title, 48)), fontsize=8.5)

@@ -1,7 +1,7 @@
 """Stable regions side by side: several scenes in one panel, several settings in several panels.
 
 Takes: compiled scenes, what each panel sets, and two axes.
-Gives: `Panel`, `Panels`, `compare_regions`, `parse_panel`, `parse_vary`, `gain_factor`.
+Gives: `Panel`, `Panels`, `panel_letter`; `compare_regions`, `parse_panel`, `parse_vary`, `gain_factor`.
 Guarantees: what is multiplied for a comparison at equal gain follows from the scene's equations, and is told.
 Does not: draw.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,11 @@ class Panels:
         return draw_panels(self)
 
 
+def panel_letter(place: int) -> str:
+    """Return the letter of a panel, "a" for the first; after "z" they begin anew."""
+    return ascii_lowercase[place % len(ascii_lowercase)]
+
+
 def parse_panel(text: str) -> tuple[str, ...]:
     """Read `lan.delay=0 ms, contact.delay=0 ms`: what a panel sets. Raises ApcError E907 if it isn't that."""
     parts = tuple(part.strip() for part in text.split(","))
@@ -137,7 +143,7 @@ def compare_regions(
     systems
         The scenes; the first one's `studies: region:` gives the axes that are left out.
     x, y
-        The axes, see `region.parse_axes`.
+        The axes, see `region_axes.parse_axes`.
     panels
         What each panel sets: `NAME=VALUE` texts.
     overlays

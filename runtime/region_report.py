@@ -6,9 +6,10 @@ Guarantees: says what was not looked for. Does not: compute.
 
 from __future__ import annotations
 
+from apc.compiler.words import with_unit
 from apc.runtime.evaluator import PointEvaluator
 from apc.runtime.region import Curve, Region
-from apc.runtime.region_panels import Panels
+from apc.runtime.region_panels import Panels, panel_letter
 
 # Curves listed; a boundary in more pieces is told by their number.
 MOST_CURVES = 12
@@ -19,8 +20,8 @@ def region_report(found: Region) -> str:
     width = max(len(found.x.label), len(found.y.label))
     lines = [f"{found.topology}: {_words(found)}", ""]
     for letter, axis in (("x", found.x), ("y", found.y)):
-        span = f"{float(axis.low):.6g} to {float(axis.high):.6g} {_unit(axis.unit)}"
-        lines.append(f"  {letter}  {axis.label:<{width}}  {span}".rstrip())
+        span = with_unit(f"{float(axis.low):.6g} to {float(axis.high):.6g}", axis.unit)
+        lines.append(f"  {letter}  {axis.label:<{width}}  {span}")
     whole = float(found.rectangle.width.prod())
     share = 100 * found.stable_area / whole
     area = f"{found.stable_area:.9g} ± {found.stable_area_error:.0e}"
@@ -32,8 +33,7 @@ def region_report(found: Region) -> str:
         if left > 0:
             lines.append(f"  and {left} more (--json lists all)")
     cell = " × ".join(
-        f"{size:.4g} {_unit(axis.unit)}".strip()
-        for size, axis in zip(found.cell, (found.x, found.y), strict=True)
+        with_unit(f"{size:.4g}", axis.unit) for size, axis in zip(found.cell, (found.x, found.y), strict=True)
     )
     lines += ["", f"  Looked at in cells of {cell}, and finer where the"]
     lines.append("  eigenvalues hint at more; an island inside one cell could be missed.")
@@ -47,9 +47,9 @@ def region_report(found: Region) -> str:
 def panels_report(found: Panels) -> str:
     """Return what `apc region` prints of several regions."""
     lines: list[str] = []
-    for letter, panel in zip("abcdefghijklmnopqrstuvwxyz", found.panels, strict=False):
+    for place, panel in enumerate(found.panels):
         if panel.title:
-            lines += [f"({letter}) {panel.title}", ""]
+            lines += [f"({panel_letter(place)}) {panel.title}", ""]
         for region, gain in zip(panel.regions, panel.gains, strict=True):
             lines.append(region_report(region))
             if gain != 1:
@@ -72,7 +72,3 @@ def _row(curve: Curve) -> str:
     start = "({:.6g}, {:.6g})".format(*curve.points[0])
     end = "closed" if curve.closed else "({:.6g}, {:.6g})".format(*curve.points[-1])
     return f"  {curve.mode:<11.11}  {span:<15}  {start:<18}  {end:<18}  {curve.error:.0e}"
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else unit

@@ -8,7 +8,6 @@ Does not: compute.
 from __future__ import annotations
 
 import io
-import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +16,13 @@ from rich.console import Console
 from rich.table import Table
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.words import WIDTH, counted, wrapped
 from apc.runtime.analysis import Analysis
 from apc.runtime.answer import Answer
 from apc.runtime.needs import Needs
 from apc.runtime.selfcheck import skipped
 from apc.runtime.spectrum import Mode
 
-WIDTH = 80
 MOST_ROWS = 16
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
 MOVES_WIDTH = 30  # what the other columns leave of 80
@@ -56,12 +55,12 @@ def compile_report(system: CompiledSystem, needs: Needs, target: Path, differenc
     )
     lines = [
         f"{system.name} → {target}",
-        _wrapped(str(replace(needs, pairs=()))),  # they follow, with their reason
+        *_note(str(replace(needs, pairs=()))),  # they follow, with their reason
         f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
-        _wrapped(f"self-check: {_self_check(system, difference)}"),
+        *_note(f"self-check: {_self_check(system, difference)}"),
     ]
-    lines += [_wrapped(line) for line in _pairwise(system)]
-    lines += [_wrapped(f"left out: {name}, as {reason}") for name, reason in system.dropped]
+    for note in (*_pairwise(system), *(f"left out: {name}, as {reason}" for name, reason in system.dropped)):
+        lines += _note(note)
     return "\n".join(lines)
 
 
@@ -108,8 +107,7 @@ def analysis_report(result: Analysis) -> str:
     lines += [f"  {line}" for line in words.splitlines()]
     removed = ""
     if result.rigid_modes:
-        plural = "" if result.rigid_modes == 1 else "s"
-        removed = f", {result.rigid_modes} translation{plural} left out"
+        removed = f", {counted(result.rigid_modes, 'translation')} left out"
     lines += [
         "",
         f"  spectral radius  {result.spectral_radius:.12g} ± {result.spectral_radius_error:.0e}"
@@ -120,7 +118,8 @@ def analysis_report(result: Analysis) -> str:
     if result.proof:
         lines.append(f"  proof            {result.proof}")
     lines += ["", _mode_table(result.modes)]
-    lines += [_wrapped(note) for note in result.notes]
+    for note in result.notes:
+        lines += _note(note)
     return "\n".join(lines)
 
 
@@ -132,7 +131,7 @@ def answer_report(found: Answer) -> str:
     if found.detailed:
         parts.append(str(found.conventions))
     elif found.conventions.warning:
-        parts.append(textwrap.fill(f"Warning: {found.conventions.warning}", WIDTH))
+        parts.append("\n".join(wrapped(f"Warning: {found.conventions.warning}")))
     if found.box is not None:
         parts.append(str(found.box))
     return "\n\n".join(parts)
@@ -172,9 +171,5 @@ def _time(seconds: float) -> str:
     return f"{seconds * 1e3:.6g} ms" if seconds < 1 else f"{seconds:.6g} s"
 
 
-def _wrapped(text: str) -> str:
-    stream = io.StringIO()
-    Console(file=stream, width=WIDTH - 4, color_system=None).print(text, highlight=False, markup=False)
-    return "\n".join(
-        ("  " if i == 0 else "    ") + line.rstrip() for i, line in enumerate(stream.getvalue().splitlines())
-    )
+def _note(text: str) -> list[str]:
+    return wrapped(text, "  ", "    ")

@@ -1,7 +1,8 @@
 """The motions that nothing holds back, found in exact arithmetic.
 
 Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
-Gives: `RigidModes`, `find_rigid_modes`; `stays_rigid`, `independent_places`.
+Gives: `RigidModes`, `find_rigid_modes`; `stays_rigid`; `independent_places`, `relative_places`,
+`relative_coordinates`.
 Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
 a stiffness of exactly zero frees what it held.
 Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
@@ -143,6 +144,21 @@ def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
             left = left - left[:, [place]] * pivot
             left[line] = 0.0
     return np.array(sorted(places), dtype=np.intp)
+
+
+def relative_places(basis: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the places p whose coordinates rigid motions V (n, d) take away, d of them, and all others r."""
+    held = independent_places(basis.T)
+    return held, np.delete(np.arange(len(basis)), held)  # np.setdiff1d imports numpy.ma, 10 ms
+
+
+def relative_coordinates(basis: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Return p and r as `relative_places`, and W = V_r V_p⁻¹ (n − d, d), of rigid motions V = [V_p; V_r].
+
+    As V spans an invariant space, the relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr.
+    """
+    held, rest = relative_places(basis)
+    return held, rest, basis[rest] @ np.linalg.inv(basis[held])
 
 
 class _Numbering:

@@ -1,7 +1,7 @@
 """What happens in one frame, in what order, and what must be remembered from frame to frame.
 
 Takes: a `CompiledSystem`, its timings as exact rationals, the structural patterns of its kinds.
-Gives: `Schedule` and its events, `build_schedules`, `ORDER`.
+Gives: `Schedule` and its events, `build_schedules`, `ORDER`; `common_divisor`.
 Guarantees: exact time (integers of one quantum); the state at the start of a frame is what is demanded
 and nothing else: a hold that acts at once adds none, a link adds a sender's packets that are still to be
 heard. Does not: look at numbers other than times.
@@ -13,7 +13,7 @@ tick `index`, counted from the frame's first tick of that clock; a negative inde
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -123,6 +123,10 @@ class Act:
 
 
 Event = Propagate | Send | Tick | Act
+
+# What happens when: the instant, the rank of its like among what happens at once, and itself; None only stops
+# the propagation there.
+_Happening = tuple[int, int, Event | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,7 +374,7 @@ def _times(
     phase = {
         name: timings[clock.phase] % period[name] if name else Fraction(0) for name, clock in clocks.items()
     }
-    quantum = _common_divisor([*period.values(), *phase.values(), *delays.values()])
+    quantum = common_divisor([*period.values(), *phase.values(), *delays.values()])
     count = {name: int(value / quantum) for name, value in period.items()}
     frame = math.lcm(*count.values())
     _check_frame_length(system, period, count, frame, quantum)
@@ -415,7 +419,7 @@ def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
         )
 
 
-def _common_divisor(times: Iterable[Fraction]) -> Fraction:
+def common_divisor(times: Iterable[Fraction]) -> Fraction:
     """Return the largest rational of which every time is a whole multiple."""
     listed = list(times)
     denominator = math.lcm(*(time.denominator for time in listed))
@@ -473,43 +477,21 @@ def _build(
 ) -> Schedule:
     """Build one schedule, once it is known what the whole system hears."""
     kind, frame = pattern.kind, times.frame
-    partition_of = {partition.clock: index for index, partition in enumerate(kind.clocks)}
     grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
-    holds = _live_holds(pattern, live)
     heard = tuple(sorted({one for row in heard_at.values() for receive in row for one in receive}))
     place_of = {one: index for index, one in enumerate(heard)}
     channels = {sending.link: sending.channels for sending in kind.sends}
     sent = tuple(sorted(one for one in depth if one.channel in channels.get(one.link, ())))
 
-    # Everything that happens, as (instant, rank, event); propagation fills the gaps.
-    happenings: list[tuple[int, int, Event | None]] = []
+    # Everything that happens; propagation fills the gaps.
+    happenings: list[_Happening] = []
     for (p, index), row in heard_at.items():
         places = tuple(tuple(place_of[one] for one in receive) for receive in row)
         instant = times.clocks[kind.clocks[p].clock].at(index)
         happenings.append((instant, rank["tick"], Tick(p, index, places)))
-    for p, sending in enumerate(kind.sends):
-        grid = grid_of[sending.link]
-        for slot in range(frame // grid.period if grid else 0):
-            rows = tuple(
-                (sending.channels.index(one.channel), place)
-                for place, one in enumerate(sent)
-                if one.link == sending.link and one.slot == slot
-            )
-            if rows:
-                assert grid is not None
-                happenings.append((grid.at(slot), rank["send"], Send(p, rows)))
-    acting: list[Value | None] = []
-    for h, hold in enumerate(kind.holds):
-        if not holds[h]:
-            acting.append(None)
-            continue
-        grid, delay, p = times.clocks[hold.clock], times.delays[hold.delay], partition_of[hold.clock]
-        missed = 1 if delay == 0 and rank["act"] < rank["tick"] else 0
-        first = grid.newest(-delay, strictly=True)  # switched before the frame begins
-        acting.append(Value(p, hold.output, first - missed))
-        for index in range(first + 1, grid.newest(frame - delay, strictly=True) + 1):
-            switch = Act(h, Value(p, hold.output, index - missed))
-            happenings.append((grid.at(index) + delay, rank["act"], switch))
+    happenings += _sendings(pattern, grid_of, sent, frame, rank["send"])
+    acting, switches = _switches(pattern, live, times, rank)
+    happenings += switches
     fastest = min(times.clocks.values(), key=lambda grid: grid.period)
     marks = sorted({0, frame} | {fastest.at(i) for i in range(frame // fastest.period)})
     happenings += [(mark, 0, None) for mark in marks]  # so that propagation stops there
@@ -551,6 +533,45 @@ def _build(
         sent_names=tuple(f"{one.channel} sent" for one in sent),
         sent_times=tuple(_slot_time(one, grid_of) for one in sent),
     )
+
+
+def _sendings(
+    pattern: LinearSite, grid_of: Mapping[str, _Grid | None], sent: Sequence[Sent], frame: int, rank: int
+) -> Iterator[_Happening]:
+    """Yield when a site sends what in a frame."""
+    for p, sending in enumerate(pattern.kind.sends):
+        grid = grid_of[sending.link]
+        for slot in range(frame // grid.period if grid else 0):
+            rows = tuple(
+                (sending.channels.index(one.channel), place)
+                for place, one in enumerate(sent)
+                if one.link == sending.link and one.slot == slot
+            )
+            if rows:
+                assert grid is not None
+                yield grid.at(slot), rank, Send(p, rows)
+
+
+def _switches(
+    pattern: LinearSite, live: frozenset[tuple[int, int]], times: _Times, rank: Mapping[str, int]
+) -> tuple[list[Value | None], list[_Happening]]:
+    """Return what each hold holds as the frame begins, None if nobody feels it, and when it switches."""
+    kind = pattern.kind
+    partition_of = {partition.clock: index for index, partition in enumerate(kind.clocks)}
+    acting: list[Value | None] = []
+    happenings: list[_Happening] = []
+    for h, (hold, used) in enumerate(zip(kind.holds, _live_holds(pattern, live), strict=True)):
+        if not used:
+            acting.append(None)
+            continue
+        grid, delay, p = times.clocks[hold.clock], times.delays[hold.delay], partition_of[hold.clock]
+        missed = 1 if delay == 0 and rank["act"] < rank["tick"] else 0
+        first = grid.newest(-delay, strictly=True)  # switched before the frame begins
+        acting.append(Value(p, hold.output, first - missed))
+        for index in range(first + 1, grid.newest(times.frame - delay, strictly=True) + 1):
+            switch = Act(h, Value(p, hold.output, index - missed))
+            happenings.append((grid.at(index) + delay, rank["act"], switch))
+    return acting, happenings
 
 
 def _slot_time(sent: Sent, grid_of: Mapping[str, _Grid | None]) -> int:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.words import with_unit
 from apc.runtime.analysis import Prepared, prepare
 from apc.runtime.batch import BatchEvaluator, Evaluator, matrix_errors
 from apc.runtime.discretize import UNIT
@@ -168,6 +169,8 @@ def _differentiate(
         active += [(complex(value), names[place]) for value in values]
         for number, one in enumerate(free):
             matrix, slope = pairs[place][0][number], pairs[place][1][number]
+            if not np.isfinite(slope).all():
+                continue  # it can be moved neither way
             moved = left @ slope @ right
             rates = np.linalg.eigvals(moved) if len(values) > 1 else moved[0]
             growth = (values.conj() * rates).real / np.abs(values)
@@ -175,10 +178,9 @@ def _differentiate(
             if errors is None:
                 doubt += DIFFERENCE**2 * float(np.abs(growth).max())
             parameter = parameter_of(system, one)
-            name = one.name if one.group is None else f"{one.group}.{one.name}"
             rows += [
                 Sensitivity(
-                    name,
+                    one.label,
                     parameter.unit,
                     parameter.value,
                     float(rate),
@@ -249,9 +251,8 @@ def sensitivity_report(found: Sensitivities) -> str:
     width = max(len(row.parameter) for row in shown)
     lines = ["  what moves it most" + " " * max(width - 16, 2) + "value            per percent"]
     for row in shown:
-        unit = "" if row.unit == "1" else f" {row.unit}"
         mode = f"  mode {row.mode + 1}" if len(found.active) > 1 else ""
-        value = f"{row.value:.6g}{unit}"
+        value = with_unit(f"{row.value:.6g}", row.unit)
         lines.append(f"  {row.parameter:<{width}}  {value:<16} {row.relative / 100:+.2e}{mode}")
     if found.note:
         lines.append(f"  {found.note}")

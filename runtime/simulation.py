@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.exchange import build_exchange
+from apc.runtime.exchange import Exchange, build_exchange
 from apc.runtime.flow import Flow, Tolerance, flow_of, rows_to_move
 from apc.runtime.forcing import SiteForcing, forcing_of, impulses, site_forcing
 from apc.runtime.gathering import Gate, Places, build_gates, kept_links
 from apc.runtime.linearize import SiteJacobians, jacobians
 from apc.runtime.methods import CVODES, DEFAULT, EXACT, WHERE_NEEDED, Method, check_step
 from apc.runtime.native import native
+from apc.runtime.pairs import count_pairs
 from apc.runtime.parameters import Numbers, resolve
 from apc.runtime.population import (
     Member,
@@ -58,6 +59,7 @@ ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing t
 TOLD = 2**23
 MOST_NAMED = 6  # states in a message
 MOST_FRAMES = 2000  # of one chunk: the function of a chunk is built in a time that grows with it
+NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
 # Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
 MOST_NUMBERS = 2**26
 
@@ -151,10 +153,9 @@ def prepare(
     Raises
     ------
     ApcError
-        E870 a continuous equation is not linear and the method is exact, E871 a reduction looks at each pair
-        of peers, E873 a pattern fits nothing, E874 the peers are too many, E893 a peer has nothing of its own
-        to stand in for a missing packet, E913 a step that does not fit; and those of `build_schedules`,
-        `build_population` and `routes_of`.
+        E870 a continuous equation is not linear and the method is exact, E873 a pattern fits nothing, E874
+        the peers are too many, E893 a peer has nothing of its own to stand in for a missing packet, E913 a
+        step that does not fit; and those of `build_schedules`, `build_population` and `routes_of`.
     """
     refuse_unheard_of(system)
     numbers = resolve(system)
@@ -176,10 +177,10 @@ def prepare(
         available = [
             local_signals(system.kinds[one.kind], s) for one, s in zip(system.groups, schedules, strict=True)
         ]
-        _check_size(system, schedules)
+        _check_size(system, exchange, schedules)
         _check_step(system, numbers, schedules, method)
         choices = choose(system, available, signals)
-        _check_size(system, schedules, choices)
+        _check_size(system, exchange, schedules, choices)
         cuts = exchanges_within(schedules)
         programs: dict[Any, Program] = {}
         members = []
@@ -245,7 +246,7 @@ def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
 
 
 def _check_size(
-    system: CompiledSystem, schedules: Sequence[Schedule], choices: Sequence[Choice] = ()
+    system: CompiledSystem, exchange: Exchange, schedules: Sequence[Schedule], choices: Sequence[Choice] = ()
 ) -> None:
     """Refuse so many peers, or so many of them recorded, that one frame of them would not fit the memory."""
     total = sum(
@@ -257,6 +258,7 @@ def _check_size(
         lengths = 2  # of intervals, mostly
         own = len(kind.parameters) + lengths * len(kind.states) * (len(kind.states) + len(kind.holds) + 1)
         total += group.count * (own + sum(schedule.depths))
+    total += NUMBERS_A_PAIR * count_pairs(system, exchange)
     if total > MOST_NUMBERS:
         what = (
             f"{system.peers} peers hold {total} numbers in a frame; at most {MOST_NUMBERS} can be "

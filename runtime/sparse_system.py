@@ -1,7 +1,7 @@
 """All peers of a sparse graph as one sparse matrix, each peer with numbers of its own.
 
 Takes: crowds, and the exchange between them.
-Gives: `SparseSystem`, `sparse_system`, `relative_matrix`.
+Gives: `SparseSystem`, `sparse_system`; `RelativeMatrix`, `relative_matrix`.
 Guarantees: the matrix is that of `modes.dense`, in the same order of states, with a bound on its error entry
 by entry; its cost grows with peers and arcs.
 Does not: compute eigenvalues (see `krylov`).
@@ -130,7 +130,7 @@ def _assemble(
     lags: Sequence[int],
     hearing: Sequence[Any],
 ) -> Any:
-    """Return the closed matrix: as `modes.close`, sparse."""
+    """Return the closed matrix: as `modes.close_loop`, sparse."""
     import scipy.sparse
 
     n = int(starts[-1])
@@ -243,7 +243,29 @@ def _packet_of(
     return scipy.sparse.csr_matrix((np.ones(len(lines)), (lines, columns)), shape=shape)
 
 
-def relative_matrix(system: SparseSystem, rigid: Floats) -> tuple[Any, Any, Integers]:
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativeMatrix:
+    """A sparse matrix without its rigid motions: R = M_rr − W M_pr, over the places r of the state.
+
+    `bordered` is [M_rr −W; M_pr −1], which is far sparser to factor than R; `error` bounds that of R.
+    """
+
+    matrix: Any  # scipy.sparse, (n − d, n − d)
+    error: Any
+    bordered: Any  # (n, n)
+    places: Integers
+
+    def factor(self, shift: complex) -> Any:
+        """Return LU factors of [M_rr − shift, −W; M_pr, −1]: what solves with these solves with R − shift."""
+        import scipy.sparse
+        import scipy.sparse.linalg
+
+        own, whole = self.matrix.shape[0], self.bordered.shape[0]
+        diagonal = np.concatenate([np.full(own, shift), np.zeros(whole - own)])
+        return scipy.sparse.linalg.splu((self.bordered - scipy.sparse.diags(diagonal)).tocsc())
+
+
+def relative_matrix(system: SparseSystem, rigid: Floats) -> RelativeMatrix:
     """Take rigid motions out: x_r − W x_p moves by M_rr − W M_pr, with W = V_r V_p⁻¹.
 
     Parameters
@@ -252,10 +274,6 @@ def relative_matrix(system: SparseSystem, rigid: Floats) -> tuple[Any, Any, Inte
         The whole.
     rigid
         V (n, d), of which no two move the same state.
-
-    Returns
-    -------
-    The matrix, a bound on its error, and the places r of the state it is over.
     """
     import scipy.sparse
 
@@ -263,7 +281,14 @@ def relative_matrix(system: SparseSystem, rigid: Floats) -> tuple[Any, Any, Inte
     rest = np.setdiff1d(np.arange(rigid.shape[0]), held)
     matrix, error = system.matrix.tocsr(), system.error.tocsr()
     weights = scipy.sparse.csr_matrix(rigid[rest] / rigid[held, np.arange(len(held))])
-    moved = matrix[held][:, rest]
-    reduced = matrix[rest][:, rest] - weights @ moved
+    own, moved = matrix[rest][:, rest], matrix[held][:, rest]
+    reduced = own - weights @ moved
     off = error[rest][:, rest] + abs(weights) @ (error[held][:, rest] + 8 * UNIT * abs(moved))
-    return reduced.tocsc(), (off + 2 * UNIT * abs(reduced)).tocsr(), rest
+    below = -scipy.sparse.identity(len(held))
+    bordered = scipy.sparse.bmat([[own, -weights], [moved, below]]) if len(held) else own
+    return RelativeMatrix(
+        reduced.tocsr(),
+        (off + 2 * UNIT * abs(reduced)).tocsr(),
+        bordered.tocsc().astype(np.complex128),
+        rest,
+    )

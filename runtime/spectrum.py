@@ -23,7 +23,7 @@ from apc.runtime.discretize import UNIT
 from apc.runtime.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
 from apc.runtime.modes import ClosedSystem
 from apc.runtime.pseudospectrum import PRODUCT_ROUNDINGS
-from apc.runtime.rigid import RigidModes, find_rigid_modes, independent_places
+from apc.runtime.rigid import RigidModes, find_rigid_modes, independent_places, relative_places
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -37,6 +37,12 @@ UNDECIDED = "undecided: |ρ−1| below the error bound"
 
 # A mode that shrinks to less than this in a frame is one that ends in finite time, computed in floats.
 DEADBEAT = 1e-12
+
+# An angle that no eigenvalue kept as two floats has unless it is real: their unit roundoff.
+STRAIGHT = 2.0**-53
+
+# Angles up to here are half a turn the other way, which rounding or the sign of a zero made of a change of sign.
+HALF_TURN_BACK = -np.pi * (1 - 2.0**-40)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +210,7 @@ def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
     if count == n:
         return _Solved(free, [], 0.0, 0.0, True, 0)
     matrix, error = system.matrix, system.error
-    held, rest = _places(free, n)
+    held, rest = relative_places(free.basis)
     weights, weights_error = _relative(free.basis[held], free.basis[rest])
     reduced = matrix[np.ix_(rest, rest)] - weights @ matrix[np.ix_(held, rest)]
     size = np.abs(matrix) + error
@@ -220,8 +226,7 @@ def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
 
 def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     """Solve one system in balls; what these leave open stays as floats found it."""
-    n = len(system.names)
-    proof = prove(system, estimate.free, _places(estimate.free, n)[0].tolist())
+    proof = prove(system, estimate.free, independent_places(estimate.free.basis.T).tolist())
     if proof.free.drifts != estimate.free.drifts:
         estimate = _solve(system, proof.free)
     if proof.values is None or not len(proof.values):
@@ -232,12 +237,6 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
         modes = _modes(system, proof.free, proof.values, proof.right, proof.left, found.errors)
     low, high = max(estimate.low, found.low), min(estimate.high, found.high)
     return _Solved(proof.free, modes, low, high, proof.inside, proof.bits)
-
-
-def _places(free: RigidModes, n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the places whose coordinates the rigid motions take away, and all others."""
-    held = independent_places(free.basis.T)
-    return held, np.delete(np.arange(n), held)
 
 
 def _modes(
@@ -252,7 +251,7 @@ def _modes(
     n = len(system.names)
     count = free.basis.shape[1]
     matrix = system.matrix
-    held, rest = _places(free, n)
+    held, rest = relative_places(free.basis)
     weights, _ = _relative(free.basis[held], free.basis[rest])
     # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
     corner = matrix[np.ix_(held, held)] + matrix[np.ix_(held, rest)] @ weights
@@ -312,7 +311,8 @@ def _mode(system: ClosedSystem, value: complex, vector: Complexes, shares: Float
 
 def oscillation(magnitude: float, angle: float, frame_s: float) -> tuple[float, float]:
     """Return the frequency in Hz and the damping ratio of what shrinks and turns so much in a frame."""
-    rate = complex(np.log(magnitude), angle) / frame_s
+    turn = angle if abs(angle) > STRAIGHT else 0.0  # a real eigenvalue's, in more digits than a float has
+    rate = complex(np.log(magnitude), turn) / frame_s
     return abs(rate.imag) / (2 * np.pi), -rate.real / abs(rate) if rate else 1.0
 
 
@@ -322,6 +322,15 @@ def angle_in_frame(system: ClosedSystem, value: complex, vector: Complexes, shar
     The eigenvalue knows the angle up to whole turns; these are counted on the continuous state that takes
     most part, from tick to tick of the fastest clock. A real vector has no angle but its sign: each change
     of sign is half a turn.
+
+    Parameters
+    ----------
+    system
+        The closed system.
+    value, vector
+        An eigenvalue and its vector (n,) over the state.
+    shares
+        How much each state takes part (n,).
     """
     if not system.motion:
         return float(np.angle(value))
@@ -330,9 +339,13 @@ def angle_in_frame(system: ClosedSystem, value: complex, vector: Complexes, shar
 
 
 def turned_along(course: Complexes, value: complex) -> float:
-    """Return the angle of an eigenvalue, in radians, with the whole turns of a state at a frame's marks."""
+    """Return the angle of an eigenvalue, in radians, with the whole turns of a state at a frame's marks.
+
+    A change of sign is half a turn forwards, whatever the sign of the zero beside it.
+    """
     principal = float(np.angle(value))
     if not np.all(np.abs(course) > 0):
         return principal
-    turned = float(np.sum(np.angle(course[1:] / course[:-1])))
+    turns = np.angle(course[1:] / course[:-1])
+    turned = float(np.sum(np.where(turns <= HALF_TURN_BACK, turns + 2 * np.pi, turns)))
     return principal + 2 * np.pi * round((turned - principal) / (2 * np.pi))

@@ -15,7 +15,6 @@ flanges and v that flange's velocity: exact, as f is constant between events. Po
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.words import wrapped
 from apc.runtime.signals import Signal
 from apc.runtime.simulation import Block, Simulation
 
@@ -38,7 +38,6 @@ FEWEST_TURNS = 4  # within the tail: two periods
 SMALLER = 0.9  # a swing of less than this part of that in the time before is dying away
 BUCKETS = 512  # times that extremes are kept for
 MOST_EXTREMES = 2**22  # numbers kept for each of three tables: 32 MiB
-WIDTH = 79
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +292,7 @@ def summary_text(topology: str, summary: Summary, notes: Sequence[tuple[str, str
         stopped_at=quantity(summary.stopped_at or 0.0, "s"),
     )
     lines = [f"{topology}: {summary.verdict}", ""]
-    lines += textwrap.wrap(words, WIDTH, initial_indent="  ", subsequent_indent="  ")
+    lines += wrapped(words, "  ", "  ")
     rows = []
     if summary.largest_force:
         name, size, at = summary.largest_force
@@ -309,13 +308,7 @@ def summary_text(topology: str, summary: Summary, notes: Sequence[tuple[str, str
     rows.append(("recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"))
     lines.append("")
     for title, text in [*rows, *notes]:
-        lines += textwrap.wrap(
-            f"{title:<15}{text}",
-            WIDTH,
-            initial_indent="  ",
-            subsequent_indent=" " * 17,
-            break_long_words=False,
-        )
+        lines += wrapped(text, f"  {title:<15}", " " * 17)
     return "\n".join(lines)
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import counted, with_unit
 from apc.runtime.grid import Grid, build_grid, parse_axis
 from apc.runtime.quantities import VERDICT, Cell, Row, find_quantity
 from apc.runtime.sweep_local import Workers, cores, local_processes, this_process
@@ -97,9 +98,9 @@ class Sweep:
         lines = [f"{self.topology}: {self.points:,} points{where}"]
         for axis in self.grid.axes:
             ends = f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}"
-            unit = "" if axis.unit == "1" else f" {axis.unit}"
-            count = len(axis.values)
-            lines.append(f"  {axis.label}: {ends}{unit}, {count} value{'' if count == 1 else 's'}")
+            lines.append(
+                f"  {axis.label}: {with_unit(ends, axis.unit)}, {counted(len(axis.values), 'value')}"
+            )
         lines += [f"  {count:>10,} × {verdict}" for verdict, count in self.verdicts]
         messages = Counter(cell for cell in self.columns[-1].tolist() if cell)
         if messages:

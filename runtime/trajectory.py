@@ -30,6 +30,7 @@ from apc.runtime.summary import Summary, Watch, summary_text
 Floats = NDArray[np.float64]
 
 MOST_KEPT = 2**27  # numbers that are kept in memory: 1 GiB
+MOST_LISTED = 1000  # peers whose own numbers are written out; the digest of their table covers the others
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,17 @@ def need(module: str, extra: str) -> Any:
 def result_text(
     topology: str, summary: Summary, provenance: Provenance, error: ErrorEstimate | None = None
 ) -> str:
-    """Return what `apc simulate` prints: the summary, the method if it is not exact, the error if known."""
+    """Return what `apc simulate` prints: the summary, the method if it is not exact, the error if known.
+
+    Parameters
+    ----------
+    topology
+        The scene's name.
+    summary, provenance
+        What the motion amounts to, and what made it.
+    error
+        How far off it is, if that was estimated.
+    """
     notes = [] if provenance.method == EXACT else [("method", method_text(provenance))]
     return summary_text(topology, summary, notes + ([("error", error_text(error))] if error else []))
 
@@ -164,7 +175,15 @@ def result_document(
     interrupted: bool,
     error: ErrorEstimate | None = None,
 ) -> dict[str, Any]:
-    """Return what `apc simulate --json` prints."""
+    """Return what `apc simulate --json` prints.
+
+    Parameters
+    ----------
+    topology, summary, provenance, error
+        As for `result_text`.
+    interrupted
+        Whether the run ended before its time.
+    """
 
     def named(pair: tuple[str, float] | None, key: str) -> dict[str, Any] | None:
         return None if pair is None else {"signal": pair[0], key: pair[1]}
@@ -225,9 +244,6 @@ def provenance_of(simulation: Simulation) -> Provenance:
         timings=tuple((one.name, str(one.value)) for one in system.timings),
         versions=tuple((name, version(name)) for name in ("apc", "casadi", "numpy")),
     )
-
-
-MOST_LISTED = 1000  # peers whose own numbers are written out; the digest of their table covers the others
 
 
 class Sink(Protocol):
@@ -339,7 +355,19 @@ def trajectory_of(
     interrupted: bool,
     error: ErrorEstimate | None = None,
 ) -> Trajectory:
-    """Return what was kept as a trajectory."""
+    """Return what was kept as a trajectory.
+
+    Parameters
+    ----------
+    simulation
+        The scene that was played.
+    keeper
+        Its rows.
+    summary, interrupted
+        As `play` returns them.
+    error
+        How far off it is, if that was estimated.
+    """
     return Trajectory(
         topology=simulation.system.name,
         time=np.concatenate(keeper.time),

@@ -2,8 +2,8 @@
 
 Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
 Gives: `Lifted`, `Wiring`, `wire`, `closed_loop`, `reduced`, `relative_weights`, `are_rigid`, `site_key`.
-Guarantees: the matrices are those of `modes.close` in relative coordinates, to rounding; where the directions
-are not those of a rigid motion they are NaN.
+Guarantees: the matrices are those of `modes.close_loop` in relative coordinates, to rounding; where the
+directions are not those of a rigid motion they are NaN.
 Does not: lift a site (see `batch`).
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apc.runtime.modes import ClosedSystem, Packet, packet_places
 from apc.runtime.peers import PeerGroup
-from apc.runtime.rigid import RigidModes, find_rigid_modes, independent_places
+from apc.runtime.rigid import RigidModes, find_rigid_modes, relative_coordinates
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
@@ -96,9 +96,7 @@ def wire(system: ClosedSystem) -> Wiring:
 
 
 def _without(system: ClosedSystem, listed: Sequence[tuple[Floats, Floats]], rigid: RigidModes) -> Wiring:
-    basis = rigid.basis
-    held = independent_places(basis.T)
-    rest = np.delete(np.arange(len(system.names)), held)  # np.setdiff1d imports numpy.ma, 10 ms
+    held, rest, weights = relative_coordinates(rigid.basis)
     return Wiring(
         system=system,
         now=tuple(now for now, _ in listed),
@@ -107,13 +105,13 @@ def _without(system: ClosedSystem, listed: Sequence[tuple[Floats, Floats]], rigi
         rigid=rigid,
         held=held,
         rest=rest,
-        weights=basis[rest] @ np.linalg.inv(basis[held]),
+        weights=weights,
         moving=False,
     )
 
 
 def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], Lifted]) -> Matrices:
-    """Close the loop of one system at all points: its matrices (k, n, n), see `modes.close`."""
+    """Close the loop of one system at all points: its matrices (k, n, n), see `modes.close_loop`."""
     system = wiring.system
     n = len(system.names)
     own = [lifted[site_key(group)] for group in system.sites]

@@ -23,7 +23,7 @@ def different(
     spread: float = 0.3,
     **values: Any,
 ) -> CompiledSystem:
-    """Return peers whose masses, dampings and contacts all differ; a sum's gains are shared among the others."""
+    """Return peers whose masses, dampings and contacts all differ; the others share a sum's gains."""
     gains = {"kt": 400.0, "bt": 1.0, "kc": 1000.0, "bc": 1.0, **values}
     if operator == "sum":
         gains |= {"kt": gains["kt"] / peers, "bt": gains["bt"] / peers}

@@ -16,7 +16,7 @@ from tests.topologies import AVERAGE, ROOT
 # Every module, earliest first: each may import only those before it.
 ORDER = (
     # what the others are written in, and what is handed over
-    *("apc.compiler.errors", "apc.compiler.compiled", "apc.compiler.cache"),
+    *("apc.compiler.errors", "apc.compiler.words", "apc.compiler.compiled", "apc.compiler.cache"),
     # text
     *(
         "apc.compiler.source",
@@ -51,6 +51,7 @@ ORDER = (
         "apc.runtime.exchange",
         "apc.runtime.packets",
         "apc.runtime.timetable",
+        "apc.runtime.guards",
         "apc.runtime.linearize",
         "apc.runtime.schedule",
         "apc.runtime.gathering",
@@ -82,12 +83,13 @@ ORDER = (
     *("apc.runtime.table_file", "apc.runtime.sweep_work", "apc.runtime.sweep_store"),
     *("apc.runtime.sweep_local", "apc.runtime.sweep_cluster", "apc.runtime.sweep"),
     # a scene played in time
-    *("apc.runtime.methods", "apc.runtime.guards", "apc.runtime.scales", "apc.runtime.stepping"),
+    *("apc.runtime.methods", "apc.runtime.scales", "apc.runtime.stepping"),
     *("apc.runtime.integrate", "apc.runtime.propagate", "apc.runtime.flow", "apc.runtime.forcing"),
-    *("apc.runtime.program", "apc.runtime.native"),
+    *("apc.runtime.pairs", "apc.runtime.program", "apc.runtime.native"),
     *("apc.runtime.population", "apc.runtime.signals", "apc.runtime.simulation", "apc.runtime.accuracy"),
     "apc.runtime.summary",
-    *("apc.runtime.trajectory", "apc.runtime.recording", "apc.runtime.figures", "apc.runtime.still"),
+    *("apc.runtime.trajectory", "apc.runtime.formats", "apc.runtime.recording"),
+    *("apc.runtime.figures", "apc.runtime.still"),
     "apc.runtime.ensemble",
     # the stable region of two parameters
     *("apc.runtime.eigenpairs", "apc.runtime.surrogate", "apc.runtime.cells", "apc.runtime.curves"),
@@ -95,15 +97,26 @@ ORDER = (
     *("apc.runtime.region_axes", "apc.runtime.region", "apc.runtime.region_panels"),
     *("apc.runtime.region_report", "apc.runtime.region_figure", "apc.runtime.region_files"),
     "apc.runtime.report",
+    # speed against error
+    *(
+        "apc.runtime.bench_events",
+        "apc.runtime.bench_reference",
+        "apc.runtime.bench",
+        "apc.runtime.bench_hard",
+        "apc.runtime.bench_scale",
+    ),
+    *("apc.runtime.bench_report", "apc.runtime.bench_figure"),
     # what a person calls
     *(
         "apc.inputs",
+        "apc.options",
         "apc.contents",
         "apc.api",
         "apc.cli_region",
         "apc.cli_simulate",
         "apc.cli_sweep",
         "apc.cli_critical",
+        "apc.cli_bench",
         "apc.cli_analyze",
         "apc.cli",
         "apc.__main__",
@@ -114,6 +127,7 @@ BACKWARDS = {
     ("apc.runtime.analysis", "apc.runtime.report"),
     ("apc.runtime.answer", "apc.runtime.report"),
     ("apc.runtime.trajectory", "apc.runtime.figures"),  # likewise a trajectory that draws itself
+    ("apc.runtime.bench", "apc.runtime.bench_report"),
     # and a region that prints, draws and lists itself
     *(("apc.runtime.region", f"apc.runtime.region_{late}") for late in ("report", "figure", "files")),
     *(("apc.runtime.region_panels", f"apc.runtime.region_{late}") for late in ("report", "figure")),

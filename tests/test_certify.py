@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import casadi
 import flint
@@ -117,8 +118,8 @@ def test_proved_modes_are_the_modes() -> None:
                 assert max(abs(a[1] - b[1]) for a, b in shares) < 1e-6
 
 
-def _undamped(**values: object) -> CompiledSystem:
-    system = paper(**values)  # type: ignore[arg-type]
+def _undamped(**values: Any) -> CompiledSystem:
+    system = paper(**values)
     return grouped(system, ("user", system.peers, {"device.damping": 0.0, "cube.damping": 0.0}))
 
 
@@ -132,8 +133,8 @@ def test_a_drift_is_told_from_a_translation_by_proof() -> None:
 def test_what_lies_on_the_circle_stays_undecided() -> None:
     """A mass on an undamped spring: its eigenvalues have magnitude one, exactly."""
 
-    def swing(x: object, u: object) -> object:
-        return casadi.vertcat(x[1], -4 * x[0])  # type: ignore[index]
+    def swing(x: Any, u: Any) -> Any:
+        return casadi.vertcat(x[1], -4 * x[0])
 
     system = alone()
     [kind] = system.kinds

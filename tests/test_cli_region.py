@@ -16,7 +16,13 @@ from apc.runtime import region_files
 from apc.runtime.region import region
 from apc.runtime.region_axes import parse_axes
 from apc.runtime.region_figure import stable_outlines
-from apc.runtime.region_panels import compare_regions, gain_factor, parse_panel, parse_vary
+from apc.runtime.region_panels import (
+    compare_regions,
+    gain_factor,
+    panel_letter,
+    parse_panel,
+    parse_vary,
+)
 from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced
 
 X = "contact.stiffness=10 N/m:3000 N/m"
@@ -187,3 +193,7 @@ def test_panels_read_as_they_are_written() -> None:
     assert parse_panel("lan.delay=0 ms, contact.delay=1 ms") == ("lan.delay=0 ms", "contact.delay=1 ms")
     with pytest.raises(ApcError, match="E907"):
         parse_panel("lan.delay 0 ms")
+
+
+def test_every_panel_has_a_letter_however_many_there_are() -> None:
+    assert [panel_letter(place) for place in (0, 1, 25, 26)] == ["a", "b", "z", "a"]

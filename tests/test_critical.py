@@ -17,6 +17,7 @@ from apc.runtime.critical import critical
 from apc.runtime.crossings import scan
 from apc.runtime.parameters import Override, apply
 from tests.bruteforce import Scene, frame_matrix
+from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 TEXTS = {"AP": AVERAGE, "VC": MESH}
@@ -41,26 +42,13 @@ def stable_at(system: CompiledSystem, name: str, value: float) -> bool | None:
     return analyze(apply(system, [Override(name, None, Fraction(value))])).stable
 
 
-@pytest.mark.parametrize(
-    ("delayed", "delays", "b", "k_c", "average", "mesh"),
-    [
-        (False, "all", "0", "100", 2127.449, 1063.725),
-        (False, "all", "0", "2000", 2868.148, 1434.074),
-        (False, "all", "2", "100", 4488.004, 2959.062),
-        (False, "all", "2", "2000", 5869.746, 3479.811),
-        (True, "all", "0", "100", 708.186, 354.093),
-        (True, "all", "0", "1000", 1096.411, 548.205),
-        (True, "all", "2", "100", 1493.128, 962.734),
-        (True, "all", "2", "1000", 2477.935, 1378.111),
-        (True, "own", "0", "100", 743.165, 371.582),
-    ],
-)
+@pytest.mark.parametrize(("delayed", "delays", "b", "k_c", "average", "mesh"), LIMITS)
 def test_the_largest_stable_stiffness_is_the_reference_one(
-    delayed: bool, delays: str, b: str, k_c: str, average: float, mesh: float
+    delayed: bool, delays: str, b: int, k_c: int, average: float, mesh: float
 ) -> None:
     for scheme, limit in (("AP", average), ("VC", mesh)):
         found = critical(
-            scene(scheme, delayed=delayed, delays=delays, b=b, k_c=k_c), "coordination.stiffness"
+            scene(scheme, delayed=delayed, delays=delays, b=str(b), k_c=str(k_c)), "coordination.stiffness"
         )
         assert found.value == pytest.approx(limit, abs=6e-4)
         assert found.stable_side == "below"
@@ -70,9 +58,9 @@ def test_the_largest_stable_stiffness_is_the_reference_one(
         assert found.whole
 
 
-@pytest.mark.parametrize(("b", "limit"), [("0", 1865.424), ("2", 3175.018)])
-def test_the_contact_alone_has_its_reference_limit(b: str, limit: float) -> None:
-    system = with_values(scene("AP"), {"coordination.stiffness": "0", "contact.damping": b})
+@pytest.mark.parametrize(("b", "limit"), CONTACT_LIMITS)
+def test_the_contact_alone_has_its_reference_limit(b: int, limit: float) -> None:
+    system = with_values(scene("AP"), {"coordination.stiffness": "0", "contact.damping": str(b)})
     assert critical(system, "contact.stiffness").value == pytest.approx(limit, abs=6e-4)
 
 
@@ -156,9 +144,7 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
     ticks = first.value / 1e-3
     assert ticks == pytest.approx(round(ticks), abs=1e-9)
     sides = [
-        analyze(
-            apply(system, [Override("lan.delay", None, Fraction(round(ticks), 1000) + shift)])
-        ).stable
+        analyze(apply(system, [Override("lan.delay", None, Fraction(round(ticks), 1000) + shift)])).stable
         for shift in (Fraction(-1, 10**7), Fraction(1, 10**7))
     ]
     assert sides == ([True, False] if first.stable_side == "below" else [False, True])

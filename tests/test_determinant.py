@@ -74,8 +74,8 @@ def test_different_peers_have_the_spectral_radius_of_their_whole_matrix(
     _agree(_solved(system), analyze(system, method="dense"))
 
 
-def test_a_hundred_different_peers_do_too() -> None:
-    system = different(100)
+def test_sixty_different_peers_do_too() -> None:
+    system = different(60)
     found, whole = analyze(system), analyze(system, method="dense")
     assert (found.method, whole.method) == ("determinant", "dense")
     _agree(found, whole)
@@ -172,7 +172,7 @@ def test_groups_and_delays_of_their_own_are_one_loop_each() -> None:
     groups = ("left", 3, {"device.mass": 0.3}), ("right", 2, {"cube.mass": 0.1})
     base = grouped(paper(kt=20.0, bt=0.1), *groups)
     system = linked(base, delays={("left", "right"): 40 * MS, ("right", "left"): 56 * MS})
-    found, whole = analyze(system, method="determinant"), analyze(system, method="dense")
+    found, whole = solve_loops(complete_loops(*lifted_groups(system))), analyze(system, method="dense")
     assert (found.verdict, found.rigid_modes) == (whole.verdict, whole.rigid_modes)
     assert found.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-11)
 
@@ -236,7 +236,7 @@ def _count_by_samples(p: Any, q: Any, s: Any, frames: int, found: Analysis) -> N
     for sign, shape in ((1, "common"), (-1, "difference")):
         sizes = sorted({mode.magnitude for mode in found.modes if mode.shape == shape}, reverse=True)
         radius = (sizes[0] + sizes[1]) / 2
-        points = radius * np.exp(2j * np.pi * (np.arange(2**17) + 0.5) / 2**17)
+        points = radius * np.exp(2j * np.pi * (np.arange(2**16) + 0.5) / 2**16)
         shifted = points[:, None, None] * np.eye(len(blocks[0])) - blocks[0]
         answer = blocks[2] @ np.linalg.solve(shifted, blocks[1].astype(complex))
         value = np.linalg.det(np.eye(2) - sign * points[:, None, None] ** -frames * answer)

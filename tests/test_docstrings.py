@@ -12,6 +12,7 @@ import pytest
 from tests.topologies import ROOT
 
 FILES = sorted([*(ROOT / "compiler").glob("*.py"), *(ROOT / "runtime").rglob("*.py")])
+MANY = 5  # arguments that a sentence can't tell apart
 Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
 
@@ -52,6 +53,20 @@ def test_every_public_name_has_a_docstring(path: Path) -> None:
         for name, node in public(parsed(path))
         if not ast.get_docstring(node)
         and not any(getattr(d, "attr", "") in ("setter", "register") for d in node.decorator_list)
+    ]
+    assert not missing
+
+
+@pytest.mark.parametrize("path", FILES, ids=named)
+def test_who_takes_many_arguments_documents_them(path: Path) -> None:
+    # A command's docstring is its help; its options have a help of their own.
+    missing = [
+        name
+        for name, node in public(parsed(path))
+        if not isinstance(node, ast.ClassDef)
+        and len([*node.args.args, *node.args.kwonlyargs]) >= MANY
+        and not any("command(" in ast.unparse(one) for one in node.decorator_list)
+        and "Parameters\n-" not in (ast.get_docstring(node) or "")
     ]
     assert not missing
 

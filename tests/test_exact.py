@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from typing import Any
 
 import casadi
 import mpmath
@@ -12,9 +13,9 @@ import pytest
 from apc.runtime.exact import evaluate_exact, is_rational
 
 
-def _function(build: object, size: int = 2) -> casadi.Function:
+def _function(build: Any, size: int = 2) -> casadi.Function:
     x = casadi.SX.sym("x", size)
-    return casadi.Function("f", [x], [build(x)])  # type: ignore[operator]
+    return casadi.Function("f", [x], [build(x)])
 
 
 def test_rational_operations_are_exact() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import mpmath
 import numpy as np
@@ -25,13 +26,13 @@ def moved(tmp_path: Path, hand: str, duration: str = "1/2") -> tuple[np.ndarray,
     return found.time, found["user[1].device.x"], found["user[1].device.v"]
 
 
-def exact(force: object, corners: list[float], t: float) -> tuple[float, float]:
+def exact(force: Any, corners: list[float], t: float) -> tuple[float, float]:
     """Return x and v by quadrature in 30 digits."""
     with mpmath.workdps(30):
         edges = [mpmath.mpf(0), *(mpmath.mpf(c) for c in corners if c < t), mpmath.mpf(t)]
         b, m = mpmath.mpf(3), mpmath.mpf(2)
-        v = mpmath.quad(lambda s: mpmath.exp(-b / m * (t - s)) / m * force(s), edges)  # type: ignore[operator]
-        x = mpmath.quad(lambda s: -mpmath.expm1(-b / m * (t - s)) / b * force(s), edges)  # type: ignore[operator]
+        v = mpmath.quad(lambda s: mpmath.exp(-b / m * (t - s)) / m * force(s), edges)
+        x = mpmath.quad(lambda s: -mpmath.expm1(-b / m * (t - s)) / b * force(s), edges)
         return float(x), float(v)
 
 
@@ -54,7 +55,7 @@ def exact(force: object, corners: list[float], t: float) -> tuple[float, float]:
     ],
 )
 def test_a_force_over_time_is_integrated_to_rounding(
-    tmp_path: Path, hand: str, force: object, corners: list[float]
+    tmp_path: Path, hand: str, force: Any, corners: list[float]
 ) -> None:
     time, x, v = moved(tmp_path, hand)
     for row in (5, 13, 24):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import casadi
 import flint
@@ -44,12 +45,12 @@ def truth(scene: Scene, bits: int) -> list[flint.acb]:
         return flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
 
 
-def analysed(**values: object) -> Analysis:
+def analysed(**values: Any) -> Analysis:
     """Analyse a scene of equal peers given as `bruteforce.Scene` gives it."""
     own = {_OWN[key]: values.pop(key) for key in list(values) if key in _OWN}
-    system = paper(**values)  # type: ignore[arg-type]
+    system = paper(**values)
     if own:
-        system = grouped(system, ("user", system.peers, own))  # type: ignore[dict-item]
+        system = grouped(system, ("user", system.peers, own))
     return analyze(system)
 
 
@@ -124,7 +125,7 @@ def test_bounds_hold_the_truth(name: str) -> None:
     found = analysed(**values)
     assert found.stable is not None
     rigid = 1
-    check(found, truth(Scene(**values), 1024), rigid=rigid)  # type: ignore[arg-type]
+    check(found, truth(Scene(**values), 1024), rigid=rigid)
     assert found.rigid_modes == rigid
     assert found.spectral_radius_error <= 1e-8 * max(found.spectral_radius, 1)
 
@@ -140,7 +141,7 @@ def test_no_damping_at_all_drifts_where_nothing_brakes() -> None:
 def test_no_damping_but_ties_are_decided() -> None:
     values = {"peers": 2, "kt": 100.0, "bt": 2.0, "bc": 3.0, "device_damping": 0.0, "cube_damping": 0.0}
     found = analysed(**values)
-    check(found, truth(Scene(**values), 1024), rigid=1)  # type: ignore[arg-type]
+    check(found, truth(Scene(**values), 1024), rigid=1)
 
 
 @pytest.mark.parametrize("ratio", [1, 10, 100, 1000])
@@ -148,8 +149,7 @@ def test_the_frame_of_loose_peers_is_the_tick_to_the_power_of_the_ratio(ratio: i
     """One peer and a loose copy: what the frame does is the tick's own map to the power of the ratio."""
     found = analyze(paper(kt=0.0, kc=500.0, bc=1.0, network=ratio * MS, comm=ratio * MS))
     [tick] = {
-        mode.magnitude
-        for mode in analyze(paper(kt=0.0, kc=500.0, bc=1.0, network=MS, comm=MS)).modes[:1]
+        mode.magnitude for mode in analyze(paper(kt=0.0, kc=500.0, bc=1.0, network=MS, comm=MS)).modes[:1]
     }
     assert found.verdict == TRANSLATING
     assert found.rigid_modes == 3

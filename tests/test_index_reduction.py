@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
+from typing import Any
 
 import pytest
 
@@ -56,10 +57,10 @@ def site(
     )
 
 
-def sorted_site(text: str, variables: str, **more: object) -> SortedKind:
+def sorted_site(text: str, variables: str, **more: Any) -> SortedKind:
     """Sort a site; raise its mistakes."""
     mistakes = Mistakes()
-    kind = sort_kind(site(text, variables, **more), mistakes)  # type: ignore[arg-type]
+    kind = sort_kind(site(text, variables, **more), mistakes)
     mistakes.raise_if_any()
     return kind
 
@@ -78,7 +79,7 @@ def values(kind: SortedKind, **numbers: float) -> dict[str, float]:
     return known
 
 
-def mistakes_of(text: str, variables: str, **more: object) -> list[str]:
+def mistakes_of(text: str, variables: str, **more: Any) -> list[str]:
     with pytest.raises(ApcError) as caught:
         sorted_site(text, variables, **more)
     return [f"{m.code} {m.sentence}" for m in caught.value.mistakes]

@@ -8,7 +8,7 @@ import pytest
 
 from apc.compiler import store
 from apc.compiler.pipeline import compile_topology
-from apc.inputs import find_input, is_fresh, load_fresh
+from apc.inputs import find_input, is_fresh, load_fresh, open_scene
 from tests.topologies import AVERAGE, told
 
 
@@ -83,3 +83,15 @@ def test_a_model_is_fresh_until_its_topology_changes() -> None:
     ]
     Path("scene.yaml").unlink()
     assert load_fresh(path).name == "three-users-average", "no topology there to be older than"
+
+
+@pytest.mark.parametrize("file", [None, "scene.yaml", "scene.apc"])
+def test_a_scene_is_opened_with_its_parameters_set(file: str | None) -> None:
+    model()
+
+    def stiffness(settings: list[str]) -> float:
+        return next(
+            one.value for one in open_scene(file, settings).parameters if one.name == "contact.stiffness"
+        )
+
+    assert (stiffness([]), stiffness(["contact.stiffness=800 N/m"])) == (1000, 800)

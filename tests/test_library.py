@@ -79,7 +79,7 @@ def test_a_component_is_typed_whole() -> None:
     assert coupler is not None
     assert coupler.hears_others
     assert not mass.hears_others
-    assert coupler.parameter("clock") == Reference("clock", "clock", "", coupler.parameter("clock").place)  # type: ignore[union-attr]
+    assert coupler.parameter("clock") == Reference("clock", "clock", "", coupler.parameter("clock").place)  # type: ignore[union-attr] # it is there
     assert isinstance(coupler.parameter("delays"), Option)
     assert coupler.parameter("nothing") is None
 
@@ -167,7 +167,7 @@ def test_an_option_test_names_its_option_and_word(tmp_path: Path) -> None:
     coupler = Library().component("FullMesh")
     assert coupler is not None
     options = {p.name: p for p in coupler.parameters if isinstance(p, Option)}
-    condition = coupler.equations[-1].right.condition  # type: ignore[union-attr]
+    condition = coupler.equations[-1].right.condition  # type: ignore[union-attr] # it is there
     assert option_test(condition, options) == (options["delays"], "all")
     assert option_test(condition, {}) is None
 

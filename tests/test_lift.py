@@ -16,8 +16,8 @@ from apc.runtime.lift import LiftedSite
 from tests.sites import MS, alone, paper
 
 
-def _lifted(**values: object) -> LiftedSite:
-    [group], _ = lifted_groups(paper(**values))  # type: ignore[arg-type]
+def _lifted(**values: Any) -> LiftedSite:
+    [group], _ = lifted_groups(paper(**values))
     return group.lifted
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -96,9 +97,9 @@ CONVENTIONS: list[dict[str, object]] = [
 
 
 @pytest.mark.parametrize("values", CONVENTIONS)
-def test_peers_stepped_one_by_one_have_the_same_spectrum(values: dict[str, object]) -> None:
-    system = paper(**GAINS, **values)  # type: ignore[arg-type]
-    whole = np.linalg.eigvals(np.array(frame_matrix(Scene(**GAINS, **values))))  # type: ignore[arg-type]
+def test_peers_stepped_one_by_one_have_the_same_spectrum(values: dict[str, Any]) -> None:
+    system = paper(**GAINS, **values)
+    whole = np.linalg.eigvals(np.array(frame_matrix(Scene(**GAINS, **values))))
     assert _apart(_split(system), whole, same_size=False) < 1e-12
 
 
@@ -238,7 +239,7 @@ def test_pairs_of_groups_may_have_delays_of_their_own(
         4,
         weights={(i, j): w for i, j, w in _arcs("ring", 4)} if graph == "ring" else None,
         late={(i, j): delays.get((names[i], names[j]), 8 * MS) for i in range(4) for j in range(4)},
-        **{**GAINS, "kt": 200.0},  # type: ignore[arg-type]
+        **{**GAINS, "kt": 200.0},
     )
     groups, exchange = lifted_groups(system)
     # A delay equal to the usual one is none of its own.
@@ -287,11 +288,11 @@ def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, 
         {"own_delay": True},
     ],
 )
-def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values: dict[str, object]) -> None:
+def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values: dict[str, Any]) -> None:
     others = peers - 1
     gains = {"kc": 1500.0, "bc": 2.0}
-    mesh = paper("sum", peers=peers, kt=900.0 / others, bt=3.0 / others, **gains, **values)  # type: ignore[arg-type]
-    mean = paper("mean", peers=peers, kt=900.0, bt=3.0, **gains, **values)  # type: ignore[arg-type]
+    mesh = paper("sum", peers=peers, kt=900.0 / others, bt=3.0 / others, **gains, **values)
+    mean = paper("mean", peers=peers, kt=900.0, bt=3.0, **gains, **values)
     for one, other in zip(modes(*lifted_groups(mesh)), modes(*lifted_groups(mean)), strict=True):
         size = np.abs(other.matrix).max()
         np.testing.assert_allclose(one.matrix, other.matrix, rtol=1e-12, atol=1e-12 * size)

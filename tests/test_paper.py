@@ -17,6 +17,7 @@ from apc.runtime.analysis import lifted_groups
 from apc.runtime.modes import dense
 from apc.runtime.paper import PaperRoute, analyze_paper, paper_route
 from tests import bruteforce
+from tests.reference import OPERATORS, RADII
 from tests.sites import MS, linked, paper
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, told
 
@@ -40,7 +41,6 @@ def direct(system: CompiledSystem) -> np.ndarray[Any, Any]:
 
 
 def test_the_shapes_are_the_papers() -> None:
-    """reference_cases.yaml seed_dims_continuous, seed_dims_lifted, seed_dims_feedback."""
     for text in (AVERAGE, MESH):
         route = paper_route(compiled(text))
         assert (route.a.shape, route.b.shape, route.c.shape) == ((12, 12), (12, 9), (18, 12))
@@ -167,8 +167,8 @@ def test_other_graphs_and_delays_of_pairs_have_the_form_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("operator", "radius"), [("mean", 0.8982367557), ("sum", 0.9121448917)]
-)  # reference_cases.yaml rho_N3_comp1_comm1
+    ("operator", "radius"), [(OPERATORS[one], rho) for one, n, _, rho in RADII if n == 3]
+)
 def test_its_analysis_gives_the_verdict_and_the_radius(operator: str, radius: float) -> None:
     found = analyze_paper(paper(operator, kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
     assert found.method == "paper"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import json
+import re
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,9 +16,9 @@ import pytest
 import scipy.io
 
 from apc.compiler.errors import ApcError
-from apc.runtime import recording as module
+from apc.runtime import formats
 from apc.runtime.recording import SUFFIXES, open_recording
-from apc.runtime.simulation import Simulation, blocks, prepare
+from apc.runtime.simulation import Block, Simulation, blocks, prepare
 from apc.runtime.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
 
@@ -111,49 +114,102 @@ def test_a_folder_that_isnt_there_is_told(simulation: Simulation, tmp_path: Path
         open_recording(tmp_path / "nowhere" / "run.csv", simulation)
 
 
-class _Full:
-    """A file on a disk that is full after so many bytes."""
-
-    def __init__(self, file: Any, room: int) -> None:
-        self._file, self._room = file, room
-
-    def write(self, data: bytes) -> int:
-        if self._file.tell() + len(data) > self._room:
-            self._file.write(data[: self._room - self._file.tell()])  # half a line
-            self._file.flush()
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return int(self._file.write(data))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
+@contextmanager
+def no_room_after(size: int) -> Iterator[None]:
+    """Let no file grow beyond so many bytes: a disk that is full, told by the system itself."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_on_a_full_disk_the_whole_rows_of_a_csv_are_kept(
-    simulation: Simulation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def told_of(simulation: Simulation, path: Path) -> str:
+    """Record until there is no more room; return what is told then, "" if all was written."""
+    try:
+        written(simulation, path)
+    except ApcError as error:
+        return str(error)
+    return ""
+
+
+def check_kept(path: Path, message: str) -> int:
+    """Check that a file holds what a message says; return how many rows."""
+    told = re.search(r"E879 holds the first (\d+) rows only, up to ([\d.e-]+) s: \w+", message)
+    assert told, message
+    time, values, names, provenance = read(path)
+    rows = int(told[1])
+    assert len(time) == rows and f"{time[-1]:.9g}" == told[2]
+    assert (time == WHOLE.time[:rows]).all() and (values == WHOLE.values[:rows]).all()
+    assert len(names) == len(WHOLE.signals) and provenance["topology"] == "three-users-average"
+    return rows
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_wherever_the_disk_is_full_the_blocks_before_are_kept(
+    simulation: Simulation, tmp_path: Path, suffix: str
 ) -> None:
-    path = tmp_path / "run.csv"
-    recording = open_recording(path, simulation)
-    parts = list(blocks(simulation))
-    recording.take(parts[0])
-    size = recording._writer.file.tell()
-    monkeypatch.setattr(recording._writer, "file", _Full(recording._writer.file, size + 1000))
-    with pytest.raises(ApcError, match=r"E879 holds the first \d+ rows only: No space left on device"):
-        recording.take(parts[1])
-    time, values, _, _ = read(path)
-    assert (values == parts[0].values).all()
-    assert (time == parts[0].time).all()
+    path = tmp_path / f"run{suffix}"
+    whole = written(simulation, path).stat().st_size
+    found = []
+    for share in (0.0, 0.5, 0.9):
+        path.unlink()
+        path.with_name(f"{path.name}.json").unlink(missing_ok=True)
+        with no_room_after(int(share * whole)):
+            message = told_of(simulation, path)
+        if not path.exists():
+            assert re.search(r"E879 can't be written: \w+", message)
+            assert list(tmp_path.iterdir()) == []
+            path.touch()
+            found.append(0)
+        else:
+            found.append(check_kept(path, message))
+    assert found == sorted(found) and found[0] == 0
+    assert found[1] > 0
+    if suffix in (".csv", ".npz"):  # what is packed needs room before it is known how small it gets
+        assert found[2] == pytest.approx(0.9 * len(WHOLE.time), rel=0.05)
 
 
-def test_on_a_full_disk_a_file_that_needs_its_end_is_not_left_half(
-    simulation: Simulation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("suffix", [".parquet", ".mat", ".npz"])
+def test_room_is_kept_for_what_comes_last(
+    simulation: Simulation, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "run.npz"
-    recording = open_recording(path, simulation)
+    # Once a block is written, nothing more is asked of the disk, whatever the numbers look like.
+    def cut(writer: formats.Writer) -> None:
+        assert writer.file.tell() <= writer._kept
+        rooms.append(writer._kept)
+        whole(writer)
 
-    def full(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+    whole, rooms = formats.Writer.cut, []
+    monkeypatch.setattr(formats.Writer, "cut", cut)
+    random = np.random.default_rng(1)
+    wide = len(simulation.signals)
+    noise = random.integers(0, 2**62, (1500, wide)).view(np.float64)
+    for values in (noise, np.tile(noise[:250], (6, 1)), np.zeros((1, wide))):
+        recording = open_recording(tmp_path / f"run{suffix}", simulation)
+        for _ in range(3):
+            blocked = Block(np.arange(len(values)) / 1000, values, np.zeros(0))
+            recording.take(blocked)
+        recording.close()
+    assert len(rooms) == 3
 
-    monkeypatch.setattr(module._Npz, "rows", full)
-    with pytest.raises(ApcError, match="E879 can't be written: No space left on device"):
-        recording.take(next(blocks(simulation)))
-    assert list(tmp_path.iterdir()) == []
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_on_a_small_disk_what_was_done_is_kept(simulation: Simulation, tmp_path: Path, suffix: str) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("only root can make a disk")
+    try:
+        message = told_of(simulation, disk / f"run{suffix}")
+        assert message.endswith("No space left on device.")
+        assert check_kept(disk / f"run{suffix}", message) > 0
+        beside = {f"run{suffix}", *([f"run{suffix}.json"] if suffix == ".csv" else [])}
+        assert {one.name for one in disk.iterdir()} == beside
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)

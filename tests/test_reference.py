@@ -2,7 +2,6 @@
 
 Conventions: rho is the spectral radius of the map of one frame of 8 ms, the rigid mode removed; limits are
 the first crossing as the stiffness grows. m = 0.1 kg and 0.2 kg a copy, b = 5 N·s/m, T_c = 1 ms, T_n = 8 ms.
-The values were computed independently of this project, by brute-force propagation over one frame.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.parameters import Override, apply
+from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, RADII
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 TEXTS = {"AP": AVERAGE, "VC": MESH}
@@ -63,35 +63,13 @@ def analyse(
     return analyze(changed(system, values), prepared=shared)
 
 
-@pytest.mark.parametrize(
-    ("scheme", "peers", "delayed", "rho"),
-    [
-        ("AP", 3, True, 0.8982367557),
-        ("VC", 3, True, 0.9121448917),
-        ("AP", 5, False, 0.8513958715),
-        ("VC", 5, False, 0.805679409),
-    ],
-)
+@pytest.mark.parametrize(("scheme", "peers", "delayed", "rho"), RADII)
 def test_spectral_radii_are_the_reference_to_1e_8(scheme: str, peers: int, delayed: bool, rho: float) -> None:
     result = analyse(scheme, gains(800, 2, 1500, 2), peers=peers, delayed=delayed)
     assert abs(result.spectral_radius - rho) < 1e-8
     assert result.spectral_radius_error < 1e-9
     assert result.rigid_modes == 1
     assert result.verdict == "stable up to a common translation"
-
-
-# (delayed, delays, B_T = B_C, K_C, largest K_T for AP, for VC)
-LIMITS = [
-    (False, "all", 0, 100, 2127.449, 1063.725),
-    (False, "all", 0, 2000, 2868.148, 1434.074),
-    (False, "all", 2, 100, 4488.004, 2959.062),
-    (False, "all", 2, 2000, 5869.746, 3479.811),
-    (True, "all", 0, 100, 708.186, 354.093),
-    (True, "all", 0, 1000, 1096.411, 548.205),
-    (True, "all", 2, 100, 1493.128, 962.734),
-    (True, "all", 2, 1000, 2477.935, 1378.111),
-    (True, "own", 0, 100, 743.165, 371.582),
-]
 
 
 def limit(scheme: str, delayed: bool, delays: str, b: float, k_c: float, near: float) -> float:
@@ -131,14 +109,14 @@ def test_stiffness_limits_are_the_reference_to_the_last_printed_digit(
 
 def test_a_network_delay_may_widen_the_stable_range() -> None:
     """With B = 2 and K_C = 2000 the largest stable K_T of AP rises from 2602 to 3041 when it is added."""
-    for late, expected in ((0.0, 2602), (0.008, 3041)):
-        values = {**gains(0, 2, 2000, 2), "lan.delay": late}
+    for late, expected in HELPED_LIMITS:
+        values = {**gains(0, 2, 2000, 2), "lan.delay": late / 1000}
         for k_t, stable in ((expected - 1, True), (expected + 1, False)):
             assert analyse("AP", {**values, "coordination.stiffness": k_t}).stable is stable
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize(("b_c", "k_c"), [(0, 1865.424), (2, 3175.018)])
+@pytest.mark.parametrize(("b_c", "k_c"), CONTACT_LIMITS)
 def test_contact_limits_without_coordination_are_the_reference(scheme: str, b_c: float, k_c: float) -> None:
     def stable(value: float) -> bool:
         result = analyse(scheme, gains(0, 0, value, b_c))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,11 +19,13 @@ from apc.runtime.parameters import Override, apply
 from apc.runtime.region import Region, region
 from apc.runtime.region_axes import parse_axes
 from tests.paper_limit import limit
+from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced
 
 X = "contact.stiffness=10 N/m:3000 N/m"
 Y = "coordination.stiffness=10 N/m:3000 N/m"
-NO_DELAY = ("delay: 1 ms", "delay: 0 ms")
+UNDELAYED = (("delay: 1 ms", "delay: 0 ms"), ("delay: 1 ms", "delay: 0 ms"), ("delay: 8 ms", "delay: 0 ms"))
+CONTACT = CONTACT_LIMITS[0][1]  # stable up to there without damping of its own
 DAMPED = (
     ("contact:      {type: SampledSpringDamper,", "contact: {type: SampledSpringDamper, damping: 2 N*s/m,"),
     ("object: cube,", "object: cube, damping: 2 N*s/m,"),
@@ -71,31 +74,24 @@ def test_the_papers_boundary_is_right_to_one_part_in_a_billion(paper: Region) ->
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        # reference cases ktmax_3user_nodelay_B0 and comp1_all_comm1, B = 0 and B = 2
-        (
-            replaced(AVERAGE, NO_DELAY, NO_DELAY, ("delay: 8 ms", "delay: 0 ms")),
-            {100: 2127.449, 2000: 2868.148},
-        ),
-        (AVERAGE, {100: 708.186, 1000: 1096.411}),
-        (MESH, {100: 354.093, 1000: 548.205}),
-        (replaced(AVERAGE, *DAMPED), {100: 1493.128, 1000: 2477.935}),
-        (replaced(MESH, *DAMPED), {100: 962.734, 1000: 1378.111}),
-    ],
+    ("delayed", "delays", "damping", "k_c", "average", "mesh"),
+    [row for row in LIMITS if row[0] and row[1] == "all"] + list(LIMITS[:2]),
 )
-def test_the_published_limits_lie_on_the_curves(text: str, expected: dict[float, float]) -> None:
-    system = compiled(text)
-    found = region(system, parse_axes(system, X, Y))
-    for stiffness, most in expected.items():
-        assert height(found, stiffness) == pytest.approx(most, rel=1e-6)
+def test_the_published_limits_lie_on_the_curves(
+    delayed: bool, delays: str, damping: int, k_c: int, average: float, mesh: float
+) -> None:
+    changes = (*(() if delayed else UNDELAYED), *(DAMPED if damping else ()))
+    for text, most in ((AVERAGE, average), (MESH, mesh)):
+        system = compiled(replaced(text, *changes))
+        found = region(system, parse_axes(system, X, Y))
+        assert height(found, k_c) == pytest.approx(most, rel=1e-6)
 
 
 def test_the_contact_alone_limits_the_region_where_nothing_coordinates(average: CompiledSystem) -> None:
     axes = parse_axes(average, "contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:3000 N/m")
     [curve] = region(average, axes).curves
     ends = curve.points[[0, -1]]
-    assert ends[0] == pytest.approx([1865.424, 0], abs=1e-3)  # kcmax_contact_only_B0_comp1
+    assert ends[0] == pytest.approx([CONTACT, 0], abs=1e-3)
     assert ends[1, 0] == 0
 
 
@@ -137,9 +133,8 @@ def test_an_island_and_a_hole_made_by_construction_are_circles(name: str, sign: 
     assert curve.closed
     radii = np.hypot(*(curve.points - [620, 410]).T)
     assert radii == pytest.approx(radii.mean(), rel=1e-8)
-    # The contact is stable up to 1865.424 N/m (kcmax_contact_only_B0_comp1).
     top, steepness = (1500, 0.02) if name == "island" else (2100, 0.002)
-    assert radii.mean() == pytest.approx(np.sqrt(sign * (1865.424 - top) / steepness), rel=1e-6)
+    assert radii.mean() == pytest.approx(np.sqrt(sign * (CONTACT - top) / steepness), rel=1e-6)
     disc = np.pi * radii.mean() ** 2
     assert found.stable_area == pytest.approx(disc if sign > 0 else 1e6 - disc, rel=1e-8)
     assert found.contains(620, 410) is (sign > 0)
@@ -272,6 +267,6 @@ def test_a_scene_without_studies_asks_for_axes() -> None:
         parse_axes(system, None, None)
 
 
-def test_regions_of_saved_models_are_those_of_fresh_ones(average: CompiledSystem, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_regions_of_saved_models_are_those_of_fresh_ones(average: CompiledSystem, tmp_path: Path) -> None:
     apc.save(average, tmp_path / "model.apc")
     assert apc.load(tmp_path / "model.apc").region == average.region

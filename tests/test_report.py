@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from apc.compiler.words import WIDTH
 from apc.runtime.analysis import analyze
 from apc.runtime.needs import needs
-from apc.runtime.report import WIDTH, analysis_report, compile_report
+from apc.runtime.report import analysis_report, compile_report
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
 
 LONG = replaced(AVERAGE, ("user: {count: 3}", "a_long_name_of_a_group: {count: 2, set: {device.mass: 1 kg}}"))
@@ -30,8 +31,8 @@ def test_compiling_tells_what_the_scene_needs() -> None:
     system = compiled(AVERAGE)
     assert compile_report(system, needs(system), Path("scene.apc"), 2.22e-16).splitlines() == [
         "three-users-average → scene.apc",
-        "  8 states a peer (4 motion, 2 delayed force, 2 network), 3 peers; analysed as",
-        "    2 modes of 8",
+        "  8 states a peer (4 motion, 2 delayed force, 2 network), 3 peers; analysed as 2",
+        "    modes of 8",
         "  frame 8 ms: haptic ticks 8 times, network once",
         "  self-check: one frame event by event and lifted differ by 2e-16",
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,8 +20,8 @@ def _closed(system: CompiledSystem) -> Sequence[ClosedSystem]:
     return modes(*lifted_groups(system))
 
 
-def _undamped(**values: object) -> CompiledSystem:
-    system = paper(**values)  # type: ignore[arg-type]
+def _undamped(**values: Any) -> CompiledSystem:
+    system = paper(**values)
     return grouped(system, ("user", system.peers, {"device.damping": 0.0, "cube.damping": 0.0}))
 
 
@@ -68,8 +69,8 @@ def test_a_stiffness_of_exactly_zero_frees_what_it_held(
         },
     ],
 )
-def test_a_direction_is_an_eigenvector_with_eigenvalue_one(values: dict[str, object]) -> None:
-    for system in _closed(paper(**values)):  # type: ignore[arg-type]
+def test_a_direction_is_an_eigenvector_with_eigenvalue_one(values: dict[str, Any]) -> None:
+    for system in _closed(paper(**values)):
         for direction in find_rigid_modes(system).directions.T:
             moved = system.matrix @ direction
             size = np.abs(system.matrix) @ np.abs(direction)
@@ -88,7 +89,7 @@ def test_a_direction_is_an_eigenvector_with_eigenvalue_one(values: dict[str, obj
     ],
 )
 def test_undamped_peers_drift_as_far_as_nothing_brakes_them(
-    values: dict[str, object], expected: list[int]
+    values: dict[str, Any], expected: list[int]
 ) -> None:
     for system, drifts in zip(_closed(_undamped(**values)), expected, strict=True):
         rigid = find_rigid_modes(system)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from fractions import Fraction
+from typing import Any
 
 import pytest
 
@@ -13,8 +14,8 @@ from apc.runtime.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, T
 from tests.sites import MS, grouped, linked, paper
 
 
-def _schedule(order: tuple[str, ...] = ORDER, **values: object) -> Schedule:
-    system = paper(**values)  # type: ignore[arg-type]
+def _schedule(order: tuple[str, ...] = ORDER, **values: Any) -> Schedule:
+    system = paper(**values)
     patterns = [jacobians(kind).pattern for kind in system.kinds]
     [schedule] = build_schedules(system, resolve(system).timings, patterns, order=order)
     return schedule

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import pytest
 
@@ -22,9 +23,9 @@ from tests.sites import MS, columned, edged, grouped, linked, paper
         {"haptic": 3 * MS, "network": 2 * MS, "comm": Fraction(0), "haptic_phase": MS / 3},
     ],
 )
-def test_a_frame_stepped_and_lifted_agrees_to_rounding(values: dict[str, object]) -> None:
+def test_a_frame_stepped_and_lifted_agrees_to_rounding(values: dict[str, Any]) -> None:
     system = grouped(
-        paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0, **values),  # type: ignore[arg-type]
+        paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0, **values),
         ("right", 1, {"hand.force": -4.0, "device.x.start": 0.03}),
         ("left", 2, {"hand.force": 2.0, "device.mass": 0.2}),
     )
@@ -32,8 +33,8 @@ def test_a_frame_stepped_and_lifted_agrees_to_rounding(values: dict[str, object]
 
 
 def test_a_wrong_lift_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    def spoiled(*arguments: object) -> LiftedSite:
-        lifted = lift(*arguments)  # type: ignore[arg-type]
+    def spoiled(*arguments: Any) -> LiftedSite:
+        lifted = lift(*arguments)
         return replace(lifted, p=lifted.p * (1 + 1e-9))
 
     monkeypatch.setattr(selfcheck, "lift", spoiled)

@@ -17,7 +17,7 @@ from apc.runtime.modes import dense
 from apc.runtime.simulation import blocks, prepare
 from apc.runtime.trajectory import Trajectory, simulate
 from tests.eventwise import MS, Play, User, experiment, play
-from tests.sites import alone, edged, paper
+from tests.sites import alone, paper
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, told
 
 MOVED = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm], cube.x: [2 mm, 0 mm, 1 mm]}}"
@@ -222,8 +222,6 @@ def test_what_cant_be_simulated_is_refused_by_name() -> None:
     ]
     with pytest.raises(ApcError, match=r"E870 the motion of device\.v, cube\.v is not linear .* contact:"):
         simulate(compiled(crossley), duration=Fraction(1), method=Method("exact"))
-    with pytest.raises(ApcError, match="E871 pull looks at each pair of peers"):
-        simulate(edged(paper()), duration=Fraction(1))
     with pytest.raises(ApcError, match="E874"):
         simulate(compiled(replaced(AVERAGE, ("count: 3", "count: 100000000"))), duration=Fraction(1))
 

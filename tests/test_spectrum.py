@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import flint
 import mpmath
@@ -18,72 +19,52 @@ from apc.runtime.enclosure import enclose_eigenvalues
 from apc.runtime.rigid import independent_places
 from apc.runtime.spectrum import _relative
 from tests.bruteforce import Scene, frame_matrix
+from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS, RADII
 from tests.sites import MS, grouped, paper
 from tests.topologies import ROOT
 
-# Rakhsha and Constantinescu's section III: device 0.1 kg, copy 0.2 kg, both 5 N·s/m, 1 ms and 8 ms; limits
-# were computed apart from this project by propagating the full map.
 BOTH = {"comp": MS, "comm": 8 * MS}
 NONE = {"comp": Fraction(0), "comm": Fraction(0)}
 OWN = {**BOTH, "own_delay": True}
+DELAYS: dict[tuple[bool, str], dict] = {(False, "all"): NONE, (True, "all"): BOTH, (True, "own"): OWN}
 
 
-@pytest.mark.parametrize(
-    ("operator", "peers", "delays", "radius"),
-    [
-        ("mean", 3, BOTH, 0.8982367557),
-        ("sum", 3, BOTH, 0.9121448917),
-        ("mean", 5, NONE, 0.8513958715),
-        ("sum", 5, NONE, 0.805679409),
-    ],
-)
-def test_the_reference_radii_come_out(operator: str, peers: int, delays: dict, radius: float) -> None:
-    found = analyze(paper(operator, peers=peers, kt=800.0, bt=2.0, kc=1500.0, bc=2.0, **delays))
+@pytest.mark.parametrize(("scheme", "peers", "delayed", "radius"), RADII)
+def test_the_reference_radii_come_out(scheme: str, peers: int, delayed: bool, radius: float) -> None:
+    delays = DELAYS[delayed, "all"]
+    found = analyze(paper(OPERATORS[scheme], peers=peers, kt=800.0, bt=2.0, kc=1500.0, bc=2.0, **delays))
     assert found.spectral_radius == pytest.approx(radius, abs=1e-8)
     assert found.verdict == "stable up to a common translation"
     assert found.rigid_modes == 1
 
 
-def _crossing(build: object, low: float, high: float) -> float:
+def _crossing(build: Any, low: float, high: float) -> float:
     """Return where the radius crosses 1 between two values, by bisection."""
-    assert analyze(build(low)).spectral_radius < 1 < analyze(build(high)).spectral_radius  # type: ignore[operator]
+    assert analyze(build(low)).spectral_radius < 1 < analyze(build(high)).spectral_radius
     while high - low > 1e-5:
         middle = (low + high) / 2
-        if analyze(build(middle)).spectral_radius < 1:  # type: ignore[operator]
+        if analyze(build(middle)).spectral_radius < 1:
             low = middle
         else:
             high = middle
     return low
 
 
-@pytest.mark.parametrize(
-    ("delays", "damping", "kc", "average", "mesh"),
-    [
-        (NONE, 0.0, 100.0, 2127.449, 1063.725),
-        (NONE, 0.0, 2000.0, 2868.148, 1434.074),
-        (NONE, 2.0, 100.0, 4488.004, 2959.062),
-        (NONE, 2.0, 2000.0, 5869.746, 3479.811),
-        (BOTH, 0.0, 100.0, 708.186, 354.093),
-        (BOTH, 0.0, 1000.0, 1096.411, 548.205),
-        (BOTH, 2.0, 100.0, 1493.128, 962.734),
-        (BOTH, 2.0, 1000.0, 2477.935, 1378.111),
-        (OWN, 0.0, 100.0, 743.165, 371.582),
-    ],
-)
+@pytest.mark.parametrize(("delayed", "delays", "damping", "kc", "average", "mesh"), LIMITS)
 def test_the_largest_coordination_stiffness_is_the_reference_one(
-    delays: dict, damping: float, kc: float, average: float, mesh: float
+    delayed: bool, delays: str, damping: float, kc: float, average: float, mesh: float
 ) -> None:
     for operator, limit in (("mean", average), ("sum", mesh)):
 
         def build(kt: float, operator: str = operator) -> CompiledSystem:
-            return paper(operator, kt=kt, bt=damping, kc=kc, bc=damping, **delays)
+            return paper(operator, kt=kt, bt=damping, kc=kc, bc=damping, **DELAYS[delayed, delays])
 
         assert _crossing(build, limit * 0.99, limit * 1.01) == pytest.approx(limit, abs=6e-4)
         for kt in np.linspace(1.0, limit * 0.99, 8):
             assert analyze(build(float(kt))).stable
 
 
-@pytest.mark.parametrize(("damping", "limit"), [(0.0, 1865.424), (2.0, 3175.018)])
+@pytest.mark.parametrize(("damping", "limit"), CONTACT_LIMITS)
 def test_the_largest_contact_stiffness_alone_is_the_reference_one(damping: float, limit: float) -> None:
     found = _crossing(lambda kc: paper(kc=kc, kt=0.0, bt=0.0, bc=damping, **BOTH), limit * 0.99, limit * 1.01)
     assert found == pytest.approx(limit, abs=6e-4)
@@ -91,9 +72,9 @@ def test_the_largest_contact_stiffness_alone_is_the_reference_one(damping: float
 
 def test_a_network_delay_can_help() -> None:
     """K_C = 2000, B = 2, and the computational delay: 2602 without, 3041 with a network delay of 8 ms."""
-    for comm, limit in ((Fraction(0), 2602), (8 * MS, 3041)):
+    for late, limit in HELPED_LIMITS:
 
-        def build(kt: float, comm: Fraction = comm) -> CompiledSystem:
+        def build(kt: float, comm: Fraction = late * MS) -> CompiledSystem:
             return paper(kt=kt, bt=2.0, kc=2000.0, bc=2.0, comp=MS, comm=comm)
 
         assert _crossing(build, limit * 0.99, limit * 1.01) == pytest.approx(limit, abs=0.5)
@@ -368,8 +349,8 @@ def test_a_mode_that_ends_in_finite_time_has_no_frequency() -> None:
 # ---- verdicts ----
 
 
-def _undamped(**values: object) -> CompiledSystem:
-    return grouped(paper(**values), ("user", 3, {"device.damping": 0.0, "cube.damping": 0.0}))  # type: ignore[arg-type]
+def _undamped(**values: Any) -> CompiledSystem:
+    return grouped(paper(**values), ("user", 3, {"device.damping": 0.0, "cube.damping": 0.0}))
 
 
 def test_every_verdict_says_what_it_says() -> None:
@@ -384,7 +365,7 @@ def test_every_verdict_says_what_it_says() -> None:
 
 def test_the_dense_system_gives_the_same_answer() -> None:
     for values in ({}, {"kt": 0.0}, {"operator": "sum", "kc": 2500.0}):
-        split, whole = analyze(paper(**values)), analyze(paper(**values), method="dense")  # type: ignore[arg-type]
+        split, whole = analyze(paper(**values)), analyze(paper(**values), method="dense")
         assert split.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-12)
         assert (split.verdict, split.rigid_modes) == (whole.verdict, whole.rigid_modes)
         assert sum(mode.multiplicity for mode in split.modes) == len(whole.modes)

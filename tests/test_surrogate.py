@@ -51,9 +51,9 @@ def test_what_jumps_in_the_rectangle_is_asked_point_by_point() -> None:
     class Jumping:
         free = FREE
 
-        def matrices(self, values: np.ndarray[tuple[int, int], np.dtype[np.float64]]):  # type: ignore[no-untyped-def]
+        def matrices(self, values: np.ndarray[tuple[int, int], np.dtype[np.float64]]):  # type: ignore[no-untyped-def] # as in `Evaluator`
             return ((values[:, :1, None] > 1000) * np.ones((1, 2, 2)),)
 
-    family = resolve_family(Jumping(), RECTANGLE, lambda values: (np.zeros((1, 2, 2)),))  # type: ignore[arg-type]
+    family = resolve_family(Jumping(), RECTANGLE, lambda values: (np.zeros((1, 2, 2)),))  # type: ignore[arg-type] # it has enough
     assert isinstance(family, DirectFamily)
     assert family.matrices(np.array([[0.1, 0.5], [0.9, 0.5]]))[0][:, 0, 0] == pytest.approx([0, 1])

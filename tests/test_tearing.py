@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import casadi
 import numpy as np
@@ -53,7 +54,7 @@ def values(text: str, unknowns: str, **numbers: float) -> dict[str, float]:
     return dict(zip(unknowns.split(), map(float, found), strict=True))
 
 
-def _writer(known: dict, definitions: dict) -> _Writer:  # type: ignore[type-arg]
+def _writer(known: dict[str, Any], definitions: dict[str, Any]) -> _Writer:
     return _Writer(casadi.MX, known, definitions, {}, {})
 
 

@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from apc.cli_analyze import analyze_command
+from apc.cli_bench import bench_command
 from apc.cli_critical import critical_command
 from apc.cli_region import region_command
 from apc.cli_simulate import simulate_command
 from apc.cli_sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import counted
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -70,6 +72,7 @@ def apc() -> None:
 
 
 apc.add_command(analyze_command)
+apc.add_command(bench_command)
 apc.add_command(critical_command)
 apc.add_command(simulate_command)
 apc.add_command(region_command)
@@ -121,7 +124,7 @@ def check(file: str | None) -> None:
 
     path = Path(file) if file else find_input(compiled_too=False)
     system = compile_topology(path)
-    click.echo(f"{path}: no mistakes. {system.name}, {_counted(system.peers, 'peer')}.")
+    click.echo(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
 
 
 @apc.command("compile")
@@ -245,7 +248,3 @@ def _print_or_write(text: str, out: Path | None) -> None:
 
     write_atomically(out, write)
     click.echo(f"{out} is written")
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")

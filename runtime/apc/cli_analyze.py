@@ -7,23 +7,16 @@ Does not: compute.
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import click
+
+from apc.options import json_option, print_result, set_option
 
 METHODS = ("auto", "modes", "dense", "determinant", "krylov", "paper")
 
 
 @click.command("analyze")
 @click.argument("file", required=False)
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar='PATH="VALUE UNIT"',
-    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
-)
+@set_option
 @click.option(
     "--method",
     type=click.Choice(METHODS),
@@ -50,7 +43,7 @@ METHODS = ("auto", "modes", "dense", "determinant", "krylov", "paper")
     is_flag=True,
     help="Repeat the analysis under every order of events that coincide.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+@json_option
 def analyze_command(
     file: str | None,
     settings: tuple[str, ...],
@@ -69,21 +62,14 @@ def analyze_command(
     how far each coupler and delay may grow, and for contacts that push and
     never pull, which of them make it unstable.
     """
-    from apc.inputs import find_input, load_or_compile
+    from apc.inputs import open_scene
     from apc.runtime.answer import answer
 
-    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
-    if settings:
-        from apc.runtime.parameters import apply, parse_override
-
-        system = apply(system, [parse_override(system, text) for text in settings])
+    system = open_scene(file, settings)
     ranges = []
     if box:
         from apc.runtime.box import parse_range
 
         ranges = [parse_range(system, text) for text in box]
     found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)
-    if as_json:
-        click.echo(json.dumps(found.to_dict(), ensure_ascii=False, allow_nan=False, indent=2))
-    else:
-        click.echo(str(found))
+    print_result(found, as_json=as_json)

@@ -7,25 +7,18 @@ Does not: compute.
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import click
+
+from apc.options import json_option, print_result, set_option
 
 
 @click.command("critical")
 @click.argument("path")
 @click.argument("file", required=False)
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar='PATH="VALUE UNIT"',
-    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
-)
+@set_option
 @click.option("--upper", metavar='"VALUE UNIT"', help="Look no further up than this.")
 @click.option("--lower", metavar='"VALUE UNIT"', help="Look no further down than this.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+@json_option
 def critical_command(
     path: str,
     file: str | None,
@@ -42,16 +35,8 @@ def critical_command(
     is printed, and on which side of it the scene is stable. FILE is a
     topology or a compiled model.
     """
-    from apc.inputs import find_input, load_or_compile
+    from apc.inputs import open_scene
     from apc.runtime.critical import critical
 
-    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
-    if settings:
-        from apc.runtime.parameters import apply, parse_override
-
-        system = apply(system, [parse_override(system, text) for text in settings])
-    result = critical(system, path, lower=lower, upper=upper)
-    if as_json:
-        click.echo(json.dumps(result.to_dict(), ensure_ascii=False, allow_nan=False, indent=2))
-    else:
-        click.echo(str(result))
+    system = open_scene(file, settings)
+    print_result(critical(system, path, lower=lower, upper=upper), as_json=as_json)

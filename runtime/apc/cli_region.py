@@ -8,12 +8,12 @@ Does not: compute.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.options import json_option, print_result, set_option
 
 
 @click.command("region")
@@ -43,13 +43,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
     metavar="CONDITION:SYMBOL=PATH,…",
     help="Draw a published condition too; every symbol is given a parameter or a quantity.",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar='PATH="VALUE UNIT"',
-    help="Change a parameter first, in every scene. May be repeated.",
-)
+@set_option
 @click.option(
     "--cells",
     type=click.IntRange(2, 256),
@@ -63,7 +57,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
     metavar="FILE",
     help="Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+@json_option
 def region_command(
     file: str | None,
     x: str | None,
@@ -89,8 +83,7 @@ def region_command(
                    --compare mesh.yaml --vary "lan.delay=0,8 ms" \\
                    --out regions.svg
     """
-    from apc.inputs import find_input, load_or_compile
-    from apc.runtime.parameters import apply, parse_override
+    from apc.inputs import open_scene
     from apc.runtime.region_files import check_region_path, write_panels
     from apc.runtime.region_panels import compare_regions, parse_panel, parse_vary
 
@@ -100,17 +93,12 @@ def region_command(
         what = "--vary and --panel both say what the panels are: one of them is enough"
         raise ApcError(Mistake("E907", Place("region"), what))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
-    first = Path(file) if file else find_input(compiled_too=True)
-    systems = [load_or_compile(path) for path in (first, *map(Path, compare))]
-    changed = [apply(one, [parse_override(one, text) for text in settings]) for one in systems]
+    systems = [open_scene(one, settings) for one in (file, *compare)]
     found = compare_regions(
-        changed, x=x, y=y, panels=listed, overlays=overlays, normalize=normalize, cells=cells
+        systems, x=x, y=y, panels=listed, overlays=overlays, normalize=normalize, cells=cells
     )
     if out is not None:
         write_panels(out, found)
-    if as_json:
-        click.echo(json.dumps(found.to_dict(), ensure_ascii=False, allow_nan=False, indent=2))
-    else:
-        click.echo(str(found))
-        if out is not None:
-            click.echo(f"\n{out} is written")
+    print_result(found, as_json=as_json)
+    if out is not None and not as_json:
+        click.echo(f"\n{out} is written")

@@ -8,7 +8,6 @@ Does not: compute.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from pathlib import Path
 import click
 
 from apc.compiler.errors import ApcError
+from apc.options import json_option, print_document, print_result, set_option
 
 LONG = 1.0  # seconds of work after which progress is shown
 
@@ -28,13 +28,7 @@ LONG = 1.0  # seconds of work after which progress is shown
     metavar='"TIME"',
     help='How long, such as "2 s"; that of the scene\'s experiment if not given.',
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar='PATH="VALUE UNIT"',
-    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
-)
+@set_option
 @click.option(
     "--signals",
     multiple=True,
@@ -59,7 +53,7 @@ LONG = 1.0  # seconds of work after which progress is shown
     metavar="FILE",
     help="Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+@json_option
 @click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
 @click.option(
     "--seed",
@@ -118,7 +112,7 @@ def simulate_command(
         apc simulate --runs 1000 --seed 1 --jobs 4
         apc simulate --method semi-implicit:1ms --error
     """
-    from apc.inputs import find_input, load_or_compile
+    from apc.inputs import open_scene
     from apc.runtime.accuracy import compare_with
     from apc.runtime.methods import DEFAULT, parse_method
     from apc.runtime.recording import open_recording
@@ -145,11 +139,7 @@ def simulate_command(
         from apc.runtime.figures import check_format
 
         check_format(still, "--still")
-    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
-    if settings:
-        from apc.runtime.parameters import apply, parse_override
-
-        system = apply(system, [parse_override(system, text) for text in settings])
+    system = open_scene(file, settings)
     if still is not None:
         from apc.runtime.still import save_still
 
@@ -169,8 +159,7 @@ def simulate_command(
                 method=chosen,
                 progress=progress,
             )
-        as_text = json.dumps(many.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
-        click.echo(as_text if as_json else str(many))
+        print_result(many, as_json=as_json)
         if many.interrupted:
             raise click.Abort
         return
@@ -199,7 +188,7 @@ def simulate_command(
         save(trajectory_of(simulation, keeper, summary, interrupted), plot)
     if as_json:
         document = result_document(system.name, summary, provenance_of(simulation), interrupted, estimate)
-        click.echo(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
+        print_document(document)
     else:
         click.echo(result_text(system.name, summary, provenance_of(simulation), estimate))
         for written in (out, plot, still):

@@ -8,7 +8,6 @@ Does not: compute.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING
 import click
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.options import json_option, print_result, set_option
 
 if TYPE_CHECKING:
     from apc.runtime.sweep import Progress
@@ -47,20 +47,14 @@ if TYPE_CHECKING:
     metavar="WHAT",
     help="What to compute at each point; see below.",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar='PATH="VALUE UNIT"',
-    help="Change a parameter for all points. May be repeated.",
-)
+@set_option
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes to compute with; all cores by default.")
 @click.option(
     "--cluster",
     metavar="ADDRESS",
     help="Compute on a running Dask cluster instead: its scheduler's address, tcp://HOST:8786.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+@json_option
 def sweep_command(
     file: str | None,
     over: tuple[str, ...],
@@ -86,21 +80,14 @@ def sweep_command(
     "critical:PATH" (the value of another parameter at which the verdict
     changes, with its error).
     """
-    from apc.inputs import find_input, load_or_compile
+    from apc.inputs import open_scene
     from apc.runtime.sweep import sweep
 
     values = _values(over)
-    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
-    if settings:
-        from apc.runtime.parameters import apply, parse_override
-
-        system = apply(system, [parse_override(system, text) for text in settings])
+    system = open_scene(file, settings)
     with _progress(out) as progress:
         result = sweep(system, values, of=of, out=out, jobs=jobs, cluster=cluster, progress=progress)
-    if as_json:
-        click.echo(json.dumps(result.to_dict(), ensure_ascii=False, allow_nan=False, indent=2))
-    else:
-        click.echo(str(result))
+    print_result(result, as_json=as_json)
 
 
 def _values(over: tuple[str, ...]) -> dict[str, str]:

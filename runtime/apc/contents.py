@@ -8,7 +8,6 @@ Does not: analyse.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 from apc.compiler.blocks import ImplicitBlock
 from apc.compiler.clocks import ClockedSystem
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.diagram import Diagram, build_diagram, counted, draw_dot, one_of, seconds
+from apc.compiler.diagram import Diagram, build_diagram, common_period, draw_dot, one_of, seconds
 from apc.compiler.flatten import FlatKind, FlatSystem
 from apc.compiler.listing import plain, step_lines
 from apc.compiler.picture import draw_svg
@@ -25,10 +24,9 @@ from apc.compiler.pipeline import each_stage, run_stages
 from apc.compiler.scene import Scene
 from apc.compiler.structure import SortedKind, SortedSystem
 from apc.compiler.units import format_dimension
+from apc.compiler.words import counted, wrapped
 
-WIDTH = 80
 PAIRWISE = ("max", "min")
-_PIECE = re.compile(r"[^*/(,]+[*/(,]*|[*/(,]+")  # of a word, broken behind an operator
 
 
 def show_dot(path: Path) -> str:
@@ -45,7 +43,7 @@ def show_text(path: Path) -> str:
     """Return graph, equations and schedule of a topology as text."""
     scene, flat, _, ordered, compiled = _stages(path)
     diagram = build_diagram(scene)
-    lines = [diagram.title, *_wrapped(diagram.about, "", "")]
+    lines = [diagram.title, *wrapped(diagram.about)]
     lines += ["", "GRAPH", *_graph_lines(diagram)]
     for flat_kind, sorted_kind in zip(flat.kinds, ordered.kinds, strict=True):
         of = f" of {flat_kind.name}" if len(flat.kinds) > 1 else ""
@@ -125,21 +123,21 @@ def _graph_lines(diagram: Diagram) -> Iterator[str]:
         text = f"{node.name}: {', '.join(node.lines) or node.role}"
         if node.clock:
             text += f", at each tick of {node.clock}"
-        yield from _wrapped(text, "    ", "      ")
+        yield from wrapped(text, "    ", "      ")
         if node.role != "mass" and meets[node.name]:
             ends = ["ground" if name.startswith("ground of ") else name for name in meets[node.name]]
-            yield from _wrapped(f"joins {' and '.join(ends)}", "      ", "        ")
+            yield from wrapped(f"joins {' and '.join(ends)}", "      ", "        ")
         if node.links:
-            yield from _wrapped(f"hears the others over {', '.join(node.links)}", "      ", "        ")
+            yield from wrapped(f"hears the others over {', '.join(node.links)}", "      ", "        ")
     for node in diagram.nodes:
         if node.role == "joint":
-            yield from _wrapped(f"rigidly joined: {node.name}", "    ", "      ")
+            yield from wrapped(f"rigidly joined: {node.name}", "    ", "      ")
     for net in diagram.nets:
         shape = f"{counted(len(net.pairs), 'arc')}" if net.shape == "arcs" else f"{net.shape} graph"
-        yield from _wrapped(f"{net.name}: {shape}, {', '.join(net.lines)}", "  ", "    ")
+        yield from wrapped(f"{net.name}: {shape}, {', '.join(net.lines)}", "  ", "    ")
     for crowd in diagram.crowds:
         own = f"; {', '.join(crowd.settings)}" if crowd.settings else ""
-        yield from _wrapped(f"{crowd.name}: {counted(crowd.count, 'peer')}{own}", "  ", "    ")
+        yield from wrapped(f"{crowd.name}: {counted(crowd.count, 'peer')}{own}", "  ", "    ")
 
 
 def _graph_document(diagram: Diagram) -> dict[str, Any]:
@@ -177,27 +175,27 @@ def _equation_lines(kind: FlatKind) -> Iterator[str]:
         yield f"  {'connections' if origin == 'connection' else origin}"
         for equation in kind.equations:
             if equation.origin == origin:
-                yield from _wrapped(equation.text, "    ", "        ")
+                yield from wrapped(equation.text, "    ", "        ")
 
 
 def _computed_lines(kind: SortedKind) -> Iterator[str]:
     """Yield what each clock computes, in order, samples and sends included."""
-    yield from _wrapped(f"states: {', '.join(kind.states) or 'none'}", "  ", "    ")
+    yield from wrapped(f"states: {', '.join(kind.states) or 'none'}", "  ", "    ")
     samples = {clock: [(n, e) for n, its, e in kind.samples if its == clock] for _, clock, _ in kind.samples}
     for partition in kind.partitions:
         yield f"  {partition.clock}" if partition.clock == "continuous" else f"  tick of {partition.clock}"
         for name, expression in samples.get(partition.clock, []):
-            yield from _wrapped(f"{name} := {plain(expression)}", "    ", "        ")
+            yield from wrapped(f"{name} := {plain(expression)}", "    ", "        ")
         for step in partition.assignments:
             for line in step_lines(step):
                 indent = line[: len(line) - len(line.lstrip())]
-                yield from _wrapped(line.lstrip(), indent, indent + "    ")
+                yield from wrapped(line.lstrip(), indent, indent + "    ")
     for send in kind.sends:
-        yield from _wrapped(f"sent over {send.link}: {send.name} := {plain(send.expression)}", "  ", "      ")
+        yield from wrapped(f"sent over {send.link}: {send.name} := {plain(send.expression)}", "  ", "      ")
     pairs = {name: plain(value) for name, value in kind.aliases}
     if pairs:
         yield "  the same as another"
-        yield from _wrapped(", ".join(f"{name} = {value}" for name, value in pairs.items()), "    ", "    ")
+        yield from wrapped(", ".join(f"{name} = {value}" for name, value in pairs.items()), "    ", "    ")
 
 
 def _step_document(step: Any) -> dict[str, Any]:
@@ -222,7 +220,7 @@ def schedule(system: CompiledSystem) -> dict[str, Any]:
     """
     timings = {timing.name: timing.value for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
-    frame = _least_common_multiple(periods.values())
+    frame = common_period(periods.values())
     return {
         "frame_s": None if frame is None else float(frame),
         "clocks": [
@@ -279,13 +277,6 @@ def schedule(system: CompiledSystem) -> dict[str, Any]:
     }
 
 
-def _least_common_multiple(periods: Iterable[Fraction]) -> Fraction | None:
-    found = list(periods)
-    if not found:
-        return None
-    return Fraction(math.lcm(*(p.numerator for p in found)), math.gcd(*(p.denominator for p in found)))
-
-
 def _computed_at(kinds: Iterable[Kind], clock: str) -> list[str]:
     outputs = (name for kind in kinds for part in kind.clocks if part.clock == clock for name in part.outputs)
     return list(dict.fromkeys(outputs))
@@ -310,13 +301,13 @@ def _schedule_lines(facts: dict[str, Any]) -> Iterator[str]:
             doing.append(f"packets leave over {', '.join(clock['sends'])}")
         if clock["computes"]:
             doing.append(f"each peer computes {', '.join(clock['computes'])}")
-        yield from _wrapped(f"{text}: {'; '.join(doing)}", "  ", "    ")
+        yield from wrapped(f"{text}: {'; '.join(doing)}", "  ", "    ")
     several = len({hold["kind"] for hold in facts["holds"]}) > 1
     for hold in facts["holds"]:
         at = f" at {hold['kind']}" if several else ""
         start = f"from {_time(hold['delay_s'])} after its tick" if hold["delay_s"] else "from its tick"
         text = f"{hold['hold']}{at} acts {start}, held for {_time(hold['held_s'])} until the next one acts"
-        yield from _wrapped(text, "  ", "    ")
+        yield from wrapped(text, "  ", "    ")
     for link in facts["links"]:
         between = f" from {link['from']} to {link['to']}" if link["from"] else ""
         when = f"{_time(link['delay_s'])} later" if link["delay_s"] else "at once"
@@ -326,13 +317,13 @@ def _schedule_lines(facts: dict[str, Any]) -> Iterator[str]:
         text += f", available {when}; {_on_the_way(link['on_the_way'])} of each sender on the way"
         youngest, oldest = link["age_s"]
         text += f"; the newest one heard is {_time(youngest)} to {_time(oldest)} old"
-        yield from _wrapped(text, "  ", "    ")
+        yield from wrapped(text, "  ", "    ")
     several = len({one["kind"] for one in facts["receives"]}) > 1
     for one in facts["receives"]:
         at = f" at {one['kind']}" if several else ""
         text = f"{one['receive']}{at}: heard at each tick of {one['clock']} over {one['link']}"
         text += "; one evaluation a pair of peers" if one["pairwise"] else ""
-        yield from _wrapped(text, "  ", "    ")
+        yield from wrapped(text, "  ", "    ")
 
 
 def _on_the_way(number: int) -> str:
@@ -345,19 +336,3 @@ def _times(number: int) -> str:
 
 def _time(number: float) -> str:
     return seconds(Fraction(number))
-
-
-def _wrapped(text: str, indent: str, later: str) -> list[str]:
-    """Return a text as lines of at most `WIDTH` columns, broken at spaces, at need behind an operator."""
-    lines: list[str] = []
-    line, between = indent, ""
-    for word in text.split():
-        whole = len(later) + len(word) <= WIDTH
-        for piece in [word] if whole else _PIECE.findall(word):
-            if line.strip() and len(line) + len(between) + len(piece) > WIDTH:
-                lines.append(line)
-                line, between = later, ""
-            line += between + piece
-            between = ""
-        between = " "
-    return [*lines, line] if line.strip() else lines

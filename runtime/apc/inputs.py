@@ -9,6 +9,7 @@ Does not: compile.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -108,6 +109,29 @@ def load_or_compile(path: Path) -> CompiledSystem:
     system = compile_topology(path)
     check_frame(system)
     return system
+
+
+def open_scene(file: str | None, settings: Sequence[str]) -> CompiledSystem:
+    """Return the compiled model that a command means.
+
+    Parameters
+    ----------
+    file
+        A topology or compiled model; the only one of the working folder if not given.
+    settings
+        Parameters to change, each `NAME=QUANTITY`.
+
+    Raises
+    ------
+    ApcError
+        As `find_input`, `load_or_compile`, `parameters.parse_override` and `parameters.apply`.
+    """
+    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
+    if not settings:
+        return system
+    from apc.runtime.parameters import apply, parse_override
+
+    return apply(system, [parse_override(system, text) for text in settings])
 
 
 def compiled_already(topology: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The truth about every scene of this folder, to fifty digits: `python -m tests.hard.truths` writes truths.json.
+"""The truth about every scene here, to fifty digits: `python -m tests.hard.truths` writes truths.json.
 
 All peers (equal ones by a representative and the weights of its class) are followed event by event in ball
 arithmetic, see `bench_reference`; two precisions agree on every digit written. Nothing of the analysis takes
@@ -55,7 +55,10 @@ def main() -> None:
     found = {}
     for path in sorted(HERE.glob("*.yaml")):
         found[path.stem] = truth_of(compile_topology(path))
-        print(f"{path.stem:<24} {found[path.stem]['spectral_radius'][:24]}  {found[path.stem]['verdict']}", flush=True)
+        print(
+            f"{path.stem:<24} {found[path.stem]['spectral_radius'][:24]}  {found[path.stem]['verdict']}",
+            flush=True,
+        )
     TRUTHS.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
@@ -120,7 +123,10 @@ def _by_polynomial(system: CompiledSystem, frames: int) -> Truth:
     zeros of det(z − P − z^(−d) Q S) = p₀(z) + z^(−d) p₁(z) + z^(−2d) p₂(z), after multiplying with z^(2d).
     """
     [link] = system.links
-    near, nearest = (_delayed(system, link.delay, Fraction(1, frames)), _delayed(system, link.delay, Fraction(0)))
+    near, nearest = (
+        _delayed(system, link.delay, Fraction(1, frames)),
+        _delayed(system, link.delay, Fraction(0)),
+    )
     roots: list[Any] = []
     radius, rigid = flint.arb(0), 0
     with precision(1024):
@@ -150,7 +156,9 @@ def _by_polynomial(system: CompiledSystem, frames: int) -> Truth:
 
 def _delayed(system: CompiledSystem, name: str, factor: Fraction) -> CompiledSystem:
     """Return the scene with a timing multiplied."""
-    timings = tuple(replace(one, value=one.value * factor) if one.name == name else one for one in system.timings)
+    timings = tuple(
+        replace(one, value=one.value * factor) if one.name == name else one for one in system.timings
+    )
     return replace(system, timings=timings)
 
 
@@ -190,7 +198,7 @@ def write_boundary() -> None:
         about = f"A gain {'below' if side == 'inside' else 'above'} the boundary by 1e-{size} of it."
         head = (
             f"topology: boundary-{name}\nabout: {about}\n"
-            "# From: the paper's scene (Rakhsha and Constantinescu, section III), its gain found by bisection in truths.py\n"
+            "# From: the paper's scene (Rakhsha and Constantinescu, section III), its gain by bisection\n"
         )
         (HERE / f"boundary-{name}.yaml").write_text(
             head + body.replace("stiffness: 500 N/m", f"stiffness: {gain!r} N/m"), encoding="utf-8"

@@ -1,0 +1,146 @@
+"""The command `apc bench`.
+
+Takes: words of a command line. Gives: text on stdout; exit code 1 when a hard case fails.
+Guarantees: with --json, stdout holds one JSON document and nothing else.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+
+from apc.compiler.errors import ApcError, Mistake, Place
+
+HARD = Path("tests/hard")  # of a copy of the repository
+
+
+@click.command("bench")
+@click.argument("file", required=False)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar='PATH="VALUE UNIT"',
+    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Draw error against time: .png, .svg or .pdf.",
+)
+@click.option("--scale", "counts", metavar="3,30,300", help="Measure with these numbers of peers instead.")
+@click.option(
+    "--hard",
+    "folder",
+    type=click.Path(path_type=Path),
+    is_flag=False,
+    flag_value=HARD,
+    metavar="[FOLDER]",
+    help=f"Analyse a folder of scenes whose truth is known instead ({HARD} if not given).",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+def bench_command(
+    file: str | None,
+    settings: tuple[str, ...],
+    plot: Path | None,
+    counts: str | None,
+    folder: Path | None,
+    as_json: bool,
+) -> None:
+    """Measure speed against error, on this scene and this machine.
+
+    Every method of analysis and of simulation that can serve the scene is
+    timed, and its error found against a reference of fifty digits. A star
+    marks those that none is better than in both. FILE is a topology or a
+    compiled model.
+
+    \b
+        apc bench --plot bench.png
+        apc bench --scale 3,30,300,3000
+        apc bench --hard tests/hard
+    """
+    if folder is not None:
+        if file or settings or plot or counts:
+            raise click.UsageError("--hard has scenes of its own: no FILE, --set, --plot or --scale with it")
+        _hard(folder, as_json)
+        return
+    from apc.inputs import find_input, load_or_compile
+
+    if counts is not None:
+        if settings or plot:
+            raise click.UsageError("--scale compiles anew: no --set or --plot with it")
+        _scale(Path(file) if file else find_input(compiled_too=False), counts, as_json)
+        return
+    from apc.runtime.bench import bench
+    from apc.runtime.bench_report import bench_report
+
+    if plot is not None:
+        from apc.runtime.figures import check_format
+
+        check_format(plot)
+    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
+    if settings:
+        from apc.runtime.parameters import apply, parse_override
+
+        system = apply(system, [parse_override(system, text) for text in settings])
+    found = bench(system)
+    if plot is not None:
+        from apc.runtime.bench_figure import save_bench
+
+        save_bench(found, plot)
+    _print(found.to_dict(), bench_report(found), as_json)
+    if plot is not None and not as_json:
+        click.echo(f"  {plot} is written")
+
+
+def _hard(folder: Path, as_json: bool) -> None:
+    """Report the hard cases; a failure is exit code 1."""
+    from apc.runtime.bench_hard import run_hard_cases
+    from apc.runtime.bench_report import hard_report
+
+    found = run_hard_cases(folder)
+    _print(found.to_dict(), hard_report(found), as_json)
+    if found.failures:
+        names = ", ".join(case.name for case in found.failures)
+        raise ApcError(
+            Mistake("E922", Place(str(folder)), f"{len(found.failures)} hard cases failed: {names}")
+        )
+
+
+def _scale(path: Path, counts: str, as_json: bool) -> None:
+    """Report what more peers cost."""
+    from apc.runtime.bench_report import scale_report
+    from apc.runtime.bench_scale import scale
+
+    if path.suffix == ".apc":
+        what = "is a compiled model, whose peers are counted"
+        raise ApcError(Mistake("E921", Place(str(path)), what, hint=f"apc bench {path.with_suffix('.yaml')}"))
+    try:
+        numbers = [int(float(text)) for text in counts.split(",")]
+    except (ValueError, OverflowError) as error:
+        place = Place("--scale")
+        raise ApcError(Mistake("E921", place, "the numbers", "like 3,30,300", counts[:80])) from error
+    found = scale(path, numbers)
+    _print(found.to_dict(), scale_report(found), as_json)
+
+
+def _print(document: dict[str, Any], text: str, as_json: bool) -> None:
+    if as_json:
+        click.echo(json.dumps(_finite(document), ensure_ascii=False, allow_nan=False, indent=2))
+    else:
+        click.echo(text)
+
+
+def _finite(value: Any) -> Any:
+    """Replace what JSON has no word for by null."""
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,140 @@
+"""`apc bench`: what is measured, what counts as better, what is printed."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+
+from apc.__main__ import run
+from apc.compiler.errors import ApcError
+from apc.runtime.bench import SAME, Bench, Measured, bench, bench_analysis, pareto_front
+from apc.runtime.bench_figure import draw_bench, save_bench
+from apc.runtime.bench_report import bench_report, scale_report
+from apc.runtime.bench_scale import scale, with_count
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
+
+
+@pytest.fixture(scope="module")
+def found() -> Bench:
+    return bench(compiled(AVERAGE), rounds=1, duration=Fraction(1, 50))
+
+
+def _one(name: str, seconds: float, error: float | None, spread: float = 0.0) -> Measured:
+    return Measured(name, seconds, spread, 3, error, None, False)
+
+
+def test_the_front_is_what_nothing_beats_in_both_ways() -> None:
+    quick, right = _one("quick", 1.0, 1e-3), _one("right", 4.0, 1e-9)
+    between, beaten = _one("between", 2.0, 1e-5), _one("beaten", 3.0, 1e-4)
+    marked = pareto_front([right, beaten, between, quick])
+    assert [(one.name, one.front) for one in marked] == [
+        ("quick", True),
+        ("between", True),
+        ("beaten", False),
+        ("right", True),
+    ]
+
+
+def test_differences_within_spread_or_rounding_are_none() -> None:
+    assert all(one.front for one in pareto_front([_one("a", 1.0, 1e-9, 0.2), _one("b", 1.1, 1e-9, 0.1)]))
+    rounding = [_one("a", 1.0, SAME / 2), _one("b", 2.0, 0.0)]
+    assert [one.front for one in pareto_front(rounding)] == [True, False]
+    assert [one.front for one in pareto_front([_one("a", 1.0, None), _one("b", 2.0, None)])] == [True, False]
+
+
+def test_every_method_that_serves_the_scene_is_measured_beside_its_error(found: Bench) -> None:
+    analysis, simulation = found.comparisons
+    names = {"modes", "dense", "determinant", "krylov", "certified", "paper"}
+    assert {one.name for one in analysis.measured} == names
+    assert analysis.reference.startswith("spectral radius 0.957171389625094952208279125575")
+    for one in analysis.measured:
+        assert one.error is not None
+        assert one.bound is not None
+        assert one.error <= one.bound
+    assert analysis.chosen is not None
+    assert analysis.chosen.name == "modes"
+    errors = {one.name: one.error for one in simulation.measured}
+    assert errors["exact"] is not None
+    assert errors["exact"] < 1e-14
+    assert simulation.chosen is not None
+    assert simulation.chosen.name == "exact"
+    # Of order four and one: a step of a quarter and of a tenth.
+    assert errors["rk4:1 ms"] / errors["rk4:0.25 ms"] > 100  # type: ignore[operator] # no error is None here
+    assert 5 < errors["semi-implicit:1 ms"] / errors["semi-implicit:0.1 ms"] < 20  # type: ignore[operator] # likewise
+    assert simulation.notes == ("the scene starts at rest: its first peer is moved by 10 mm",)
+
+
+def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
+    text = replaced(
+        AVERAGE,
+        ("haptic: 1 ms", "haptic: 1 ms\n  slow: 2 ms"),
+        ("clock: haptic, delay: 1 ms, link", "clock: slow, delay: 1 ms, link"),
+    )
+    [(name, reason)] = bench_analysis(compiled(text), rounds=1).refused
+    assert name == "paper"
+    assert "one clock of forces (here are haptic and slow)" in reason
+
+
+def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
+    text = bench_report(found)
+    assert str(found) == text
+    assert max(map(len, text.splitlines())) <= 80
+    assert "analyze chooses modes, which is" in text
+    assert "simulate chooses exact, which is" in text
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_the_picture_has_a_panel_a_task(found: Bench, tmp_path: Path) -> None:
+    axes = draw_bench(found).axes
+    assert [ax.get_title() for ax in axes] == ["apc analyze", "apc simulate"]
+    assert "exact (default)" in [text.get_text() for text in axes[1].texts]
+    save_bench(found, tmp_path / "bench.svg")
+    assert (tmp_path / "bench.svg").stat().st_size > 10_000
+
+
+def test_a_scaled_scene_is_the_text_with_another_count(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(AVERAGE, encoding="utf-8")
+    grown, expected = with_count(path, 30), compiled(replaced(AVERAGE, ("count: 3", "count: 30")))
+    assert (grown.peers, grown.parameters) == (30, expected.parameters)
+    assert path.read_text(encoding="utf-8") == AVERAGE
+    two = replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}"))
+    path.write_text(two, encoding="utf-8")
+    assert [group.count for group in with_count(path, 7).groups] == [1, 7]
+
+
+def test_more_peers_are_measured_each_in_a_process_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(AVERAGE, encoding="utf-8")
+    found = scale(path, [3, 3000])
+    assert [row.peers for row in found.rows] == [3, 3000]
+    assert all(row.error is not None and row.error <= row.bound for row in found.rows)
+    assert all(row.memory > 10 * 2**20 for row in found.rows)
+    text = scale_report(found)
+    assert max(map(len, text.splitlines())) <= 80
+    assert "3,000" in text
+
+
+@pytest.mark.parametrize("counts", [[], [0], [3, -1]])
+def test_numbers_of_peers_that_are_none_are_refused(tmp_path: Path, counts: list[int]) -> None:
+    with pytest.raises(ApcError, match="E921"):
+        scale(tmp_path / "scene.yaml", counts)
+
+
+def test_a_scene_of_a_table_has_no_count_to_grow() -> None:
+    with pytest.raises(ApcError, match="no group of this topology has a count that could grow"):
+        scale(SCENES / "users-table.yaml", [3])
+
+
+def test_the_command_prints_one_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(AVERAGE, encoding="utf-8")
+    assert run(["bench", str(path), "--scale", "3", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [row["peers"] for row in document["rows"]] == [3]
+    assert run(["bench", str(path), "--scale", "many"]) == 1
+    assert "E921 the numbers wants like 3,30,300, got many" in capsys.readouterr().err
+    assert run(["bench", str(path), "--hard"]) == 2

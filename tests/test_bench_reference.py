@@ -1,0 +1,121 @@
+"""The reference of fifty digits, against computations that share nothing with it."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import flint
+import numpy as np
+import pytest
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.balls import precision
+from apc.runtime.bench_events import refusal
+from apc.runtime.bench_reference import Truth, classes_of, exact_course, spectral_truth
+from tests.bruteforce import Scene, frame_matrix
+from tests.eventwise import experiment, play
+from tests.sites import MS, columned, edged, grouped, linked, paper
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
+
+
+def _arb(value: object) -> flint.arb:
+    if isinstance(value, Fraction):
+        return flint.arb(flint.fmpq(value.numerator, value.denominator))
+    return flint.arb(value)
+
+
+def _radius(scene: Scene, rigid: int) -> flint.arb:
+    """Return the radius by the brute force of the tests, which knows the scene and no compiled function."""
+    with precision(600):
+        rows = frame_matrix(scene, number=_arb, exp=lambda value: value.exp())
+        values = flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
+        values.sort(key=lambda value: float(abs(value - 1).mid()))
+        return max(abs(value).mid() for value in values[rigid:])
+
+
+def _truth(system: CompiledSystem) -> Truth:
+    found = spectral_truth(system)
+    assert isinstance(found, Truth), found
+    return found
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"operator": "sum", "peers": 2, "bt": 2.0, "bc": 1.0},
+        {"comp": MS / 7, "comm": MS * 22 / 7},
+        {"comp": Fraction(0), "comm": Fraction(0), "own_delay": True},
+        {"peers": 1, "operator": "sum", "network": Fraction(1, 90), "comm": Fraction(1, 45)},
+        {"haptic_phase": MS / 2, "network_phase": MS * 3},
+    ],
+)
+def test_fifty_digits_are_those_of_the_brute_force(values: dict[str, Any]) -> None:
+    scene = {"kt": 300.0, **values}
+    found = _truth(paper(**scene))
+    assert found.rigid == 1
+    with precision(600):
+        assert float(abs(found.radius - _radius(Scene(**scene), 1))) < 1e-50
+
+
+def test_a_graph_with_weights_is_followed_arc_by_arc() -> None:
+    arcs = [(0, 1, 1.0), (1, 0, 0.5), (2, 1, 2.0), (1, 2, 0.25)]
+    found = _truth(linked(paper(peers=3), arcs))
+    weights = {(i, j): weight for i, j, weight in arcs}
+    with precision(600):
+        assert float(abs(found.radius - _radius(Scene(weights=weights), 1))) < 1e-50
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+def test_equal_peers_by_their_classes_are_all_peers(operator: str) -> None:
+    system = paper(operator, peers=4, kt=200.0)
+    assert classes_of(system).counts == (4,)
+    with precision(600):
+        expected = _radius(Scene(operator=operator, peers=4, kt=200.0), 1)
+        assert float(abs(_truth(system).radius - expected)) < 1e-50
+
+
+def test_groups_and_stars_fall_into_classes() -> None:
+    two = grouped(paper(), ("one", 1, {"device.mass": 0.3}), ("many", 10**6, {}))
+    assert classes_of(two).counts == (1, 10**6)
+    star = linked(paper(peers=5), "star")
+    assert classes_of(star).counts == (1, 4)
+    ring = linked(paper(peers=5), "ring")
+    assert classes_of(ring).counts == (1, 1, 1, 1, 1)
+    weights = dict.fromkeys(((0, 1), (0, 2), (0, 3), (0, 4), (1, 0), (2, 0), (3, 0), (4, 0)), 1.0)
+    with precision(600):
+        assert float(abs(_truth(star).radius - _radius(Scene(peers=5, weights=weights), 1))) < 1e-50
+
+
+def test_a_course_is_that_of_stepping_by_hand() -> None:
+    """The experiment, with contacts that open and close: positions and velocities at every tick."""
+    for name, operator in (("average", "mean"), ("mesh", "sum")):
+        system = compiled((SCENES / f"experiment-{name}.yaml").read_text(encoding="utf-8"))
+        found = exact_course(system, Fraction(1, 5))
+        assert not isinstance(found, str)
+        names, rows = found
+        assert names[0] == "right[1].device.x"
+        by_hand = np.array(play(experiment(operator), Fraction(1, 5)))[:, 1:].reshape(len(rows), 3, 6)
+        np.testing.assert_allclose(rows.reshape(len(rows), 3, 4), by_hand[:, :, :4], rtol=0, atol=1e-12)
+
+
+def test_what_has_no_reference_says_why() -> None:
+    timed = replaced(
+        AVERAGE,
+        ("studies:", "hands:\n  push: {type: RampForce, flange: device, force: 2 N, rise: 0.5 s}\nstudies:"),
+    )
+    lossy = replaced(AVERAGE, ("delay: 8 ms}\nstudies", "delay: 8 ms, loss: 2 %}\nstudies"))
+    assert refusal(compiled(timed), in_time=True) == "a force on user changes between its ticks"
+    assert refusal(compiled(timed), in_time=False) == ""
+    assert refusal(compiled(lossy), in_time=True) == "packets get lost or come late by chance"
+    assert refusal(edged(paper()), in_time=False) == "user looks at each sender by itself"
+    many = columned(paper(peers=20), device__mass=[0.1 + 0.01 * i for i in range(20)])
+    assert "80 states of motion take too long at 50 digits" == str(spectral_truth(many))
+
+
+def test_the_mesh_is_the_average_with_twice_the_gain() -> None:
+    """Three peers: (N − 1) K_T in the one is K_T in the other, to every digit."""
+    mesh = compiled(replaced(MESH, ("stiffness: 500 N/m", "stiffness: 250 N/m")))
+    with precision(600):
+        assert float(abs(_truth(mesh).radius - _truth(compiled(AVERAGE)).radius)) < 1e-50

@@ -1,0 +1,255 @@
+"""`pairs`: what peers make of each other pair by pair is what looking at each of them by hand gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.compiler.pipeline import compile_topology
+from apc.runtime.packets import PacketSource, channel_law
+from apc.runtime.simulation import prepare
+from apc.runtime.trajectory import simulate
+from tests.eventwise import MS, coast
+from tests.sites import edged, paper
+from tests.test_gathering import effective
+from tests.topologies import MESH, compiled, replaced
+
+DURATION = Fraction(3, 10)
+K, B, LIMIT = 500.0, 2.0, 1.5
+
+# What a component says its force is, and the same by hand: of what the peer has (x, v, its force before, the
+# time) and what it hears, with weights.
+Heard = Sequence[tuple[float, float, float]]  # weight, x, v
+Force = Callable[[float, float, float, float, Heard], float]
+
+
+def limited(x: float, v: float, x_j: float, v_j: float) -> float:
+    return max(-LIMIT, min(LIMIT, K * (x - x_j) + B * (v - v_j)))
+
+
+def of_sum(x: float, v: float, f: float, t: float, heard: Heard) -> float:
+    return sum(w * limited(x, v, *one) for w, *one in heard)
+
+
+def of_mean(x: float, v: float, f: float, t: float, heard: Heard) -> float:
+    return of_sum(x, v, f, t, heard) / sum(w for w, *_ in heard)
+
+
+def of_largest(x: float, v: float, f: float, t: float, heard: Heard) -> float:
+    return K * (x - max(one for _, one, _ in heard))
+
+
+def of_least_pull(x: float, v: float, f: float, t: float, heard: Heard) -> float:
+    return min(K * (x - x_j) * abs(x_j) / 0.01 + B * v for _, x_j, _ in heard)
+
+
+def of_memory_and_time(x: float, v: float, f: float, t: float, heard: Heard) -> float:
+    pulls = [(w, K * (x - x_j) + f / 4 + LIMIT * math.sin(100 * t)) for w, x_j, _ in heard]
+    return sum(w * max(-LIMIT, min(LIMIT, pull)) for w, pull in pulls)
+
+
+LIMITED = "max(-limit, min(limit, stiffness*(x - others.x) + damping*(v - others.v)))"
+FORCES: dict[str, tuple[str, Force]] = {
+    "sum": (f"sum({LIMITED})", of_sum),
+    "mean": (f"mean({LIMITED})", of_mean),
+    "max": ("stiffness*(x - max(others.x))", of_largest),
+    "min": ("min(stiffness*(x - others.x)*abs(others.x)/scale + damping*v)", of_least_pull),
+    "memory": (
+        "sum(max(-limit, min(limit, stiffness*(x - others.x) + previous(f)/4 + limit*sin(rate*time))))",
+        of_memory_and_time,
+    ),
+}
+
+COMPONENT = """\
+component: Odd
+about: A coupling that looks at each peer by itself.
+connectors: {object: Flange}
+sends: {x: sample(object.x), v: sample(der(object.x))}
+parameters:
+  stiffness: {unit: N/m, min: 0}
+  damping:   {unit: N*s/m, min: 0}
+  limit:     {unit: N, default: 1.5 N}
+  scale:     {unit: m, default: 10 mm}
+  rate:      {unit: 1/s, default: 100 1/s}
+  clock: clock
+  link: link
+  delay:     {unit: s, min: 0, default: 0 s}
+variables:
+  x: {unit: m}
+  v: {unit: m/s}
+  f: {unit: N, start: 0 N}
+equations:
+  - x = sample(object.x)
+  - v = sample(der(object.x))
+  - f = FORCE
+  - object.f = hold(f, delay)
+"""
+X = (0.01, -0.004, 0.007, -0.012)
+
+
+def scene(folder: Path, force: str, link: str = "delay: 8 ms") -> CompiledSystem:
+    """Return two near and two far peers whose bodies pull each other."""
+    (folder / "parts").mkdir(exist_ok=True)
+    (folder / "parts" / "odd.yaml").write_text(COMPONENT.replace("FORCE", force), encoding="utf-8")
+    text = f"""\
+topology: pairs
+clocks: {{haptic: 1 ms, network: 8 ms}}
+library: parts
+peers:
+  near: {{set: {{body.x: [10 mm, -4 mm]}}}}
+  far:  {{set: {{body.x: [7 mm, -12 mm]}}}}
+masses:
+  body: {{mass: 0.1 kg, damping: 5 N*s/m}}
+couplers:
+  pull:
+    {{type: Odd, object: body, stiffness: 500 N/m, damping: 2 N*s/m, clock: haptic, delay: 1 ms, link: lan}}
+links:
+  lan: {{clock: network, {link}}}
+"""
+    (folder / "scene.yaml").write_text(text, encoding="utf-8")
+    return compile_topology(folder / "scene.yaml")
+
+
+Ways = Mapping[tuple[int, int], float]  # the weight of each (sender, receiver)
+COMPLETE: Ways = {(i, j): 1.0 for i in range(4) for j in range(4) if i != j}
+
+
+def by_hand(
+    force: Force, ways: Ways, late: Callable[[int, int, int], tuple[int, bool]], *, zero: bool = False
+) -> NDArray[np.float64]:
+    """Return every body's x and v at each ms; `late` says which packet counts on a way at a tick."""
+    motion = [(x, 0.0) for x in X]
+    start = list(motion)
+    sent: list[list[tuple[float, float]]] = [[] for _ in X]
+    acting = [0.0] * 4
+    rows = []
+    for tick in range(int(DURATION / MS) + 1):
+        rows.append([one for m in motion for one in m])
+        if tick % 8 == 0:
+            for i, m in enumerate(motion):
+                sent[i].append(m)
+        computed = []
+        for j, m in enumerate(motion):
+            heard = []
+            for (i, receiver), weight in ways.items():
+                if receiver == j:
+                    number, missing = late(i, j, tick)
+                    packet = sent[i][number] if number >= 0 else start[i]
+                    heard.append((weight, *(m if missing and zero else packet)))
+            computed.append(force(*m, acting[j], tick / 1000, heard))
+        motion = [coast(*m, -f, 0.1, 5.0, 0.001) for m, f in zip(motion, acting, strict=True)]
+        acting = computed  # each acts a tick after it was computed
+    return np.array(rows)
+
+
+def punctual(delays: Callable[[int, int], int]) -> Callable[[int, int, int], tuple[int, bool]]:
+    return lambda i, j, tick: (max(-1, (tick - delays(i, j)) // 8), False)
+
+
+def check(system: CompiledSystem, expected: NDArray[np.float64], seed: int = 0) -> None:
+    found = simulate(system, duration=DURATION, signals=["body.*"], jit=False, seed=seed)
+    assert np.abs(expected).max() > 0.01
+    # Velocities of some 0.1 m/s, 300 steps: what rounding leaves, 1e-12 of them.
+    np.testing.assert_allclose(found.values, expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", FORCES)
+@pytest.mark.parametrize("delay", [0, 3, 8, 21])
+def test_each_pair_is_what_looking_at_every_packet_gives(tmp_path: Path, name: str, delay: int) -> None:
+    text, force = FORCES[name]
+    system = scene(tmp_path, text, f"delay: {delay} ms")
+    check(system, by_hand(force, COMPLETE, punctual(lambda i, j: delay)))
+
+
+@pytest.mark.parametrize("name", FORCES)
+def test_pairs_of_groups_have_delays_of_their_own(tmp_path: Path, name: str) -> None:
+    text, force = FORCES[name]
+    system = scene(tmp_path, text, "delay: 8 ms, delays: {near: {far: 19 ms}, far: {near: 2 ms}}")
+
+    def delays(i: int, j: int) -> int:
+        return 8 if i // 2 == j // 2 else 19 if i < j else 2
+
+    check(system, by_hand(force, COMPLETE, punctual(delays)))
+
+
+ARCS: Ways = {(0, 1): 0.5, (2, 1): 2.0, (3, 1): 1.0, (1, 0): 1.0, (3, 2): 3.0, (0, 3): 0.25, (1, 3): 1.5}
+GRAPHS: dict[str, Ways] = {
+    "ring": {(i, j): 1.0 for i in range(4) for j in ((i + 1) % 4, (i - 1) % 4)},
+    "star": {(i, j): 1.0 for i in range(4) for j in range(4) if (i == 0) != (j == 0)},
+    f"{{arcs: [{', '.join(f'[{i + 1}, {j + 1}, {w}]' for (i, j), w in ARCS.items())}]}}": ARCS,
+}
+
+
+@pytest.mark.parametrize("name", FORCES)
+@pytest.mark.parametrize("graph", GRAPHS)
+def test_only_those_who_hear_each_other_are_looked_at(tmp_path: Path, name: str, graph: str) -> None:
+    text, force = FORCES[name]
+    check(
+        scene(tmp_path, text, f"delay: 8 ms, graph: {graph}"),
+        by_hand(force, GRAPHS[graph], punctual(lambda i, j: 8)),
+    )
+
+
+@pytest.mark.parametrize("name", FORCES)
+@pytest.mark.parametrize(
+    ("more", "graph"),
+    [
+        ("loss: {p: 10 %, r: 30 %}", "ring"),
+        ("loss: 30 %, on_loss: zero", ""),
+        ("loss: 20 %, jitter: 9 ms, distribution: normal, reorder: all, on_loss: zero", "star"),
+    ],
+)
+def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, more: str, graph: str) -> None:
+    text, force = FORCES[name]
+    system = scene(tmp_path, text, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
+    law = channel_law(system, system.links[0], 8 * MS)
+    ways = GRAPHS[graph] if graph else COMPLETE
+    late = {way: PacketSource(law, "lan", *way, seed=3).take(50).tolist() for way in ways}
+
+    def packet(i: int, j: int, tick: int) -> tuple[int, bool]:
+        return effective(late[i, j], tick, newest="all" not in more)
+
+    check(system, by_hand(force, ways, packet, zero="zero" in more), seed=3)
+
+
+def test_peers_that_are_not_recorded_are_heard_all_the_same(tmp_path: Path) -> None:
+    system = scene(tmp_path, FORCES["sum"][0])
+    whole = simulate(system, duration=DURATION)
+    part = simulate(system, duration=DURATION, signals=["near[2].body.x", "far[1].pull.f"])
+    for one in part.signals:
+        assert np.abs(part[one.name] - whole[one.name]).max() < 1e-15
+
+
+def test_a_mesh_whose_limit_is_never_reached_is_a_full_mesh() -> None:
+    start = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm], cube.x: [2 mm, 0 mm, 1 mm]}}"
+    text = replaced(MESH, ("{count: 3}", start))
+    mesh = simulate(compiled(text), duration=Fraction(1))
+    for limit, alike in (("5 kN", True), ("0.1 N", False)):
+        odd = compiled(replaced(text, ("type: FullMesh", f"type: SaturatedMesh, limit: {limit}")))
+        apart = np.abs(simulate(odd, duration=Fraction(1)).values - mesh.values).max()
+        assert (apart < 1e-12 * np.abs(mesh.values).max()) == alike
+
+
+def test_machine_code_gives_the_same(tmp_path: Path) -> None:
+    system = scene(tmp_path, FORCES["min"][0])
+    one, two = (simulate(system, duration=DURATION, jit=jit) for jit in (True, False))
+    assert np.abs(one.values - two.values).max() < 1e-13
+
+
+def test_nobody_has_no_maximum(tmp_path: Path) -> None:
+    system = scene(tmp_path, FORCES["max"][0], "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
+    with pytest.raises(ApcError, match=r"E801 far\[2\] hears nobody over lan: there is no max over nobody"):
+        prepare(system, DURATION)
+
+
+def test_so_many_pairs_that_the_memory_would_not_hold_them_are_refused() -> None:
+    with pytest.raises(ApcError, match="E874 10000 peers"):
+        prepare(edged(paper(peers=10_000)), DURATION)
