@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.runtime.blocks import Block, blocks
 from apc.runtime.methods import finer
 from apc.runtime.signals import Signal
-from apc.runtime.simulation import Block, Simulation, blocks, prepare
+from apc.runtime.simulation import Simulation, prepare
 
 Floats = NDArray[np.float64]
 

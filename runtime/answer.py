@@ -123,13 +123,30 @@ def answer(
         notes = (*notes, compared.not_repeated)
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
-        sensitivities=sensitivities(system, prepared=prepared),
-        margins=margins(system, prepared=prepared),
+        sensitivities=_sensitivities(system, prepared, found),
+        margins=_margins(system, prepared),
         contact_modes=modes,
         conventions=compared,
         detailed=every_convention,
         box=prove_box(system, box) if box else None,
     )
+
+
+def _sensitivities(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:
+    """Return what moves the spectral radius most, or only why it couldn't be had."""
+    try:
+        return sensitivities(system, prepared=prepared)
+    except ApcError as error:
+        note = f"what moves it most: not looked for: {error.mistakes[0].sentence}"
+        return Sensitivities(found.spectral_radius, (), (), note)
+
+
+def _margins(system: CompiledSystem, prepared: Prepared) -> Margins:
+    """Return the margins, or only why they couldn't be had."""
+    try:
+        return margins(system, prepared=prepared)
+    except ApcError as error:
+        return Margins((), f"not looked for: {error.mistakes[0].sentence}")
 
 
 def _contact_modes(system: CompiledSystem, prepared: Prepared) -> tuple[ContactModes | None, tuple[str, ...]]:

@@ -29,11 +29,12 @@ from apc.compiler.errors import ApcError
 from apc.runtime.analysis import Analysis, analyze
 from apc.runtime.balls import precision
 from apc.runtime.bench_reference import PRECISIONS, Truth, exact_course, spectral_truth
+from apc.runtime.blocks import blocks
 from apc.runtime.discretize import UNIT
 from apc.runtime.methods import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method
 from apc.runtime.paper import analyze_paper
 from apc.runtime.parameters import resolve
-from apc.runtime.simulation import Simulation, blocks, prepare
+from apc.runtime.simulation import Simulation, prepare
 from apc.runtime.threads import single_threaded
 
 Floats = NDArray[np.float64]

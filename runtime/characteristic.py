@@ -35,7 +35,7 @@ POWER_STEPS, FLOOR, TINY = 4, 1e-12, 1e-300
 
 # Steps of Newton's method, none longer than this share of |ζ|; the relative step at which it has arrived, and
 # that from which on rounding alone moves it. Nobody looks for a zero beyond the last.
-STEPS, LONGEST, ARRIVED, NEAR, FARTHEST = 60, 0.1, 1e-15, 1e-6, 1e6
+STEPS, LONGEST, ARRIVED, NEAR, FARTHEST = 40, 0.1, 1e-15, 1e-6, 1e6
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 # Modes listed of each system; of many peers fewer, as the shares of all peers are worked out for each.
-LISTED, LISTED_OF_MANY, MANY = 6, 1, 20_000
+LISTED, LISTED_OF_MANY, MANY = 5, 1, 20_000
 
 # Poles of a crowd's sites that zeros are looked for close to.
 NEAR_POLES = 6

@@ -29,8 +29,9 @@ from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted
+from apc.runtime.blocks import blocks
 from apc.runtime.methods import DEFAULT, Method
-from apc.runtime.simulation import Simulation, blocks, prepare
+from apc.runtime.simulation import Simulation, prepare
 from apc.runtime.summary import Watch
 from apc.runtime.threads import single_threaded
 

@@ -134,7 +134,7 @@ def _parameter_margins(
     here = family.matrices(base[None])
     largest = max((one.shape[1] for one in here), default=0)
     if largest > MOST_STATES:
-        return f"not looked for: a system of {largest} states takes too long (apc critical does)"
+        return f"not looked for: {largest} states take too long (apc critical does)"
     if not all(np.isfinite(one).all() for one in here):
         return "not looked for: the present values have no frame matrix of their own"
     if not max((float(np.abs(np.linalg.eigvals(one)).max(initial=0.0)) for one in here), default=0.0) < 1:

@@ -207,11 +207,7 @@ def _plan_crowds(
         )
         return Plan(method, (), (), False, ((1, states),), ("all peers as one sparse matrix",))
     rows = len(
-        {
-            (exchange.role(place), sent)
-            for place, schedule in enumerate(schedules)
-            for sent in schedule.sent
-        }
+        {(exchange.role(place), sent) for place, schedule in enumerate(schedules) for sent in schedule.sent}
     )
     note = "peers of different numbers, by one determinant of what is sent in a frame"
     return Plan(method, (), (), False, ((1, rows),), (note,))

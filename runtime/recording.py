@@ -17,8 +17,9 @@ import tempfile
 from pathlib import Path
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.blocks import Block
 from apc.runtime.formats import WRITERS
-from apc.runtime.simulation import Block, Simulation
+from apc.runtime.simulation import Simulation
 from apc.runtime.trajectory import provenance_of
 
 SUFFIXES = tuple(WRITERS)

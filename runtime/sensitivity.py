@@ -143,6 +143,8 @@ def _differentiate(
     names = [one.name for one in family.closed_at(here[0].tolist())]
     if len(names) != len(pairs):  # all systems as blocks of one
         names = ["all systems"] * len(pairs)
+    if not all(np.isfinite(matrix[0]).all() for matrix, _ in pairs):
+        return Sensitivities(0.0, (), (), NO_MATRIX)
     clusters = [
         (place, cluster)
         for place, (matrix, _) in enumerate(pairs)
@@ -247,7 +249,7 @@ def sensitivity_report(found: Sensitivities) -> str:
     """Return the table "what moves it most", of at most 80 columns."""
     shown = [row for row in found.rows if row.derivative][:SHOWN]
     if not shown:
-        return f"  {found.note or 'no parameter moves the spectral radius'}"
+        return _wrapped(found.note or "no parameter moves the spectral radius")
     width = max(len(row.parameter) for row in shown)
     lines = ["  what moves it most" + " " * max(width - 16, 2) + "value            per percent"]
     for row in shown:
@@ -255,5 +257,9 @@ def sensitivity_report(found: Sensitivities) -> str:
         value = with_unit(f"{row.value:.6g}", row.unit)
         lines.append(f"  {row.parameter:<{width}}  {value:<16} {row.relative / 100:+.2e}{mode}")
     if found.note:
-        lines.append(f"  {found.note}")
+        lines.append(_wrapped(found.note))
     return "\n".join(lines)
+
+
+def _wrapped(note: str) -> str:
+    return textwrap.fill(note, 80, initial_indent="  ", subsequent_indent="    ")

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import wrapped
+from apc.runtime.blocks import Block
 from apc.runtime.signals import Signal
-from apc.runtime.simulation import Block, Simulation
+from apc.runtime.simulation import Simulation
 
 Floats = NDArray[np.float64]
 
@@ -171,7 +172,8 @@ class Watch:
             if largest is None
             else (signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest])),
             copies=_copies(self.simulation.system, signals, self.last),
-            work=tuple(zip(self.simulation.parts, block.work.tolist(), strict=True)),
+            # Of a motion without bound the work is as meaningless as it is large.
+            work=() if block.stopped else tuple(zip(self.simulation.parts, block.work.tolist(), strict=True)),
             rows=self.rows,
             signals=len(signals),
             end=end,

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.accuracy import ErrorEstimate, compare_with, error_text
+from apc.runtime.blocks import Block, blocks
 from apc.runtime.flow import Tolerance
 from apc.runtime.methods import DEFAULT, EXACT, Method
 from apc.runtime.signals import Signal
-from apc.runtime.simulation import Block, Simulation, blocks, prepare
+from apc.runtime.simulation import Simulation, prepare
 from apc.runtime.summary import Summary, Watch, summary_text
 
 Floats = NDArray[np.float64]
@@ -385,7 +386,7 @@ def parse_duration(text: str) -> Fraction:
     # Imported here: reading a unit brings in pint, which a scene's own duration does not need.
     from apc.compiler.units import quantity
 
-    return Fraction(quantity(text, Place("--duration"), what="the duration", unit="s").value)
+    return Fraction(quantity(text, Place("--duration"), what="duration", unit="s").value)
 
 
 def duration_of(system: CompiledSystem, duration: Fraction | None) -> Fraction:

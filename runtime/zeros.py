@@ -10,8 +10,9 @@ Does not: find every zero.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,9 +118,10 @@ def find_zeros(
         zeros = _search(function, float(np.abs(poles).max(initial=1.0)), zeros, poles, rigid_radius)
     rigid_radius = _widened(function, zeros, rigid, rigid_radius)
     zeros = _distinct(zeros, rigid_radius)
+    error_of = cache(partial(_zero_error, function))
     largest, high, beyond = 0.0, 0.0, -1
     for _ in range(SEARCHES):
-        largest, error = _largest(function, zeros, exact)
+        largest, error = _largest(zeros, exact, error_of)
         high, beyond = _outside(function, largest, error, rigid, rigid_radius)
         if beyond <= 0:
             break
@@ -128,7 +130,7 @@ def find_zeros(
         if len(grown) == len(zeros):
             break
         zeros = grown
-    found = [Zero(complex(zero), _zero_error(function, complex(zero)), 1) for zero in zeros[:listed]]
+    found = [Zero(zero, error_of(zero), 1) for zero in zeros[:listed].tolist()]
     known = [one for one in (*found, *exact) if np.isfinite(one.error)]
     every = sorted(known, key=lambda one: -abs(one.value))[:listed]
     low = max([0.0, *(abs(one.value) - one.error for one in every)])
@@ -137,11 +139,13 @@ def find_zeros(
     return Zeros(low, high, tuple(every), not beyond, rigid_radius < WIDEST)
 
 
-def _largest(function: Characteristic, zeros: Complexes, exact: Sequence[Zero]) -> tuple[float, float]:
+def _largest(
+    zeros: Complexes, exact: Sequence[Zero], error_of: Callable[[complex], float]
+) -> tuple[float, float]:
     """Return the magnitude of the largest eigenvalue so far, and its error."""
     largest = max(exact, key=lambda one: abs(one.value), default=None)
     if len(zeros) and (largest is None or abs(zeros[0]) >= abs(largest.value)):
-        return float(abs(zeros[0])), _zero_error(function, complex(zeros[0]))
+        return float(abs(zeros[0])), error_of(complex(zeros[0]))
     return (abs(largest.value), largest.error) if largest else (0.0, 0.0)
 
 

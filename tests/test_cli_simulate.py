@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from apc.__main__ import run
-from apc.runtime import simulation
+from apc.runtime import blocks, simulation
 from tests.topologies import AVERAGE, SCENES, replaced
 
 MOVED = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: 5 mm}}"))
@@ -65,7 +65,7 @@ def test_json_is_one_document_with_what_made_it(capsys: pytest.CaptureFixture[st
     ("words", "said"),
     [
         ([], "three-users-average: E877 the scene says no duration."),
-        (["--duration", "3"], "--duration: E204 the duration wants s, got 3 (no unit)."),
+        (["--duration", "3"], "--duration: E204 duration wants s, got 3 (no unit). Write: duration: 3 s"),
         (["--duration", "-1 s"], "three-users-average: E877 the duration wants more than 0 s, got -1 s."),
         (["--duration", "1 s", "--signals", "cube.y"], "three-users-average: E873 no signal fits 'cube.y';"),
         (["--duration", "1 s", "--out", "run.doc"], "run.doc: E878 the suffix of --out wants one of .csv,"),
@@ -105,14 +105,14 @@ def test_ctrl_c_keeps_what_is_done(
 ) -> None:
     scene(MOVED)
     monkeypatch.setattr(simulation, "MOST_FRAMES", 5)
-    step = simulation._Runner.run
+    step = blocks._Runner.run
 
-    def interrupted(self: simulation._Runner, first: int, last: int) -> simulation.Block:
+    def interrupted(self: blocks._Runner, first: int, last: int) -> blocks.Block:
         if first >= 10:
             raise KeyboardInterrupt
         return step(self, first, last)
 
-    monkeypatch.setattr(simulation._Runner, "run", interrupted)
+    monkeypatch.setattr(blocks._Runner, "run", interrupted)
     assert run(["simulate", "--duration", "1 s", "--out", "run.csv"]) == 130
     out, err = capsys.readouterr()
     assert "run.csv is written" in out

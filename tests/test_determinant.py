@@ -236,7 +236,7 @@ def _count_by_samples(p: Any, q: Any, s: Any, frames: int, found: Analysis) -> N
     for sign, shape in ((1, "common"), (-1, "difference")):
         sizes = sorted({mode.magnitude for mode in found.modes if mode.shape == shape}, reverse=True)
         radius = (sizes[0] + sizes[1]) / 2
-        points = radius * np.exp(2j * np.pi * (np.arange(2**16) + 0.5) / 2**16)
+        points = radius * np.exp(2j * np.pi * (np.arange(2**17) + 0.5) / 2**17)
         shifted = points[:, None, None] * np.eye(len(blocks[0])) - blocks[0]
         answer = blocks[2] @ np.linalg.solve(shifted, blocks[1].astype(complex))
         value = np.linalg.det(np.eye(2) - sign * points[:, None, None] ** -frames * answer)

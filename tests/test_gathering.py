@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
+from apc.runtime.blocks import blocks
 from apc.runtime.packets import PacketSource, channel_law
-from apc.runtime.simulation import Simulation, blocks, prepare
+from apc.runtime.simulation import Simulation, prepare
 from tests.eventwise import MS, Play, User, coast, contact, pull
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 

@@ -354,6 +354,19 @@ def test_encoder_quantization_rounds_down_to_whole_steps_and_passes_forces(x: fl
     assert rates(system, {}, [6.0])["device.v"] == pytest.approx(-6 / 2, rel=EXACT)
 
 
+@pytest.mark.parametrize(
+    "part",
+    [
+        "encoder: {type: EncoderQuantization, flange: device, resolution: 0.5 mm}\n"
+        "  pull: {type: SampledSpringDamper, a: encoder.measured, b: ground, stiffness: 90 N/m, clock: tick}",
+        "rub: {type: CoulombViscousFriction, a: device, b: ground, coulomb: 2 N, threshold: 1 mm/s}",
+    ],
+)
+def test_what_jumps_or_bends_is_analysed_about_the_start(part: str) -> None:
+    found = apc.analyze(compiled(f"{ONE_MASS}{CLOCK}couplers:\n  {part}\n"))
+    assert found.linearized
+
+
 # ---- coordination ----
 
 

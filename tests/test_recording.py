@@ -17,8 +17,9 @@ import scipy.io
 
 from apc.compiler.errors import ApcError
 from apc.runtime import formats
+from apc.runtime.blocks import Block, blocks
 from apc.runtime.recording import SUFFIXES, open_recording
-from apc.runtime.simulation import Block, Simulation, blocks, prepare
+from apc.runtime.simulation import Simulation, prepare
 from apc.runtime.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
 

@@ -13,7 +13,9 @@ from apc.runtime.batch import BatchEvaluator
 from apc.runtime.evaluator import evaluator
 from apc.runtime.parameters import Free, Override, apply
 from apc.runtime.sensitivity import sensitivities, sensitivity_report
-from tests.topologies import AVERAGE, compiled, replaced
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
+
+FINGER = (SCENES / "finger.yaml").read_text(encoding="utf-8")
 
 
 def test_derivatives_are_central_differences_in_50_digits() -> None:
@@ -104,3 +106,12 @@ def test_time_and_start_values_and_the_number_of_peers_are_left_out() -> None:
         *("device.mass", "device.damping", "cube.mass", "cube.damping"),
         *("contact.stiffness", "contact.damping", "coordination.stiffness", "coordination.damping"),
     }
+
+
+def test_a_damping_of_nothing_has_the_derivative_of_what_it_adds_up_with() -> None:
+    """A finger's tip and the device it holds move as one: their dampings act as their sum, at 0 as elsewhere."""
+    found = {row.parameter: row for row in sensitivities(compiled(FINGER)).rows}
+    nothing, whole = found["finger.tip.damping"], found["device.damping"]
+    assert nothing.value == 0
+    assert nothing.derivative == pytest.approx(whole.derivative, rel=1e-7)
+    assert all(np.isfinite([row.derivative, row.error]).all() for row in found.values())

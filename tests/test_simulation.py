@@ -12,9 +12,10 @@ import pytest
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis import analyze, lifted_groups
+from apc.runtime.blocks import blocks
 from apc.runtime.methods import Method
 from apc.runtime.modes import dense
-from apc.runtime.simulation import blocks, prepare
+from apc.runtime.simulation import prepare
 from apc.runtime.trajectory import Trajectory, simulate
 from tests.eventwise import MS, Play, User, experiment, play
 from tests.sites import alone, paper

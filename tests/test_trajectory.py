@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from fractions import Fraction
@@ -199,3 +200,14 @@ def test_playing_a_compiled_model_needs_no_algebra_units_or_pictures(tmp_path: P
     run("compile")
     heavy = {"sympy", "pint", "matplotlib", "pandas", "pyarrow", "scipy.io"}
     assert not heavy & set(run("simulate scene.apc --json").split())
+
+
+def test_a_motion_without_bound_is_told_without_nan() -> None:
+    """Forces times speeds leave the range of floats halfway: that ends neither the run nor the document."""
+    groups = "  a: {count: 1, set: {device.x: 1 mm}}\n  b: {count: 2}\n"
+    text = replaced(AVERAGE, ("  user: {count: 3}\n", groups), ("stiffness: 500 N/m", "stiffness: 9000 N/m"))
+    found = simulate(compiled(text), duration=Fraction(40), jit=False)
+    assert found.summary.verdict == "diverges"
+    assert found.summary.stopped_at is not None
+    assert found.summary.stopped_at > 15  # half of it is when the work leaves the range
+    json.dumps(found.to_dict(), allow_nan=False)

@@ -1,3 +1,4 @@
+# ruff: noqa: E501 -- scenes are written by long lines
 """Random scenes, each verdict and bound against 256-bit arithmetic: `python -m tests.bench.random_scenes`.
 
 Graphs, clocks, delays, groups and couplings are drawn, and for each such structure numbers over many decades.
@@ -170,12 +171,16 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",)) -> Ta
             system = apply(plain, drawn)
             known = None
             for method in methods:
+                values = ", ".join(f"{one.name}={float(one.value)!r}" for one in drawn)
                 began = time.perf_counter()
                 try:
                     found = analyze(system, method=method)
                 except ApcError as error:
                     assert error.mistakes[0].code in ("E806", "E850"), error
                     tally.refused += 1
+                    continue
+                except Exception as error:  # whatever it is, it is a bug
+                    tally.wrong.append(f"{method}: {error!r}\n{text}{values}")
                     continue
                 tally.seconds += time.perf_counter() - began
                 known = known or truth(system)
@@ -188,7 +193,6 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",)) -> Ta
                     tally.tightest = max(tally.tightest, off / found.spectral_radius_error)
                 wrong = check(found, *known)
                 if wrong:
-                    values = ", ".join(f"{one.name}={float(one.value)!r}" for one in drawn)
                     tally.wrong.append(f"{method}: {wrong}\n{text}{values}")
     return tally
 

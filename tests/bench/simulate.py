@@ -18,8 +18,9 @@ import numpy as np
 from scipy.linalg import expm
 
 from apc.runtime.analysis import analyze, lifted_groups
+from apc.runtime.blocks import blocks
 from apc.runtime.modes import dense
-from apc.runtime.simulation import blocks, prepare
+from apc.runtime.simulation import prepare
 from apc.runtime.threads import single_threaded
 from apc.runtime.trajectory import simulate
 from tests.eventwise import experiment, play

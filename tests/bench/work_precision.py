@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.runtime.blocks import blocks
 from apc.runtime.methods import Method
-from apc.runtime.simulation import blocks, prepare
+from apc.runtime.simulation import prepare
 from apc.runtime.threads import single_threaded
 from tests.topologies import compiled
 

@@ -1,0 +1,134 @@
+"""The paper's scene asked of other programs for the same answer: `python -m tests.bench.comparison`.
+
+Each is asked for the spectral radius of one frame, without the eigenvalue 1 of the common translation; times
+and errors stand side by side, the error against fifty digits.
+
+    apc             compiled before; the analysis alone
+    NumPy by hand   SciPy's exponential of one user, a frame of eight ticks, users joined by hand
+    textbook        the same with (1 − e^(−bT/m)) m/b instead of an exponential
+    python-control  the plants sampled by its `c2d`; it has no systems of several rates, so that the frame is
+                    again joined by hand
+
+Where an eigenvalue has to be told from 1 by its distance, as by all but apc, it is the one nearest to 1.
+FMPy and PathSim simulate and know no spectral radius; Drake's simulation is compared in `tests.bench.drake`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import statistics
+import time
+from collections.abc import Callable
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+import apc
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis import analyze
+from apc.runtime.bench_reference import Truth, spectral_truth
+from apc.runtime.threads import single_threaded
+from tests.topologies import AVERAGE, compiled
+
+Floats = NDArray[np.float64]
+
+ROUNDS = 15
+TICK, TICKS, USERS = 1e-3, 8, 3
+DEVICE, CUBE = 0.1, 0.2  # kg
+K_C, K_T = 1000.0, 500.0  # N/m
+# Damping of device and cube, in N·s/m: the paper's, and one at which the textbook's form loses its digits.
+DAMPINGS = (5.0, 1e-6)
+
+
+def by_exponential(mass: float, damping: float) -> Floats:
+    """Return [F G] (2, 3) of a damped mass over a tick."""
+    return np.asarray(expm(np.array([[0, 1, 0], [0, -damping / mass, 1 / mass], [0, 0, 0]]) * TICK)[:2])
+
+
+def by_textbook(mass: float, damping: float) -> Floats:
+    """Return the same by the closed form."""
+    decay = math.exp(-damping * TICK / mass)
+    rise = (1 - decay) / damping
+    return np.array([[1, mass * rise, (TICK - mass * rise) / damping], [0, decay, rise]])
+
+
+def by_control(mass: float, damping: float) -> Floats:
+    """Return the same by python-control."""
+    import control
+
+    plant = control.ss([[0, 1], [0, -damping / mass]], [[0], [1 / mass]], np.eye(2), np.zeros((2, 1)))
+    sampled = control.c2d(plant, TICK, "zoh")
+    return np.hstack([sampled.A, sampled.B])
+
+
+def radius(step: Callable[[float, float], Floats], damping: float) -> float:
+    """Return the spectral radius of a frame of all users over (x, v, x_O, v_O, F_C, F_T, packet)."""
+    device, cube = step(DEVICE, damping), step(CUBE, damping)
+    tick = np.zeros((7, 7))
+    tick[:2, :2], tick[:2, 4] = device[:, :2], -device[:, 2]
+    tick[2:4, 2:4], tick[2:4, 4], tick[2:4, 5] = cube[:, :2], cube[:, 2], -cube[:, 2]
+    tick[4, [0, 2]] = K_C, -K_C
+    tick[5, 2] = K_T
+    tick[6, 6] = 1
+    hears = np.zeros((7, 7))
+    hears[5, 6] = -K_T
+    mean = (np.ones((USERS, USERS)) - np.eye(USERS)) / (USERS - 1)
+    fast = np.kron(np.eye(USERS), tick) + np.kron(mean, hears)
+    frame = np.linalg.matrix_power(fast, TICKS)
+    for user in range(USERS):  # the packet of the frame's start is heard in the next
+        frame[7 * user + 6] = 0
+        frame[7 * user + 6, 7 * user + 2] = 1
+    values = np.linalg.eigvals(frame)
+    return float(np.abs(np.delete(values, np.argmin(np.abs(values - 1)))).max())
+
+
+def compare(damping: float, rounds: int = ROUNDS) -> dict[str, tuple[float, float]]:
+    """Return (median seconds, error) by program, all taking turns."""
+    system = scene(damping)
+    truth = spectral_truth(system)
+    assert isinstance(truth, Truth)
+    calls: dict[str, Callable[[], float]] = {
+        "apc": lambda: analyze(system).spectral_radius,
+        "NumPy by hand": lambda: radius(by_exponential, damping),
+        "textbook": lambda: radius(by_textbook, damping),
+    }
+    if importlib.util.find_spec("control"):
+        calls["python-control"] = lambda: radius(by_control, damping)
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    found: dict[str, float] = {}
+    with single_threaded():
+        for _ in range(rounds):
+            for name, call in calls.items():
+                began = time.perf_counter()
+                found[name] = call()
+                times[name].append(time.perf_counter() - began)
+    exact = Fraction(truth.digits)
+    return {
+        name: (statistics.median(times[name]), float(abs(Fraction(found[name]) - exact))) for name in calls
+    }
+
+
+def scene(damping: float) -> CompiledSystem:
+    """Return the paper's scene with another damping of device and cube."""
+    value = f"{damping!r} N*s/m"
+    return apc.set_parameters(compiled(AVERAGE), {"device.damping": value, "cube.damping": value})
+
+
+def main() -> None:
+    """Print a table for each damping."""
+    for damping in DAMPINGS:
+        print(f"spectral radius of the paper's scene, damping {damping:g} N·s/m\n")
+        print("  program              median      ratio      error")
+        table = compare(damping)
+        for name, (seconds, error) in table.items():
+            print(f"  {name:<16} {1e3 * seconds:8.3f} ms {seconds / table['apc'][0]:10.3f} {error:10.1e}")
+        print()
+    if not importlib.util.find_spec("control"):
+        print("python-control is left out: it is not installed (pip install control)")
+
+
+if __name__ == "__main__":
+    main()
