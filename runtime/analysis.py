@@ -215,15 +215,17 @@ def _solve_crowds(
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve peers that all differ."""
     listed = crowds(system, prepared.jacobians, prepared.schedules, numbers)
+    rounded = "what rounding does to the peers' own motion is estimated here, not bounded"
+    notes = (rounded,) if any(crowd.lifted.estimated for crowd in listed) else ()
     if method == "krylov":
         motions = common_translation(listed, exchange)
         spectrum = solve_sparse(listed, exchange, motions)
         free = "peers move freely one by one, or the first as not all others do: left open"
-        return spectrum, () if motions is not None else (free,)
+        return spectrum, notes if motions is not None else (*notes, free)
     rigid = count_translations(listed, exchange)
     spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
     free = "the first peer moves freely in a way that not all others do: left open"
-    return spectrum, () if rigid is not None else (free,)
+    return spectrum, notes if rigid is not None else (*notes, free)
 
 
 def lifted_groups(

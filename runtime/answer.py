@@ -23,6 +23,9 @@ from apc.runtime.margins import Margins, margins
 from apc.runtime.paper import analyze_paper
 from apc.runtime.sensitivity import Sensitivities, sensitivities
 
+# More peers than this on a graph make more systems than can be differentiated in passing.
+MOST_ON_A_GRAPH = 100
+
 
 @dataclass(frozen=True, slots=True)
 class Answer:
@@ -124,7 +127,7 @@ def answer(
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
         sensitivities=_sensitivities(system, prepared, found),
-        margins=_margins(system, prepared),
+        margins=_margins(system, prepared, found),
         contact_modes=modes,
         conventions=compared,
         detailed=every_convention,
@@ -134,19 +137,30 @@ def answer(
 
 def _sensitivities(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:
     """Return what moves the spectral radius most, or only why it couldn't be had."""
+    if _is_large(system, found):
+        note = "what moves it most: not looked for in so large a population"
+        return Sensitivities(found.spectral_radius, (), (), note)
     try:
         return sensitivities(system, prepared=prepared)
     except ApcError as error:
-        note = f"what moves it most: not looked for: {error.mistakes[0].sentence}"
+        note = f"what moves it most: not looked for: {error.mistakes[0].what}"
         return Sensitivities(found.spectral_radius, (), (), note)
 
 
-def _margins(system: CompiledSystem, prepared: Prepared) -> Margins:
+def _is_large(system: CompiledSystem, found: Analysis) -> bool:
+    """Say whether the population is more than few small matrices, which are what is differentiated."""
+    complete = all(link.graph.shape == "complete" for link in system.links)
+    return found.method in ("determinant", "krylov") or (not complete and system.peers > MOST_ON_A_GRAPH)
+
+
+def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Margins:
     """Return the margins, or only why they couldn't be had."""
+    if _is_large(system, found):
+        return Margins((), "not looked for in so large a population")
     try:
         return margins(system, prepared=prepared)
     except ApcError as error:
-        return Margins((), f"not looked for: {error.mistakes[0].sentence}")
+        return Margins((), f"not looked for: {error.mistakes[0].what}")
 
 
 def _contact_modes(system: CompiledSystem, prepared: Prepared) -> tuple[ContactModes | None, tuple[str, ...]]:

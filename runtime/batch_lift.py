@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from apc.runtime.discretize import UNIT
 from apc.runtime.lift import COEFFICIENT_ROUNDINGS
-from apc.runtime.linearize import LinearSite, SiteJacobians, magnitudes, sites_of_rows
+from apc.runtime.linearize import LinearSite, SiteJacobians, every_matrix, magnitudes, sites_of_rows
 from apc.runtime.schedule import Act, Propagate, Schedule, Send, Tick, Value
 
 Floats = NDArray[np.float64]
@@ -26,6 +26,10 @@ Matrix = NDArray[Any]  # float64 or complex128
 
 # Sites composed together: their matrices then stay in the cache of a processor.
 CHUNK = 2048
+
+# A bound on a frame's rounding errors above this decides nothing: they are estimated then, from so many
+# frames of numbers moved at random by all roundings of a frame at once, and so many times what that changes.
+HOPELESS, SHAKES, SAFE = 1e-6, 2, 8.0
 
 # With ‖X‖ ≤ 1/2 the Taylor series of φ₁ is right to 2^−60 after so many terms: (1/2)^16/17! < 2^−64.
 TERMS = 16
@@ -45,6 +49,7 @@ class LiftedRows:
     q_error: Floats
     s_error: Floats
     d_error: Floats
+    estimated: bool = False  # the errors of some site are an estimate, as the bound says nothing
 
 
 def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRows:
@@ -62,11 +67,13 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
     Notes
     -----
     As in `lift`, errors multiply along the composition of magnitudes; a step of `exponential_rows` counts
-    with the roundings it reports.
+    with the roundings it reports. Where stiffness and damping nearly cancel over many ticks that grows
+    without measure, whatever the errors are: beyond `HOPELESS` they are estimated, see `_shaken`.
     """
     n_z = len(site.kind.states) + len(schedule.carried)
     durations = sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
     parts: list[tuple[Floats, Floats, Floats, Floats]] = []
+    estimated = False
     for start in range(0, len(rows), CHUNK):
         many = sites_of_rows(site, rows[start : start + CHUNK])
         steps, sizes, charges = {}, {}, {}
@@ -78,7 +85,10 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
         z_large, s_large = compose_rows(magnitudes(many), schedule, sizes)
         roundings = _roundings(many, schedule, charges)
         gamma = roundings * UNIT / (1 - roundings * UNIT)
-        parts.append((z, s, gamma * z_large, gamma * s_large))
+        errors = gamma * z_large, gamma * s_large
+        if not all(float(one.max(initial=0.0)) <= HOPELESS for one in errors):
+            errors, estimated = _shaken(many, schedule, steps, (z, s), roundings), True
+        parts.append((z, s, *errors))
     z, s, z_error, s_error = (np.concatenate(part) for part in zip(*parts, strict=True))
     return LiftedRows(
         z_names=(*(state.name for state in site.kind.states), *schedule.value_names),
@@ -91,7 +101,40 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
         q_error=z_error[..., n_z:],
         s_error=s_error[..., :n_z],
         d_error=s_error[..., n_z:],
+        estimated=estimated,
     )
+
+
+def _shaken(
+    site: LinearSite,
+    schedule: Schedule,
+    steps: Mapping[int, Matrix],
+    frame: tuple[Matrix, Matrix],
+    size: float,
+) -> tuple[Floats, Floats]:
+    """Estimate a frame's rounding errors: how much it moves when every number it is made of moves a little.
+
+    Parameters
+    ----------
+    site, schedule, steps
+        What the frame is composed of.
+    frame
+        The frame as it came out.
+    size
+        All its roundings, in units of UNIT: by so much each number is moved, at random.
+    """
+    random = np.random.default_rng(len(schedule.events))
+
+    def moved(matrix: Matrix) -> Matrix:
+        return np.asarray(matrix * (1 + size * UNIT * random.uniform(-1, 1, matrix.shape)))
+
+    errors = [size * UNIT * np.abs(one) for one in frame]
+    for _ in range(SHAKES):
+        other = compose_rows(
+            every_matrix(site, moved), schedule, {duration: moved(step) for duration, step in steps.items()}
+        )
+        errors = [np.maximum(e, SAFE * np.abs(a - b)) for e, a, b in zip(errors, frame, other, strict=True)]
+    return errors[0], errors[1]
 
 
 def _roundings(site: LinearSite, schedule: Schedule, charges: Mapping[int, float]) -> float:

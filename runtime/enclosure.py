@@ -135,6 +135,8 @@ def _enclose(
                 rows[cluster] = np.linalg.qr(rows[cluster].T)[0].T
         held = independent_places(rows)
         free = np.delete(free, held)
+        if len(free) != n - large:  # vectors too alike to tell apart
+            return worst
         try:
             basis[np.ix_(held, np.arange(large, n))] = -np.linalg.solve(rows[:, held], rows[:, free])
         except np.linalg.LinAlgError:

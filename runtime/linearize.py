@@ -408,8 +408,13 @@ def rational_floats(site: LinearSite) -> LinearSite:
 
 def magnitudes(site: LinearSite) -> LinearSite:
     """Return the site with every entry replaced by its absolute value, a leading axis or none."""
+    return every_matrix(site, np.abs)
+
+
+def every_matrix(site: LinearSite, change: Callable[[Matrix], Matrix]) -> LinearSite:
+    """Return the site with every matrix changed, a leading axis or none."""
     channels = [tick.channels for tick in site.ticks]
-    return _assemble(site.kind, site.affine, [np.abs(matrix) for matrix in _matrices(site)], channels)
+    return _assemble(site.kind, site.affine, [change(matrix) for matrix in _matrices(site)], channels)
 
 
 def _matrices(site: LinearSite) -> list[Matrix]:

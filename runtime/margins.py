@@ -12,6 +12,7 @@ a delay by a hold or link that waits for it.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -190,7 +191,7 @@ def _margin(name: str, unit: str, present: float, crossing: Crossing | None, sca
 def margins_report(found: Margins) -> str:
     """Return the table of the margins, of at most 80 columns."""
     if not found.rows:
-        return f"  margins {found.note or 'none: there is nothing to vary'}"
+        return _wrapped(f"margins {found.note or 'none: there is nothing to vary'}")
     width = max(len(one.parameter) for one in found.rows)
     lines = [f"  {'may grow':<{width}}  from           to               times  at"]
     for one in found.rows:
@@ -204,5 +205,9 @@ def margins_report(found: Margins) -> str:
         jump = ", jump" if one.kind == "jump" else ""
         lines.append(f"{name}{start:<14} {end:<16} {times:>5}  {one.frequency_hz:.4g} Hz{jump}")
     if found.note:
-        lines.append(f"  {found.note}")
+        lines.append(_wrapped(found.note))
     return "\n".join(lines)
+
+
+def _wrapped(note: str) -> str:
+    return textwrap.fill(note, 80, initial_indent="  ", subsequent_indent="    ")

@@ -159,10 +159,14 @@ def _propagate(kind: Kind, x: Floats, u: Floats, p: Floats, duration: float) -> 
     n = len(x)
     constant = _vector(kind.derivative(np.zeros(n), u, p, 0.0))
     block = np.zeros((n + 1, n + 1))
+    # At rest without forces: beside large ones the rates of small displacements would be lost to rounding.
+    at_rest = _vector(kind.derivative(np.zeros(n), 0 * u, p, 0.0))
     for column, unit in enumerate(np.eye(n)):
-        block[:n, column] = _vector(kind.derivative(unit, u, p, 0.0)) - constant
-    block[:n, n] = constant
-    return np.asarray(expm(block * duration) @ np.append(x, 1.0))[:n]
+        block[:n, column] = _vector(kind.derivative(unit, 0 * u, p, 0.0)) - at_rest
+    # A large force beside small rates would make the exponential halve its argument too often for its digits.
+    size = float(np.abs(constant).max(initial=0.0)) or 1.0
+    block[:n, n] = constant / size
+    return np.asarray(expm(block * duration) @ np.append(x, size))[:n]
 
 
 def _vector(result: Any) -> Floats:

@@ -12,6 +12,7 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -44,6 +45,8 @@ WORST = 1e8
 
 # Rows of the table.
 SHOWN = 6
+
+NO_MATRIX = "what moves it most: not looked for: the present values have no frame matrix of their own"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from apc.compiler.pipeline import compile_topology
 from apc.runtime.analysis import analyze
 from apc.runtime.answer import answer, judge
 from apc.runtime.box import parse_range
+from apc.runtime.parameters import apply, parse_override
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
 FLIPS = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"
@@ -73,3 +74,20 @@ def test_packet_loss_is_said_to_be_out_of_the_verdict(tmp_path: Path) -> None:
     path.write_text(replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 2 %}")), encoding="utf-8")
     notes = " ".join(analyze(compile_topology(path)).notes)
     assert "lan" in notes and "apc simulate" in notes
+
+
+def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not() -> None:
+    system = compile_topology(SCENES / "three-users-average.yaml")
+    late = apply(system, [parse_override(system, "lan.delay=8 s")])
+    found = answer(late)
+    assert found.analysis.verdict == analyze(late).verdict
+    text = str(found)
+    assert "what moves it most: not looked for: 3 peers make one system of 2,006" in text
+    assert "margins not looked for" in text
+    assert all(len(line) <= 80 for line in text.splitlines())
+
+
+def test_numbers_that_leave_the_range_of_floats_beside_the_verdict_are_said_so() -> None:
+    system = compile_topology(SCENES / "three-users-average.yaml")
+    text = str(answer(apply(system, [parse_override(system, "device.mass=1e-300 kg")])))
+    assert "what moves it most: not looked for: the present values have no frame" in text

@@ -11,6 +11,7 @@ from apc.runtime.batch_lift import exponential_rows
 from apc.runtime.discretize import UNIT, discretize
 from apc.runtime.lift import lift
 from apc.runtime.linearize import linearize_exact, linearize_rows, site_of_row
+from apc.runtime.parameters import Override, apply
 from tests.populations import crowded, different
 from tests.sites import MS
 
@@ -48,3 +49,20 @@ def test_exponentials_are_within_their_bound_of_ball_arithmetic(decay: float) ->
     step, size, charge = exponential_rows(a[None], b[None], 0.01)
     assert np.all(np.abs(step[0] - truth.matrix) <= charge * UNIT * size[0] + UNIT * truth.size)
     assert np.all(charge * UNIT * size[0] < 1e-10)
+
+
+def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
+    """A copy of a tenth of a gram: magnitudes grow without measure over a frame, the errors don't."""
+    system = apply(different(6), [Override("cube.mass", None, Fraction(1, 10**4))])
+    [crowd], _ = crowded(system)
+    assert crowd.lifted.estimated
+    for row, vector in enumerate(crowd.parameters):
+        site = site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, vector[None])[0])
+        alone = lift(
+            site, crowd.schedule, exact=linearize_exact(crowd.jacobians, vector)
+        )  # Arb's exponentials
+        for name in NAMES:
+            apart = np.abs(getattr(crowd.lifted, name)[row] - getattr(alone, name))
+            estimate = getattr(crowd.lifted, f"{name}_error")[row]
+            assert np.all(apart <= estimate)
+            assert estimate.max() < 1e-8 * max(1.0, np.abs(getattr(alone, name)).max())

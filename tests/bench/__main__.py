@@ -1,0 +1,108 @@
+"""Every figure of this folder's page by one command: `python -m tests.bench` writes README.md beside it.
+
+`--quick` takes smaller runs of each, `--only NAME` one or more of them, and then writes nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from apc.runtime.bench import machine
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+AVERAGE = "models/scenes/three-users-average.yaml"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A section of the page: its title, the words after `python -m`, and those of a quick run."""
+
+    name: str
+    title: str
+    words: tuple[str, ...]
+    quick: tuple[str, ...] | None = None
+
+    def command(self, quick: bool) -> tuple[str, ...]:
+        """Return the words after `python -m`."""
+        return self.quick if quick and self.quick is not None else self.words
+
+
+def _own(name: str, *words: str) -> tuple[str, ...]:
+    return f"tests.bench.{name}", *words
+
+
+PARTS = (
+    Part("process", "Whole processes", _own("process"), _own("process", "--runs", "3")),
+    Part(
+        "scenes",
+        "The default against the front, on every scene",
+        _own("scenes"),
+        _own("scenes", "--rounds", "3"),
+    ),
+    Part("bench", "Speed against error on the paper's scene", ("apc", "bench", AVERAGE)),
+    Part("hard", "Hard cases", ("apc", "bench", "--hard", "tests/hard")),
+    Part("scale", "More peers", ("apc", "bench", AVERAGE, "--scale", "3,30,300,3000,30000,1e6")),
+    Part("random", "Random scenes", _own("random_scenes"), _own("random_scenes", "--points", "200")),
+    Part("comparison", "Other programs", _own("comparison")),
+    Part("drake", "Drake", _own("drake")),
+    Part("work_precision", "Methods of simulation", _own("work_precision")),
+    Part("simulate", "Simulation", _own("simulate"), _own("simulate", "--quick")),
+    Part("language", "Compiling", _own("language"), _own("language", "--quick")),
+    Part("populations", "Populations", _own("populations"), _own("populations", "--quick")),
+    Part("critical", "Critical values", _own("critical")),
+    Part("region", "Regions", _own("region"), _own("region", "--quick")),
+    Part("map", "The paper's map", _own("map"), _own("map", "--points", "400")),
+    Part("sweep", "Sweeps", _own("sweep"), _own("sweep", "--points", "5000", "--kills", "1")),
+)
+
+
+def run(part: Part, quick: bool) -> str:
+    """Return a section of the page."""
+    words = part.command(quick)
+    began = time.perf_counter()
+    ran = subprocess.run(
+        [sys.executable, "-m", *words], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    taken = time.perf_counter() - began
+    shown = " ".join(words if words[0] == "apc" else ("python", "-m", *words))
+    text = ran.stdout.rstrip() or ran.stderr.rstrip()
+    end = "" if ran.returncode == 0 else f"\n\nIt ended with code {ran.returncode}."
+    return f"## {part.title}\n\n`{shown}` ({taken:.0f} s)\n\n```text\n{text}\n```{end}\n"
+
+
+def main() -> None:
+    """Run the parts and write the page."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="smaller runs")
+    parser.add_argument(
+        "--only", action="append", choices=[part.name for part in PARTS], help="may be repeated"
+    )
+    given = parser.parse_args()
+    sections = []
+    for part in PARTS:
+        if given.only and part.name not in given.only:
+            continue
+        sections.append(run(part, given.quick))
+        print(sections[-1], flush=True)
+    if given.only:
+        return
+    where = "\n".join(f"| {name} | {value} |" for name, value in machine().items() if value)
+    command = "python -m tests.bench" + (" --quick" if given.quick else "")
+    day = datetime.now(tz=UTC).date().isoformat()
+    head = (
+        "# Figures\n\nSpeed against error, as last measured. This makes them again and writes this page:\n\n"
+        f"    {command}\n\nA part of it: `python -m tests.bench --only hard`. Measured on {day}:\n\n"
+        f"| | |\n|---|---|\n{where}\n"
+    )
+    (HERE / "README.md").write_text("\n".join([head, *sections]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

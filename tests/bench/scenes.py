@@ -1,0 +1,48 @@
+"""Whether the default is on the Pareto front of every scene of models/: `python -m tests.bench.scenes`."""
+
+from __future__ import annotations
+
+import argparse
+
+from apc.compiler.pipeline import compile_topology
+from apc.runtime.bench import FAILED, bench
+from tests.topologies import SCENES
+
+
+def main() -> None:
+    """Print a line a scene and task; exit 1 if a default is off the front, a bound does not hold or a method fails."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.scenes", description=__doc__)
+    parser.add_argument("--rounds", type=int, default=15)
+    rounds = parser.parse_args().rounds
+    print(f"{'scene':<20} {'task':<9} {'chosen':<12} {'median':>9} {'error':>9} {'bound':>9}  front")
+    failed = 0
+    for path in sorted(SCENES.glob("*.yaml")):
+        for one in bench(compile_topology(path), rounds=rounds).comparisons:
+            chosen = one.chosen
+            assert chosen is not None
+            error, bound = (f"{v:.1e}" if v is not None else "–" for v in (chosen.error, chosen.bound))
+            others = ", ".join(m.name for m in one.measured if m.front and not m.chosen)
+            where = (
+                f"yes, with {others}"
+                if chosen.front and others
+                else "yes"
+                if chosen.front
+                else f"NO: {others}"
+            )
+            print(
+                f"{path.stem:<20} {one.task:<9} {chosen.name:<12} {1e3 * chosen.seconds:6.2f} ms "
+                f"{error:>9} {bound:>9}  {where}",
+                flush=True,
+            )
+            failed += not chosen.front
+            wrong = [note for note in one.notes if note.startswith("WRONG")]
+            wrong += [f"{name} {why}" for name, why in one.refused if why.startswith(FAILED)]
+            failed += len(wrong)
+            for line in wrong:
+                print(f"  {line}")
+    print("every default is on the front, every bound holds" if not failed else f"{failed} FAILED")
+    raise SystemExit(bool(failed))
+
+
+if __name__ == "__main__":
+    main()
