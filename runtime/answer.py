@@ -23,8 +23,8 @@ from apc.runtime.margins import Margins, margins
 from apc.runtime.paper import analyze_paper
 from apc.runtime.sensitivity import Sensitivities, sensitivities
 
-# More peers than this on a graph make more systems than can be differentiated in passing.
-MOST_ON_A_GRAPH = 100
+# More peers than this, that differ or stand on a graph, are more than can be differentiated in passing.
+FEW_PEERS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,8 @@ def _sensitivities(system: CompiledSystem, prepared: Prepared, found: Analysis) 
 def _is_large(system: CompiledSystem, found: Analysis) -> bool:
     """Say whether the population is more than few small matrices, which are what is differentiated."""
     complete = all(link.graph.shape == "complete" for link in system.links)
-    return found.method in ("determinant", "krylov") or (not complete and system.peers > MOST_ON_A_GRAPH)
+    apart = found.method in ("determinant", "krylov") or not complete
+    return apart and system.peers > FEW_PEERS
 
 
 def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Margins:
