@@ -341,15 +341,19 @@ def pareto_front(measured: Sequence[Measured]) -> tuple[Measured, ...]:
     """Mark what no other is better than in both ways, and sort by time.
 
     Faster is what is faster by more than both spreads; more right, what errs less by more than luck (`SAME`).
-    Without errors the fastest are the front.
+    Without errors there is no front.
     """
     return tuple(
-        replace(one, front=not any(_beats(other, one) for other in measured if other is not one))
+        replace(
+            one,
+            front=one.error is not None
+            and not any(_beats(other, one) for other in measured if other.error is not None),
+        )
         for one in sorted(measured, key=lambda one: one.seconds)
     )
 
 
 def _beats(one: Measured, other: Measured) -> bool:
     faster = one.seconds + one.spread + other.spread < other.seconds
-    mine, its = (max(m.error if m.error is not None else 0.0, SAME) for m in (one, other))
+    mine, its = (max(m.error or 0.0, SAME) for m in (one, other))
     return (faster and mine <= its) or (mine < its and one.seconds <= other.seconds)

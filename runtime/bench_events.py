@@ -359,6 +359,7 @@ def _common(periods: Sequence[Fraction]) -> Fraction:
 
 
 def ticks_between(phase: Fraction, period: Fraction, start: Fraction, end: Fraction) -> set[Fraction]:
+    """Return the ticks of a clock in [start, end)."""
     first = math.ceil((start - phase) / period)
     return {phase + k * period for k in range(first, math.ceil((end - phase) / period))}
 

@@ -38,7 +38,8 @@ def _task(found: Comparison) -> str:
             f"  {one.name:<22} {_time(one.seconds):>11} {_time(one.spread):>10} "
             f"{_size(one.error):>10} {_size(one.bound):>10} {marks}".rstrip()
         )
-    lines += ["", "  * nothing here is both faster and more right (the Pareto front)"]
+    if _known(found):
+        lines += ["", "  * nothing here is both faster and more right (the Pareto front)"]
     lines.append(_filled(_choice(found)))
     lines.append(
         _filled(f"reference: {found.reference}" if _known(found) else f"no reference: {found.reference}")
@@ -56,7 +57,10 @@ def _choice(found: Comparison) -> str:
     chosen: Measured | None = found.chosen
     if chosen is None:
         return f"what {found.task} chooses is none of these"
-    where = "which is on the front" if chosen.front else "which is NOT on the front"
+    if chosen.error is None:
+        where = "which can't be judged without a reference"
+    else:
+        where = "which is on the front" if chosen.front else "which is NOT on the front"
     return f"{found.task} chooses {chosen.name}, {where}"
 
 

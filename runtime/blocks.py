@@ -224,7 +224,7 @@ class _Runner:
         return values
 
     def _in_range(self) -> bool:
-        """Say whether all that moves, recorded or not, is still a number; the work that was done may not be."""
+        """Say whether all that moves, recorded or not, is still a number; the work done may not be."""
         for g, one in enumerate(self.state):
             if g < len(self.simulation.population.members):
                 layout = self.simulation.population.members[g].program.layout

@@ -89,8 +89,22 @@ def some_rows(lifted: LiftedRows, places: slice | Integers) -> LiftedRows:
 
 def rows_of(lifted: LiftedSite, count: int) -> LiftedRows:
     """Return `count` copies of one lifted site."""
-    blocks = (np.broadcast_to(getattr(lifted, name), (count, *getattr(lifted, name).shape)) for name in ROWS)
-    return LiftedRows(lifted.z_names, lifted.frame_s, *blocks)
+
+    def copies(matrix: Floats) -> Floats:
+        return np.broadcast_to(matrix, (count, *matrix.shape))
+
+    return LiftedRows(
+        z_names=lifted.z_names,
+        frame_s=lifted.frame_s,
+        p=copies(lifted.p),
+        q=copies(lifted.q),
+        s=copies(lifted.s),
+        d=copies(lifted.d),
+        p_error=copies(lifted.p_error),
+        q_error=copies(lifted.q_error),
+        s_error=copies(lifted.s_error),
+        d_error=copies(lifted.d_error),
+    )
 
 
 def lift_one(crowd: Crowd, row: int) -> LiftedSite:

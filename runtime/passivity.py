@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 UNITS = {"K": "N/m", "B": "N*s/m", "b": "N*s/m", "T": "s", "t_d": "s", "c": "N", "D": "m"}
 MEANINGS = {
     "K": "stiffness of the virtual wall",
-    "B": "its damping, on the backward difference of positions",
+    "B": "damping of the virtual wall, on the backward difference of positions",
     "b": "physical damping of the device",
     "T": "sampling period",
     "t_d": "delay of the loop beyond the sample and hold",

@@ -25,6 +25,7 @@ from apc.runtime.spectrum import Mode
 
 MOST_ROWS = 16
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
+LARGE = 1e4  # a larger magnitude needs another notation to fit its column
 MOVES_WIDTH = 30  # what the other columns leave of 80
 
 _WORDS = {
@@ -148,7 +149,7 @@ def _mode_table(modes: tuple[Mode, ...]) -> str:
     table.add_column("moves most", max_width=MOVES_WIDTH)
     for mode in shown:
         table.add_row(
-            f"{mode.magnitude:.6f}",
+            f"{mode.magnitude:.6f}" if mode.magnitude < LARGE else f"{mode.magnitude:.6e}",
             mode.shape,
             str(mode.multiplicity),
             f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–",

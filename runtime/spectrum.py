@@ -41,7 +41,8 @@ DEADBEAT = 1e-12
 # An angle that no eigenvalue kept as two floats has unless it is real: their unit roundoff.
 STRAIGHT = 2.0**-53
 
-# Angles up to here are half a turn the other way, which rounding or the sign of a zero made of a change of sign.
+# Angles up to here are half a turn the other way, which rounding or the sign of a zero made of a change
+# of sign.
 HALF_TURN_BACK = -np.pi * (1 - 2.0**-40)
 
 

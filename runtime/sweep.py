@@ -105,7 +105,7 @@ class Sweep:
         messages = Counter(cell for cell in self.columns[-1].tolist() if cell)
         if messages:
             text, count = messages.most_common(1)[0]
-            lines.append(f"  at {count:,} of them: {text}")
+            lines += wrapped(f"at {count:,} of them: {text}", "  ", "    ")
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
 
@@ -153,6 +153,10 @@ def sweep(
     ]
     grid = build_grid(axes)
     quantity = find_quantity(system, of)
+    for axis in grid.axes:
+        if axis.label == of.partition(":")[2].strip():
+            what = f"{axis.label} is swept: there is nothing to look for at one value of it"
+            raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
     if out is not None:
         check_table_path(out)
     if jobs is not None and jobs < 1:

@@ -65,10 +65,7 @@ def test_a_box_beyond_the_limit_is_unstable_at_a_point_and_one_below_it_is_stabl
     assert above.stable is False
     [point] = above.point
     assert 1096.41 < point <= 1096.5
-    assert (
-        analyze(apply(system, [Override("coordination.stiffness", None, Fraction(point))])).stable
-        is False
-    )
+    assert analyze(apply(system, [Override("coordination.stiffness", None, Fraction(point))])).stable is False
     assert "proved unstable at" in str(above)
 
 

@@ -16,7 +16,19 @@ from apc.__main__ import run
 from tests.topologies import AVERAGE, MESH
 
 COMMANDS = (
-    *("new", "check", "compile", "show", "analyze", "critical", "region", "simulate", "sweep", "schema"),
+    *(
+        "new",
+        "check",
+        "compile",
+        "show",
+        "analyze",
+        "critical",
+        "region",
+        "simulate",
+        "sweep",
+        "bench",
+        "schema",
+    ),
 )
 
 

@@ -32,6 +32,11 @@ def test_a_frame_stepped_and_lifted_agrees_to_rounding(values: dict[str, Any]) -
     assert check_frame(system) < 1e-13
 
 
+def test_forces_of_1e17_newtons_leave_the_slow_rates_their_digits() -> None:
+    """A contact of 1e8 N/m at 1 kHz throws a device about by its own rounding, and nothing else."""
+    assert check_frame(paper(kc=1e8)) < 1e-13
+
+
 def test_a_wrong_lift_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoiled(*arguments: Any) -> LiftedSite:
         lifted = lift(*arguments)

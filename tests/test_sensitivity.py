@@ -109,7 +109,7 @@ def test_time_and_start_values_and_the_number_of_peers_are_left_out() -> None:
 
 
 def test_a_damping_of_nothing_has_the_derivative_of_what_it_adds_up_with() -> None:
-    """A finger's tip and the device it holds move as one: their dampings act as their sum, at 0 as elsewhere."""
+    """A finger's tip and the device it holds move as one: their dampings act as their sum, at 0 too."""
     found = {row.parameter: row for row in sensitivities(compiled(FINGER)).rows}
     nothing, whole = found["finger.tip.damping"], found["device.damping"]
     assert nothing.value == 0

@@ -7,7 +7,8 @@ Run it from the project's folder: `python -m tests.bench.work_precision [--plot 
     arm             an arm holds a device that pushes a tool by a spring, forces at ticks: linear
 
 The error is that of the positions, relative to the way they go, against the exact motion where there is one
-and CVODES at 1e-14 elsewhere; that of the exact motion is what its roundings amount to. The time is that of the run, without preparing it, as a part of real time.
+and CVODES at 1e-14 elsewhere; that of the exact motion is what its roundings amount to. The time is that of
+the run, without preparing it, as a part of real time.
 """
 
 from __future__ import annotations
