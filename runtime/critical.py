@@ -150,7 +150,7 @@ def _refuse_moving_start(system: CompiledSystem, prepared: Prepared) -> None:
     """Refuse a delay of a scene whose matrices don't follow from its parameters in closed form."""
     used = [prepared.jacobians[group.kind] for group in system.groups]
     if not all(site.affine and not site.edges for site in used):
-        what = "is linearized at its start: the critical value of a delay can't be searched"
+        what = "the scene is linearized at its start: the critical value of a delay can't be searched"
         raise ApcError(
             Mistake("E845", Place(system.name), what, hint="apc critical of a stiffness or damping")
         )
@@ -170,18 +170,18 @@ def _check_limits(system: CompiledSystem, free: Free, limits: Sequence[float | N
     low, high = limits
     least = 0.0 if timed else parameter_of(system, free).minimum
     most = None if timed else parameter_of(system, free).maximum
+    unit = "s" if timed else parameter_of(system, free).unit
     for value in (low, high):
         if value is not None and (
             (least is not None and value < least) or (most is not None and value > most)
         ):
             expected = f"at least {least:g}" if least is not None and value < least else f"at most {most:g}"
-            raise ApcError(Mistake("E843", _PLACE, f"a limit of {free.name}", expected, f"{value:g}"))
+            what, got = f"a limit of {free.name}", with_unit(f"{value:g}", unit)
+            raise ApcError(Mistake("E843", _PLACE, what, with_unit(expected, unit), got))
     bottom = low if low is not None else (least or 0.0)
     if high is not None and not high > bottom:
-        got = f"{bottom:g} to {high:g}"
-        raise ApcError(
-            Mistake("E842", _PLACE, f"{free.name} needs a range", "an upper limit above the lower", got)
-        )
+        what, got = f"the range of {free.name}", with_unit(f"{bottom:g} to {high:g}", unit)
+        raise ApcError(Mistake("E842", _PLACE, what, "an upper limit above the lower", got))
 
 
 def _chosen(found: Search, present: float) -> Crossing | None:

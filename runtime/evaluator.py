@@ -37,6 +37,9 @@ DIFFERENCE = 2.0**-17
 # to the square root of 1e-15, and ten times that.
 DRIFT = 1e-6
 
+# The blocks of a point that has no matrix.
+NOTHING = [np.full((1, 1), np.nan)]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointEvaluator:
@@ -55,39 +58,36 @@ class PointEvaluator:
 
         All of a matrix is NaN where there is none: below a parameter's minimum, say.
         """
-        blocks = [self._blocks(value) for value in values]
-        size = max((sum(len(one) for one in listed) for listed in blocks), default=0)
-        found = np.zeros((len(values), size, size))
-        found[[not all(np.isfinite(one).all() for one in listed) for listed in blocks]] = np.nan
-        for matrix, listed in zip(found, blocks, strict=True):
-            if np.isnan(matrix).any():
-                continue
-            start = 0
-            for one in listed:
-                rows = slice(start, start + len(one))
-                matrix[rows, rows] = one
-                start = rows.stop
-        return (found,)
+        return (_filled_up([self._blocks(value) for value in values]),)
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return the matrices (k, n, n) and their derivatives along directions (k, m).
 
-        At the end of what a parameter may be the derivative is that of the parabola through two points
-        further inside; NaN where there is none.
+        At the end of what a parameter may be, or of where the same motions are free, the derivative is that
+        of the parabola through two points further inside; NaN where there is none.
         """
         scale = np.where(values == 0, 1.0, np.maximum(np.abs(values), 1e-6))  # 0 has none: its unit's
         step = DIFFERENCE * np.where(along != 0, scale, np.inf).min(axis=1) / np.abs(along).max(axis=1)
         moved = step[:, None] * along
-        (all_of_them,) = self.matrices(np.concatenate([values, values - moved, values + moved]))
-        here, before, after = np.split(all_of_them, 3)
+        points = np.concatenate([values, values - moved, values + moved])
+        blocks = [self._blocks(value) for value in points]
+        here, before, after = np.split(_filled_up(blocks), 3)
         slope = (after - before) / (2 * step[:, None, None])
-        for row in np.flatnonzero(~np.isfinite(slope).all(axis=(1, 2))):
-            way = 1.0 if np.isfinite(after[row]).all() else -1.0
-            far = values[row] + way * np.outer([1.0, 2.0], moved[row])
-            (inside,) = self.matrices(np.concatenate([values[row : row + 1], far]))
-            if inside.shape[1] == slope.shape[1]:
-                first, second, third = inside
-                slope[row] = way * (4 * second - 3 * first - third) / (2 * step[row])
+        shapes = [[len(one) for one in listed] for listed in blocks]
+        count = len(values)
+        for row in range(count):
+            if shapes[row] == shapes[count + row] == shapes[2 * count + row]:
+                continue
+            slope[row] = np.nan
+            way = 1.0 if shapes[row] == shapes[2 * count + row] else -1.0
+            inside = [self._blocks(value) for value in values[row] + way * np.outer([1.0, 2.0], moved[row])]
+            if all([len(one) for one in listed] == shapes[row] for listed in inside):
+                _, second, third = _filled_up([blocks[row], *inside])
+                size = len(second)
+                slope[row] = 0.0
+                slope[row, :size, :size] = (
+                    way * (4 * second - 3 * here[row, :size, :size] - third) / (2 * step[row])
+                )
         return ((here, slope),)
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
@@ -103,7 +103,7 @@ class PointEvaluator:
         try:
             systems = self.closed_at(value.tolist())
         except ApcError:
-            return [np.full((1, 1), np.nan)]
+            return NOTHING
         found = []
         for system in systems:
             free = find_rigid_modes(system, with_drifts=False)
@@ -112,6 +112,28 @@ class PointEvaluator:
                 reduced = _reduced(system, find_rigid_modes(system))
             found.append(reduced)
         return found
+
+
+def keeps_size(matrices: Sequence[Floats]) -> bool:
+    """Say whether the largest relative motion keeps its size, to rounding: it may be free here only."""
+    radius = max((float(np.abs(np.linalg.eigvals(one)).max(initial=0.0)) for one in matrices), default=0.0)
+    return abs(radius - 1) < DRIFT
+
+
+def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
+    """Return the blocks of each point as one matrix (k, n, n), all of it NaN where a block is."""
+    size = max((sum(len(one) for one in listed) for listed in blocks), default=0)
+    found = np.zeros((len(blocks), size, size))
+    for matrix, listed in zip(found, blocks, strict=True):
+        if not all(np.isfinite(one).all() for one in listed):
+            matrix[:] = np.nan
+            continue
+        start = 0
+        for one in listed:
+            rows = slice(start, start + len(one))
+            matrix[rows, rows] = one
+            start = rows.stop
+    return found
 
 
 def _reduced(system: ClosedSystem, free: RigidModes) -> Floats:

@@ -12,22 +12,26 @@ a delay by a hold or link that waits for it.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.words import wrapped
 from apc.runtime.analysis import Prepared, prepare
+from apc.runtime.batch import BatchEvaluator
 from apc.runtime.crossings import scan
 from apc.runtime.delays import delay_now
-from apc.runtime.evaluator import evaluator, free_parameters
+from apc.runtime.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size
 from apc.runtime.parameters import Free, parameter_of
 from apc.runtime.search import Crossing, Line, proved_crossing, search_delay, spread
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
+
+Floats = NDArray[np.float64]
 
 # Units of a stiffness and of a damping, as components write them.
 UNITS = ("N/m", "kg/s^2", "N*s/m", "kg/s")
@@ -138,12 +142,15 @@ def _parameter_margins(
         return f"not looked for: {largest} states take too long (apc critical does)"
     if not all(np.isfinite(one).all() for one in here):
         return "not looked for: the present values have no frame matrix of their own"
-    if not max((float(np.abs(np.linalg.eigvals(one)).max(initial=0.0)) for one in here), default=0.0) < 1:
+    lines = [Line(family, base, column) for column in range(len(free))]
+    if keeps_size(here) and not base.all():
+        family, lines = _apart(system, free, base, prepared)
+        here = family.matrices(base[None, base != 0])
+    if not _radius(here) < 1:
         return "none: the scene is not stable as it is"
     found = []
-    for column, one in enumerate(free):
-        line = Line(family, base, column)
-        present = float(base[column])
+    for one, line in zip(free, lines, strict=True):
+        present = float(line.base[line.column])
         if all(not slope.any() for _, slope in line.course(np.array([present]))):
             continue  # nothing depends on it
         scale = line.scale()
@@ -159,6 +166,29 @@ def _parameter_margins(
         reached = float(scanned.points[-1]) if len(scanned.points) else present
         found.append(_margin(one.label, parameter_of(system, one).unit, present, crossing, reached))
     return found
+
+
+def _apart(
+    system: CompiledSystem, free: Sequence[Free], base: Floats, prepared: Prepared
+) -> tuple[BatchEvaluator | PointEvaluator, list[Line]]:
+    """Return the evaluator of the parameters that aren't 0, and lines on which each that is varies alone.
+
+    What a stiffness of 0 leaves free is no relative motion of the scene as it is, but one of every scene in
+    which it varies.
+    """
+    some = [one for one, value in zip(free, base, strict=True) if value]
+    family = evaluator(system, some, prepared=prepared)
+    lines = []
+    for column, one in enumerate(free):
+        if base[column]:
+            lines.append(Line(family, base[base != 0], some.index(one)))
+        else:
+            lines.append(Line(evaluator(system, [one], prepared=prepared), np.zeros(1), 0))
+    return family, lines
+
+
+def _radius(matrices: Sequence[Floats]) -> float:
+    return max((float(np.abs(np.linalg.eigvals(one)).max(initial=0.0)) for one in matrices), default=0.0)
 
 
 def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, pieces: int) -> Margin:
@@ -191,7 +221,8 @@ def _margin(name: str, unit: str, present: float, crossing: Crossing | None, sca
 def margins_report(found: Margins) -> str:
     """Return the table of the margins, of at most 80 columns."""
     if not found.rows:
-        return _wrapped(f"margins {found.note or 'none: there is nothing to vary'}")
+        text = f"margins {found.note or 'none: there is nothing to vary'}"
+        return "\n".join(wrapped(text, "  ", "    "))
     width = max(len(one.parameter) for one in found.rows)
     lines = [f"  {'may grow':<{width}}  from           to               times  at"]
     for one in found.rows:
@@ -205,9 +236,5 @@ def margins_report(found: Margins) -> str:
         jump = ", jump" if one.kind == "jump" else ""
         lines.append(f"{name}{start:<14} {end:<16} {times:>5}  {one.frequency_hz:.4g} Hz{jump}")
     if found.note:
-        lines.append(_wrapped(found.note))
+        lines += wrapped(found.note, "  ", "    ")
     return "\n".join(lines)
-
-
-def _wrapped(note: str) -> str:
-    return textwrap.fill(note, 80, initial_indent="  ", subsequent_indent="    ")

@@ -12,7 +12,6 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import with_unit
+from apc.compiler.words import with_unit, wrapped
 from apc.runtime.analysis import Prepared, prepare
 from apc.runtime.batch import BatchEvaluator, Evaluator, matrix_errors
 from apc.runtime.discretize import UNIT
-from apc.runtime.evaluator import DIFFERENCE, evaluator, free_parameters
+from apc.runtime.evaluator import DIFFERENCE, evaluator, free_parameters, keeps_size
 from apc.runtime.parameters import Free, parameter_of
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
@@ -124,8 +123,15 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         free = _without_starts(system)
-        family = evaluator(system, free, prepared=prepared or prepare(system))
+        prepared = prepared or prepare(system)
+        family = evaluator(system, free, prepared=prepared)
         here = np.array([[parameter_of(system, one).value for one in free]])
+        # What a stiffness of 0 leaves free is no relative motion of the scene as it is: it is not among those
+        # that vary then, having no derivative there.
+        matrices = family.matrices(here)
+        if not here.all() and all(np.isfinite(one).all() for one in matrices) and keeps_size(matrices):
+            free = [one for one, value in zip(free, here[0], strict=True) if value]
+            family, here = evaluator(system, free, prepared=prepared), here[:, here[0] != 0]
         return _differentiate(system, family, free, here)
 
 
@@ -252,7 +258,7 @@ def sensitivity_report(found: Sensitivities) -> str:
     """Return the table "what moves it most", of at most 80 columns."""
     shown = [row for row in found.rows if row.derivative][:SHOWN]
     if not shown:
-        return _wrapped(found.note or "no parameter moves the spectral radius")
+        return "\n".join(wrapped(found.note or "no parameter moves the spectral radius", "  ", "    "))
     width = max(len(row.parameter) for row in shown)
     lines = ["  what moves it most" + " " * max(width - 16, 2) + "value            per percent"]
     for row in shown:
@@ -260,9 +266,5 @@ def sensitivity_report(found: Sensitivities) -> str:
         value = with_unit(f"{row.value:.6g}", row.unit)
         lines.append(f"  {row.parameter:<{width}}  {value:<16} {row.relative / 100:+.2e}{mode}")
     if found.note:
-        lines.append(_wrapped(found.note))
+        lines += wrapped(found.note, "  ", "    ")
     return "\n".join(lines)
-
-
-def _wrapped(note: str) -> str:
-    return textwrap.fill(note, 80, initial_indent="  ", subsequent_indent="    ")

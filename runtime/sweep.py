@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import counted, with_unit
+from apc.compiler.words import counted, with_unit, wrapped
 from apc.runtime.grid import Grid, build_grid, parse_axis
 from apc.runtime.quantities import VERDICT, Cell, Row, find_quantity
 from apc.runtime.sweep_local import Workers, cores, local_processes, this_process

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from apc.compiler.pipeline import compile_topology
 from apc.runtime.analysis import analyze
 from apc.runtime.answer import answer, judge
 from apc.runtime.box import parse_range
-from apc.runtime.parameters import apply, parse_override
+from apc.runtime.parameters import Override, apply, parse_override
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
 FLIPS = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"
@@ -91,3 +92,21 @@ def test_numbers_that_leave_the_range_of_floats_beside_the_verdict_are_said_so()
     system = compile_topology(SCENES / "three-users-average.yaml")
     text = str(answer(apply(system, [parse_override(system, "device.mass=1e-300 kg")])))
     assert "what moves it most: not looked for: the present values have no frame" in text
+
+
+def test_a_stiffness_of_zero_lets_copies_apart_and_the_rest_is_told_all_the_same() -> None:
+    """Three users without coordination: what is free between them decides nothing."""
+    system = compile_topology(SCENES / "three-users-average.yaml")
+    alone = apply(system, [parse_override(system, "coordination.stiffness=0 N/m")])
+    found = answer(alone)
+    assert found.analysis.rigid_modes == 3
+    assert found.sensitivities.radius == pytest.approx(found.analysis.spectral_radius, abs=1e-12)
+    step = Fraction(1, 10**6)
+    moved = [
+        analyze(apply(alone, [Override("device.mass", None, Fraction(1, 10) + side)])).spectral_radius
+        for side in (-step, step)
+    ]
+    slope = {row.parameter: row.derivative for row in found.sensitivities.rows}["device.mass"]
+    assert slope == pytest.approx((moved[1] - moved[0]) / float(2 * step), rel=1e-5)
+    margin = {row.parameter: row.value for row in found.margins.rows}["coordination.stiffness"]
+    assert margin == pytest.approx(1096.411, rel=1e-6)  # what holds below it with any stiffness

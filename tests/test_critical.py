@@ -199,7 +199,7 @@ def test_no_crossing_is_an_answer_in_words() -> None:
         (["contact.stiffness", "--upper", "3 kg"], "E204 contact.stiffness wants N/m, got 3 kg"),
         (
             ["contact.stiffness", "--lower", "9 N/m", "--upper", "3 N/m"],
-            "E842 contact.stiffness needs a range",
+            "E842 the range of contact.stiffness wants",
         ),
         (["contact.stiffness", "--lower", "-5 N/m"], "E843 a limit of contact.stiffness wants at least 0"),
     ],

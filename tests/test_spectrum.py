@@ -17,7 +17,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis import Analysis, analyze
 from apc.runtime.enclosure import enclose_eigenvalues
 from apc.runtime.rigid import independent_places
-from apc.runtime.spectrum import _relative
+from apc.runtime.spectrum import _relative, oscillation, turned_along
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS, RADII
 from tests.sites import MS, grouped, paper
@@ -369,3 +369,14 @@ def test_the_dense_system_gives_the_same_answer() -> None:
         assert split.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-12)
         assert (split.verdict, split.rigid_modes) == (whole.verdict, whole.rigid_modes)
         assert sum(mode.multiplicity for mode in split.modes) == len(whole.modes)
+
+
+def test_a_change_of_sign_at_every_mark_is_half_a_turn_each_whatever_the_zeros_sign() -> None:
+    course = np.array([complex(1.0, 0.0), complex(-1.5, -0.0), complex(1.2, 0.0), complex(-1.8, -0.0)])
+    course = np.append(course, complex(2.3, 0.0))
+    for one in (course, course.conj(), -course, course * np.exp(1j)):
+        assert turned_along(one, complex(2.3)) == pytest.approx(4 * math.pi, rel=1e-12)
+
+
+def test_an_angle_below_a_rounding_is_none() -> None:
+    assert oscillation(0.5, 1e-77, 0.008) == (0.0, 1.0)

@@ -1,6 +1,6 @@
 """Every figure of this folder's page by one command: `python -m tests.bench` writes README.md beside it.
 
-`--quick` takes smaller runs of each, `--only NAME` one or more of them, and then writes nothing.
+`--quick` takes smaller runs of each, `--only NAME` one or more of them, and keeps the rest of the page.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from apc.runtime.bench import machine
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
+PAGE = HERE / "README.md"
 AVERAGE = "models/scenes/three-users-average.yaml"
 
 
@@ -42,7 +43,7 @@ PARTS = (
     Part("process", "Whole processes", _own("process"), _own("process", "--runs", "3")),
     Part(
         "scenes",
-        "The default against the front, on every scene",
+        "The default on every scene",
         _own("scenes"),
         _own("scenes", "--rounds", "3"),
     ),
@@ -74,34 +75,39 @@ def run(part: Part, quick: bool) -> str:
     shown = " ".join(words if words[0] == "apc" else ("python", "-m", *words))
     text = ran.stdout.rstrip() or ran.stderr.rstrip()
     end = "" if ran.returncode == 0 else f"\n\nIt ended with code {ran.returncode}."
-    return f"## {part.title}\n\n`{shown}` ({taken:.0f} s)\n\n```text\n{text}\n```{end}\n"
+    day = datetime.now(tz=UTC).date().isoformat()
+    return f"## {part.title}\n\n`{shown}` ({day}, {taken:.0f} s)\n\n```text\n{text}\n```{end}\n"
+
+
+def sections(page: str) -> dict[str, str]:
+    """Return the sections of a page by their titles."""
+    parts = page.split("\n## ")[1:]
+    return {part.partition("\n")[0]: f"## {part.rstrip()}\n" for part in parts}
 
 
 def main() -> None:
     """Run the parts and write the page."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="smaller runs")
-    parser.add_argument(
-        "--only", action="append", choices=[part.name for part in PARTS], help="may be repeated"
-    )
+    names = [part.name for part in PARTS]
+    parser.add_argument("--only", action="append", choices=names, help="may be repeated")
     given = parser.parse_args()
-    sections = []
+    before = sections(PAGE.read_text(encoding="utf-8")) if given.only and PAGE.is_file() else {}
+    found = []
     for part in PARTS:
         if given.only and part.name not in given.only:
+            found += [before[part.title]] if part.title in before else []
             continue
-        sections.append(run(part, given.quick))
-        print(sections[-1], flush=True)
-    if given.only:
-        return
+        found.append(run(part, given.quick))
+        print(found[-1], flush=True)
     where = "\n".join(f"| {name} | {value} |" for name, value in machine().items() if value)
-    command = "python -m tests.bench" + (" --quick" if given.quick else "")
-    day = datetime.now(tz=UTC).date().isoformat()
     head = (
         "# Figures\n\nSpeed against error, as last measured. This makes them again and writes this page:\n\n"
-        f"    {command}\n\nA part of it: `python -m tests.bench --only hard`. Measured on {day}:\n\n"
+        "    python -m tests.bench\n\n"
+        "Smaller runs: `--quick`. One part: `--only hard`. Each part says how it was run. Measured on:\n\n"
         f"| | |\n|---|---|\n{where}\n"
     )
-    (HERE / "README.md").write_text("\n".join([head, *sections]), encoding="utf-8")
+    PAGE.write_text("\n".join([head, *found]), encoding="utf-8")
 
 
 if __name__ == "__main__":
