@@ -110,7 +110,10 @@ def make_plan(
         packets = max(sum(sum(group.schedule.depths) for group in loop.sites) for loop in loops)
         if method == "determinant":
             found = method
-        elif method == "auto" and packets > LONG_LINES:
+        elif method == "auto" and (
+            max(sum(group.schedule.depths) for loop in loops for group in loop.sites) > LONG_LINES
+            or (packets > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)
+        ):
             found = "determinant"
             notes = (*notes, f"{packets:,} packets are on their way at a time, none of which is made a state")
     if found != "determinant":
