@@ -1,1 +1,5 @@
-"""CasADi to answers: linearize, schedule, lift, modes, spectrum."""
+"""CasADi to answers, a folder a subject.
+
+frame (one peer over a frame) → eigen (all peers) and large (very many) → analysis → vary (many values of some
+parameters) → sweep, simulate, region → answers → bench. Each imports only what comes before it.
+"""

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import prepare
-from apc.runtime.crowds import Crowd, crowds
-from apc.runtime.exchange import Exchange, build_exchange
-from apc.runtime.parameters import resolve
+from apc.runtime.analysis.analysis import prepare
+from apc.runtime.frame.exchange import Exchange, build_exchange
+from apc.runtime.frame.parameters import resolve
+from apc.runtime.large.crowds import Crowd, crowds
 from tests.sites import columned, linked, paper
 
 

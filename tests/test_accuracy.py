@@ -8,9 +8,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.runtime.accuracy import error_text
-from apc.runtime.methods import parse_method
-from apc.runtime.trajectory import simulate
+from apc.runtime.simulate.accuracy import error_text
+from apc.runtime.simulate.methods import parse_method
+from apc.runtime.simulate.trajectory import simulate
 from tests.test_integrate import CROSSLEY
 from tests.topologies import AVERAGE, compiled, replaced
 

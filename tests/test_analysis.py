@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis`."""
+"""Claims about `apc.runtime.analysis.analysis`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import pytest
 
 from apc.compiler.compiled import Timing
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze, prepare
-from apc.runtime.parameters import apply, parse_override
+from apc.runtime.analysis.analysis import analyze, prepare
+from apc.runtime.frame.parameters import apply, parse_override
 from tests.sites import MS, alone, columned, edged, grouped, linked, paper
 
 
@@ -105,7 +105,7 @@ def test_an_analysis_brings_in_no_symbolic_algebra_and_no_units() -> None:
         "import sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent.parent)!r})\n"
         "from tests.sites import paper\n"
-        "from apc.runtime.analysis import analyze\n"
+        "from apc.runtime.analysis.analysis import analyze\n"
         "analyze(paper())\n"
         "print(sorted({'sympy', 'pint', 'matplotlib'} & set(sys.modules)))\n"
     )

@@ -13,137 +13,77 @@ import pytest
 
 from tests.topologies import AVERAGE, ROOT
 
-# Every module, earliest first: each may import only those before it.
-ORDER = (
-    # what the others are written in, and what is handed over
-    *("apc.compiler.errors", "apc.compiler.words", "apc.compiler.compiled", "apc.compiler.cache"),
-    # text
-    *(
-        "apc.compiler.source",
-        "apc.compiler.reading",
-        "apc.compiler.expression",
-        "apc.compiler.grammar",
-        "apc.compiler.evaluation",
-        "apc.compiler.units",
-    ),
-    *("apc.compiler.dimensions", "apc.compiler.values", "apc.compiler.tables"),
-    # components and scenes
-    *("apc.compiler.component", "apc.compiler.parts", "apc.compiler.declarations"),
-    *("apc.compiler.definitions", "apc.compiler.library"),
-    *("apc.compiler.graphs", "apc.compiler.channels", "apc.compiler.groups", "apc.compiler.studies"),
-    "apc.compiler.scene",
-    # equations
-    *("apc.compiler.flatten", "apc.compiler.clocks", "apc.compiler.symbolic", "apc.compiler.blocks"),
-    *("apc.compiler.index", "apc.compiler.structure", "apc.compiler.exchange", "apc.compiler.ports"),
-    "apc.compiler.functions",
-    *("apc.compiler.pipeline", "apc.compiler.store"),
-    # what is shown of them
-    *("apc.compiler.schema", "apc.compiler.listing", "apc.compiler.diagram", "apc.compiler.picture"),
-    # one peer over a frame
-    *(
-        "apc.runtime.threads",
-        "apc.runtime.trouble",
-        "apc.runtime.exact",
-        "apc.runtime.parameters",
-        "apc.runtime.discretize",
-    ),
-    *(
-        "apc.runtime.exchange",
-        "apc.runtime.packets",
-        "apc.runtime.timetable",
-        "apc.runtime.guards",
-        "apc.runtime.linearize",
-        "apc.runtime.schedule",
-        "apc.runtime.gathering",
-    ),
-    *("apc.runtime.lift", "apc.runtime.batch_lift", "apc.runtime.residues"),
-    # all peers, and what their motion tells
-    *("apc.runtime.peers", "apc.runtime.modes", "apc.runtime.rigid", "apc.runtime.pseudospectrum"),
-    *("apc.runtime.enclosure", "apc.runtime.balls", "apc.runtime.certify"),
-    *("apc.runtime.ratios", "apc.runtime.duals"),
-    "apc.runtime.spectrum",
-    # populations: many different peers, large graphs, long delays
-    *("apc.runtime.diagonal", "apc.runtime.transfer", "apc.runtime.counting"),
-    *("apc.runtime.characteristic", "apc.runtime.zeros", "apc.runtime.crowds"),
-    *("apc.runtime.determinant", "apc.runtime.determinant_spectrum", "apc.runtime.translation"),
-    *("apc.runtime.extremes", "apc.runtime.large_graph"),
-    *("apc.runtime.sparse_system", "apc.runtime.krylov", "apc.runtime.plan"),
-    *("apc.runtime.selfcheck", "apc.runtime.analysis", "apc.runtime.needs"),
-    *("apc.runtime.box", "apc.runtime.box_proof"),
-    # many values of some parameters at once, and where the verdict changes
-    *("apc.runtime.wiring", "apc.runtime.batch", "apc.runtime.evaluator", "apc.runtime.crossings"),
-    "apc.runtime.bracket",
-    *("apc.runtime.delays", "apc.runtime.search", "apc.runtime.critical", "apc.runtime.margins"),
-    "apc.runtime.sensitivity",
-    # other ways to analyse: the paper's, other readings of ties, each state of a contact
-    *("apc.runtime.openloop", "apc.runtime.paper", "apc.runtime.conventions"),
-    *("apc.runtime.switches", "apc.runtime.contact_modes", "apc.runtime.answer"),
-    # published conditions, and results at many values of some parameters
-    *("apc.runtime.passivity", "apc.runtime.overlay", "apc.runtime.grid", "apc.runtime.quantities"),
-    *("apc.runtime.table_file", "apc.runtime.sweep_work", "apc.runtime.sweep_store"),
-    *("apc.runtime.sweep_local", "apc.runtime.sweep_cluster", "apc.runtime.sweep"),
-    # a scene played in time
-    *("apc.runtime.methods", "apc.runtime.scales", "apc.runtime.stepping"),
-    *("apc.runtime.integrate", "apc.runtime.propagate", "apc.runtime.flow", "apc.runtime.forcing"),
-    *("apc.runtime.pairs", "apc.runtime.program", "apc.runtime.native"),
-    *("apc.runtime.population", "apc.runtime.signals", "apc.runtime.simulation", "apc.runtime.blocks"),
-    *("apc.runtime.accuracy", "apc.runtime.summary"),
-    *("apc.runtime.trajectory", "apc.runtime.formats", "apc.runtime.recording"),
-    *("apc.runtime.figures", "apc.runtime.still"),
-    "apc.runtime.ensemble",
-    # the stable region of two parameters
-    *("apc.runtime.eigenpairs", "apc.runtime.surrogate", "apc.runtime.cells", "apc.runtime.curves"),
-    *("apc.runtime.boundary_points", "apc.runtime.boundary", "apc.runtime.staircase"),
-    *("apc.runtime.region_axes", "apc.runtime.region", "apc.runtime.region_panels"),
-    *("apc.runtime.region_report", "apc.runtime.region_figure", "apc.runtime.region_files"),
-    "apc.runtime.report",
-    # speed against error
-    *(
-        "apc.runtime.bench_events",
-        "apc.runtime.bench_reference",
-        "apc.runtime.bench",
-        "apc.runtime.bench_hard",
-        "apc.runtime.bench_scale",
-    ),
-    *("apc.runtime.bench_report", "apc.runtime.bench_figure"),
+# The folders, earliest first, and in each its modules, earliest first: each may import only those before it.
+HOUSE = {
+    # what the others are written in, and what is handed over; text; components and scenes; equations; what
+    # is shown of them
+    "apc.compiler": """
+        errors words compiled cache
+        source reading expression grammar evaluation units dimensions values tables
+        component parts declarations definitions library graphs channels groups studies scene
+        flatten clocks symbolic blocks index structure exchange ports functions pipeline store
+        schema listing diagram picture
+    """,
+    "apc.runtime": "threads trouble",
+    "apc.runtime.frame": """
+        exact parameters discretize exchange packets timetable guards linearize schedule gathering
+        lift batch_lift residues
+    """,
+    "apc.runtime.eigen": "peers modes rigid pseudospectrum enclosure balls certify ratios duals spectrum",
+    "apc.runtime.large": """
+        diagonal transfer counting characteristic zeros crowds determinant determinant_spectrum
+        translation extremes graph sparse_system krylov
+    """,
+    "apc.runtime.analysis": """
+        plan selfcheck analysis needs box box_proof openloop paper conventions switches
+        contact_modes
+    """,
+    "apc.runtime.vary": "wiring batch evaluator crossings bracket delays search critical margins sensitivity",
+    "apc.runtime.sweep": "grid quantities table_file work store local cluster sweep",
+    "apc.runtime.simulate": """
+        methods scales stepping integrate propagate flow forcing pairs program native population
+        signals simulation blocks accuracy summary trajectory formats recording figures still
+        ensemble
+    """,
+    "apc.runtime.region": """
+        passivity overlay eigenpairs surrogate cells curves boundary_points boundary staircase
+        axes region panels report figure files
+    """,
+    "apc.runtime.answers": "answer report",
+    "apc.runtime.bench": "events reference bench hard scale report figure",
     # what a person calls
-    *(
-        "apc.inputs",
-        "apc.options",
-        "apc.contents",
-        "apc.api",
-        "apc.cli_region",
-        "apc.cli_simulate",
-        "apc.cli_sweep",
-        "apc.cli_critical",
-        "apc.cli_bench",
-        "apc.cli_analyze",
-        "apc.cli",
-        "apc.__main__",
-    ),
-)
+    "apc": """
+        inputs options contents api
+        cli_region cli_simulate cli_sweep cli_critical cli_bench cli_analyze cli __main__
+    """,
+}
+ORDER = tuple(f"{package}.{name}" for package, names in HOUSE.items() for name in names.split())
 # A result prints itself: it asks for the report, which knows it, when it is printed and not before.
 BACKWARDS = {
-    ("apc.runtime.analysis", "apc.runtime.report"),
-    ("apc.runtime.answer", "apc.runtime.report"),
-    ("apc.runtime.trajectory", "apc.runtime.figures"),  # likewise a trajectory that draws itself
-    ("apc.runtime.bench", "apc.runtime.bench_report"),
+    ("apc.runtime.analysis.analysis", "apc.runtime.answers.report"),
+    ("apc.runtime.answers.answer", "apc.runtime.answers.report"),
+    (
+        "apc.runtime.simulate.trajectory",
+        "apc.runtime.simulate.figures",
+    ),  # likewise a trajectory that draws itself
+    ("apc.runtime.bench.bench", "apc.runtime.bench.report"),
     # and a region that prints, draws and lists itself
-    *(("apc.runtime.region", f"apc.runtime.region_{late}") for late in ("report", "figure", "files")),
-    *(("apc.runtime.region_panels", f"apc.runtime.region_{late}") for late in ("report", "figure")),
+    *(("apc.runtime.region.region", f"apc.runtime.region.{late}") for late in ("report", "figure", "files")),
+    *(("apc.runtime.region.panels", f"apc.runtime.region.{late}") for late in ("report", "figure")),
 }
-PACKAGES = {"compiler": "apc.compiler", "runtime": "apc.runtime", "runtime/apc": "apc"}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "sympify", "parse_expr", "lambdify", "S"}
 FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "sympy.parsing"}
 
 
 def modules() -> dict[str, Path]:
-    return {
-        f"{package}.{path.stem}": path
-        for folder, package in PACKAGES.items()
-        for path in sorted((ROOT / folder).glob("*.py"))
-        if path.stem != "__init__"
-    }
+    """Return the file of every module; `runtime/apc` is the package `apc` itself."""
+    found = {}
+    for top in ("compiler", "runtime"):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            names = path.relative_to(ROOT).with_suffix("").parts
+            if names[-1] != "__init__":
+                found[".".join(names[1:] if names[:2] == ("runtime", "apc") else ("apc", *names))] = path
+    return found
 
 
 def imports(path: Path) -> set[str]:

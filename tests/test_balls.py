@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.balls`, `apc.runtime.ratios` and `apc.runtime.duals`."""
+"""Claims about `apc.runtime.eigen.balls`, `apc.runtime.eigen.ratios` and `apc.runtime.eigen.duals`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import lifted_groups
-from apc.runtime.balls import frame_balls, precision, rational_ball, reduced_balls, square, unprovable
-from apc.runtime.duals import Dual, step_duals
-from apc.runtime.modes import dense, split
-from apc.runtime.ratios import NotRational, Ratios
-from apc.runtime.rigid import find_rigid_modes, independent_places
+from apc.runtime.analysis.analysis import lifted_groups
+from apc.runtime.eigen.balls import frame_balls, precision, rational_ball, reduced_balls, square, unprovable
+from apc.runtime.eigen.duals import Dual, step_duals
+from apc.runtime.eigen.modes import dense, split
+from apc.runtime.eigen.ratios import NotRational, Ratios
+from apc.runtime.eigen.rigid import find_rigid_modes, independent_places
 from tests.sites import MS, columned, grouped, linked, paper
 
 SCENES = [

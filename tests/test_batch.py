@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.batch`, `evaluator` and `crossings.eigenvalues`."""
+"""Claims about `apc.runtime.vary.batch`, `evaluator` and `crossings.eigenvalues`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import analyze, lifted_groups
-from apc.runtime.balls import frame_balls, precision
-from apc.runtime.batch import BatchEvaluator, matrix_errors
-from apc.runtime.crossings import eigenvalues
-from apc.runtime.evaluator import evaluator, reaches_time
-from apc.runtime.modes import split
-from apc.runtime.parameters import Free, Override, apply
+from apc.runtime.analysis.analysis import analyze, lifted_groups
+from apc.runtime.eigen.balls import frame_balls, precision
+from apc.runtime.eigen.modes import split
+from apc.runtime.frame.parameters import Free, Override, apply
+from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
+from apc.runtime.vary.crossings import eigenvalues
+from apc.runtime.vary.evaluator import evaluator, reaches_time
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 NAMES = ("contact.stiffness", "coordination.stiffness", "coordination.damping", "device.mass", "cube.damping")

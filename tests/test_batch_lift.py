@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.batch_lift`: many sites at once are the sites one by one."""
+"""Claims about `apc.runtime.frame.batch_lift`: many sites at once are the sites one by one."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.runtime.batch_lift import exponential_rows
-from apc.runtime.discretize import UNIT, discretize
-from apc.runtime.lift import lift
-from apc.runtime.linearize import linearize_exact, linearize_rows, site_of_row
-from apc.runtime.parameters import Override, apply
+from apc.runtime.frame.batch_lift import exponential_rows
+from apc.runtime.frame.discretize import UNIT, discretize
+from apc.runtime.frame.lift import lift
+from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of_row
+from apc.runtime.frame.parameters import Override, apply
 from tests.populations import crowded, different
 from tests.sites import MS
 

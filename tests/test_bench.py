@@ -10,10 +10,10 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.runtime.bench import SAME, Bench, Measured, bench, bench_analysis, pareto_front
-from apc.runtime.bench_figure import draw_bench, save_bench
-from apc.runtime.bench_report import bench_report, scale_report
-from apc.runtime.bench_scale import scale, with_count
+from apc.runtime.bench.bench import SAME, Bench, Measured, bench, bench_analysis, pareto_front
+from apc.runtime.bench.figure import draw_bench, save_bench
+from apc.runtime.bench.report import bench_report, scale_report
+from apc.runtime.bench.scale import scale, with_count
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
 

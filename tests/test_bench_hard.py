@@ -14,9 +14,9 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis import Analysis, analyze
-from apc.runtime.bench_hard import HardReport, compare, run_hard_cases
-from apc.runtime.bench_report import hard_report
+from apc.runtime.analysis.analysis import Analysis, analyze
+from apc.runtime.bench.hard import HardReport, compare, run_hard_cases
+from apc.runtime.bench.report import hard_report
 from tests.hard.truths import HERE, TRUTHS, truth_of
 
 # Ball arithmetic takes 7 and 20 s over these; `apc bench --hard` runs them.

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.balls import precision
-from apc.runtime.bench_events import refusal
-from apc.runtime.bench_reference import Truth, classes_of, exact_course, spectral_truth
+from apc.runtime.bench.events import refusal
+from apc.runtime.bench.reference import Truth, classes_of, exact_course, spectral_truth
+from apc.runtime.eigen.balls import precision
 from tests.bruteforce import Scene, frame_matrix
 from tests.eventwise import experiment, play
 from tests.sites import MS, columned, edged, grouped, linked, paper

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.certify` and what `apc.runtime.spectrum` makes of it."""
+"""Claims about `apc.runtime.eigen.certify` and what `apc.runtime.eigen.spectrum` makes of it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import Analysis, analyze, lifted_groups
-from apc.runtime.balls import precision
-from apc.runtime.certify import prove, root_discs, schur_cohn
-from apc.runtime.modes import split
-from apc.runtime.rigid import find_rigid_modes, independent_places
+from apc.runtime.analysis.analysis import Analysis, analyze, lifted_groups
+from apc.runtime.eigen.balls import precision
+from apc.runtime.eigen.certify import prove, root_discs, schur_cohn
+from apc.runtime.eigen.modes import split
+from apc.runtime.eigen.rigid import find_rigid_modes, independent_places
 from tests.sites import MS, alone, columned, grouped, linked, paper
 
 TRANSLATING = "stable up to a common translation"

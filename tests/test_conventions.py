@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.conventions`."""
+"""Claims about `apc.runtime.analysis.conventions`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import analyze, prepare
-from apc.runtime.conventions import Conventions, Outcome, conventions
-from apc.runtime.schedule import ORDER
+from apc.runtime.analysis.analysis import analyze, prepare
+from apc.runtime.analysis.conventions import Conventions, Outcome, conventions
+from apc.runtime.frame.schedule import ORDER
 from tests import bruteforce
 from tests.sites import MS, columned, edged, paper
 from tests.topologies import AVERAGE, SCENES, compiled

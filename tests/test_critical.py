@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.critical` and what it searches with: limits, islands, jumps, errors."""
+"""Claims about `apc.runtime.vary.critical` and what it searches with: limits, islands, jumps, errors."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pytest
 from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze
-from apc.runtime.critical import critical
-from apc.runtime.crossings import scan
-from apc.runtime.parameters import Override, apply
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.vary.critical import critical
+from apc.runtime.vary.crossings import scan
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, compiled, replaced

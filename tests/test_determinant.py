@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import Analysis, analyze, lifted_groups
-from apc.runtime.characteristic import characteristic_ball, refine
-from apc.runtime.determinant import of_crowds
-from apc.runtime.determinant_spectrum import solve_crowds, solve_loops
-from apc.runtime.modes import complete_loops, dense, split
-from apc.runtime.spectrum import Spectrum
-from apc.runtime.translation import count_translations
-from apc.runtime.zeros import find_zeros, near_poles
+from apc.runtime.analysis.analysis import Analysis, analyze, lifted_groups
+from apc.runtime.eigen.modes import complete_loops, dense, split
+from apc.runtime.eigen.spectrum import Spectrum
+from apc.runtime.large.characteristic import characteristic_ball, refine
+from apc.runtime.large.determinant import of_crowds
+from apc.runtime.large.determinant_spectrum import solve_crowds, solve_loops
+from apc.runtime.large.translation import count_translations
+from apc.runtime.large.zeros import find_zeros, near_poles
 from tests.bruteforce import Scene, frame_matrix
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper
@@ -114,7 +114,7 @@ def test_groups_with_delays_of_their_own_are_one_determinant(delays: dict[tuple[
 
 @pytest.mark.parametrize("radius", [0.7, 0.8, 0.9, 0.95, 1.05])
 def test_a_count_is_the_number_of_eigenvalues_of_the_whole_matrix(radius: float) -> None:
-    from apc.runtime.zeros import _beyond
+    from apc.runtime.large.zeros import _beyond
 
     system = different(8, kt=2000.0)
     values = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)

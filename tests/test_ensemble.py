@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.ensemble`."""
+"""Claims about `apc.runtime.simulate.ensemble`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.runtime.ensemble import PART, Ensemble, Run, play_many, share_interval
-from apc.runtime.simulation import prepare
-from apc.runtime.trajectory import play
+from apc.runtime.simulate.ensemble import PART, Ensemble, Run, play_many, share_interval
+from apc.runtime.simulate.simulation import prepare
+from apc.runtime.simulate.trajectory import play
 from tests.test_gathering import apart
 from tests.topologies import AVERAGE, compiled
 

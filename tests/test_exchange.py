@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.exchange`."""
+"""Claims about `apc.runtime.frame.exchange`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import Graph
-from apc.runtime.exchange import GraphMode, arcs, build_exchange, graph_modes
-from apc.runtime.parameters import resolve
+from apc.runtime.frame.exchange import GraphMode, arcs, build_exchange, graph_modes
+from apc.runtime.frame.parameters import resolve
 from tests.sites import COMPLETE, MS, grouped, linked, paper
 
 

@@ -1,4 +1,4 @@
-"""Claims about `extremes` and `large_graph`: few of many systems decide, and the others are shown not to."""
+"""Claims about `extremes` and `graph`: few of many systems decide, and the others are shown not to."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import analyze, lifted_groups
-from apc.runtime.exchange import ring_mode, ring_values
-from apc.runtime.extremes import find_extremes
-from apc.runtime.large_graph import deciding_loops, is_large_ring
-from apc.runtime.modes import close_loop, graph_loop, graph_scale
-from apc.runtime.peers import used_ways
+from apc.runtime.analysis.analysis import analyze, lifted_groups
+from apc.runtime.eigen.modes import close_loop, graph_loop, graph_scale
+from apc.runtime.eigen.peers import used_ways
+from apc.runtime.frame.exchange import ring_mode, ring_values
+from apc.runtime.large.extremes import find_extremes
+from apc.runtime.large.graph import deciding_loops, is_large_ring
 from tests.sites import MS, grouped, linked, paper
 
 VARIED: list[dict[str, Any]] = [
@@ -50,8 +50,8 @@ def test_no_system_left_out_is_above_the_bound(values: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("values", [{}, {"kt": 900.0}, {"kt": 0.0}])
 def test_a_large_ring_has_the_radius_of_all_its_systems(values: dict[str, Any]) -> None:
-    from apc.runtime.modes import split
-    from apc.runtime.spectrum import solve_spectrum
+    from apc.runtime.eigen.modes import split
+    from apc.runtime.eigen.spectrum import solve_spectrum
 
     system = linked(paper(peers=300, **values), "ring")
     groups, exchange = lifted_groups(system)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.trajectory import simulate
+from apc.runtime.simulate.trajectory import simulate
 from tests.topologies import ONE_MASS
 
 CLOCK = "clocks: {haptic: 10 ms}\n"

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.gathering`: what unreliable links do to a scene that is played."""
+"""Claims about `apc.runtime.frame.gathering`: what unreliable links do to a scene that is played."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.blocks import blocks
-from apc.runtime.packets import PacketSource, channel_law
-from apc.runtime.simulation import Simulation, prepare
+from apc.runtime.frame.packets import PacketSource, channel_law
+from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.simulation import Simulation, prepare
 from tests.eventwise import MS, Play, User, coast, contact, pull
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 

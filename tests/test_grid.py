@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from apc.runtime.grid import GridAxis, build_grid, parse_axis
+from apc.runtime.sweep.grid import GridAxis, build_grid, parse_axis
 from tests.topologies import AVERAGE, compiled, told
 
 MODEL = compiled(AVERAGE)

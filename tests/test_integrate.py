@@ -13,12 +13,12 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from apc.compiler.errors import ApcError
-from apc.runtime.blocks import blocks
-from apc.runtime.integrate import integrated
-from apc.runtime.methods import Method, parse_method
-from apc.runtime.propagate import nonlinear_rows
-from apc.runtime.simulation import prepare
-from apc.runtime.trajectory import Trajectory, simulate
+from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.integrate import integrated
+from apc.runtime.simulate.methods import Method, parse_method
+from apc.runtime.simulate.propagate import nonlinear_rows
+from apc.runtime.simulate.simulation import prepare
+from apc.runtime.simulate.trajectory import Trajectory, simulate
 from tests.sites import alone
 from tests.topologies import compiled, library
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import analyze, lifted_groups
-from apc.runtime.krylov import count_beyond, solve_sparse
-from apc.runtime.modes import dense
-from apc.runtime.sparse_system import relative_matrix, sparse_system
-from apc.runtime.translation import common_translation
+from apc.runtime.analysis.analysis import analyze, lifted_groups
+from apc.runtime.eigen.modes import dense
+from apc.runtime.large.krylov import count_beyond, solve_sparse
+from apc.runtime.large.sparse_system import relative_matrix, sparse_system
+from apc.runtime.large.translation import common_translation
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.lift`."""
+"""Claims about `apc.runtime.frame.lift`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from apc.runtime.analysis import lifted_groups
-from apc.runtime.lift import LiftedSite
+from apc.runtime.analysis.analysis import lifted_groups
+from apc.runtime.frame.lift import LiftedSite
 from tests.sites import MS, alone, paper
 
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.linearize`."""
+"""Claims about `apc.runtime.frame.linearize`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import Kind
-from apc.runtime.linearize import jacobians, linearize, linearize_exact
-from apc.runtime.parameters import resolve
+from apc.runtime.frame.linearize import jacobians, linearize, linearize_exact
+from apc.runtime.frame.parameters import resolve
 from tests.sites import NAMES, edged, paper, user
 
 

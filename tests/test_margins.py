@@ -1,12 +1,12 @@
-"""Claims about `apc.runtime.margins`."""
+"""Claims about `apc.runtime.vary.margins`."""
 
 from __future__ import annotations
 
 from fractions import Fraction
 
-from apc.runtime.analysis import analyze
-from apc.runtime.margins import margins, margins_report
-from apc.runtime.parameters import Override, apply
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.vary.margins import margins, margins_report
 from tests.topologies import AVERAGE, compiled, replaced
 
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.modes`."""
+"""Claims about `apc.runtime.eigen.modes`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import lifted_groups
-from apc.runtime.modes import dense, modes, split
+from apc.runtime.analysis.analysis import lifted_groups
+from apc.runtime.eigen.modes import dense, modes, split
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, columned, edged, grouped, linked, paper
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import casadi
 import pytest
 
-from apc.runtime import native as module
-from apc.runtime.native import cache_folder, compiler, native
+from apc.runtime.simulate import native as module
+from apc.runtime.simulate.native import cache_folder, compiler, native
 
 
 @pytest.fixture

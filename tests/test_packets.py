@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.packets`."""
+"""Claims about `apc.runtime.frame.packets`."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.runtime.linearize import jacobians
-from apc.runtime.packets import (
+from apc.runtime.frame.linearize import jacobians
+from apc.runtime.frame.packets import (
     PARETO_MOST,
     START,
     ChannelLaw,
@@ -24,8 +24,8 @@ from apc.runtime.packets import (
     deviates,
     nominal_notes,
 )
-from apc.runtime.parameters import resolve
-from apc.runtime.schedule import Tick, build_schedules
+from apc.runtime.frame.parameters import resolve
+from apc.runtime.frame.schedule import Tick, build_schedules
 from tests.sites import MS, paper
 from tests.topologies import AVERAGE, compiled, replaced
 

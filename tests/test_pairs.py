@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.packets import PacketSource, channel_law
-from apc.runtime.simulation import prepare
-from apc.runtime.trajectory import simulate
+from apc.runtime.frame.packets import PacketSource, channel_law
+from apc.runtime.simulate.simulation import prepare
+from apc.runtime.simulate.trajectory import simulate
 from tests.eventwise import MS, coast
 from tests.sites import edged, paper
 from tests.test_gathering import effective

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.paper` and `apc.runtime.openloop`."""
+"""Claims about `apc.runtime.analysis.paper` and `apc.runtime.analysis.openloop`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from scipy.optimize import linear_sum_assignment
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import lifted_groups
-from apc.runtime.modes import dense
-from apc.runtime.paper import PaperRoute, analyze_paper, paper_route
+from apc.runtime.analysis.analysis import lifted_groups
+from apc.runtime.analysis.paper import PaperRoute, analyze_paper, paper_route
+from apc.runtime.eigen.modes import dense
 from tests import bruteforce
 from tests.reference import OPERATORS, RADII
 from tests.sites import MS, linked, paper

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.parameters`."""
+"""Claims about `apc.runtime.frame.parameters`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError
-from apc.runtime.parameters import Override, apply, parse_override, resolve
+from apc.runtime.frame.parameters import Override, apply, parse_override, resolve
 from tests.sites import NAMES, columned, grouped, paper
 
 

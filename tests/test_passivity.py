@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.runtime.passivity import (
+from apc.runtime.region.passivity import (
     CONDITIONS,
     abbott_limit,
     colgate_limit,

@@ -1,11 +1,11 @@
-"""Claims about `apc.runtime.pseudospectrum`."""
+"""Claims about `apc.runtime.eigen.pseudospectrum`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from apc.runtime.pseudospectrum import balance, cluster_radius, norms, pseudospectral_radius
+from apc.runtime.eigen.pseudospectrum import balance, cluster_radius, norms, pseudospectral_radius
 
 
 def _reach(matrix: np.ndarray, error: float, angles: int = 720) -> float:

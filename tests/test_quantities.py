@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.parameters import apply, parse_override
-from apc.runtime.quantities import QUANTITIES, faulty, find_quantity
-from apc.runtime.sweep import sweep
+from apc.runtime.frame.parameters import apply, parse_override
+from apc.runtime.sweep.quantities import QUANTITIES, faulty, find_quantity
+from apc.runtime.sweep.sweep import sweep
 from tests.sweeping import CHEAP
 from tests.topologies import compiled, told
 

@@ -16,11 +16,11 @@ import pytest
 import scipy.io
 
 from apc.compiler.errors import ApcError
-from apc.runtime import formats
-from apc.runtime.blocks import Block, blocks
-from apc.runtime.recording import SUFFIXES, open_recording
-from apc.runtime.simulation import Simulation, prepare
-from apc.runtime.trajectory import simulate
+from apc.runtime.simulate import formats
+from apc.runtime.simulate.blocks import Block, blocks
+from apc.runtime.simulate.recording import SUFFIXES, open_recording
+from apc.runtime.simulate.simulation import Simulation, prepare
+from apc.runtime.simulate.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
 
 SYSTEM = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 100, set: {device.x: 3 mm}}")))

@@ -12,12 +12,12 @@ import pytest
 import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze
-from apc.runtime.boundary import relative_to
-from apc.runtime.curves import between
-from apc.runtime.parameters import Override, apply
-from apc.runtime.region import Region, region
-from apc.runtime.region_axes import parse_axes
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.region.axes import parse_axes
+from apc.runtime.region.boundary import relative_to
+from apc.runtime.region.curves import between
+from apc.runtime.region.region import Region, region
 from tests.paper_limit import limit
 from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from apc.compiler.words import WIDTH
-from apc.runtime.analysis import analyze
-from apc.runtime.needs import needs
-from apc.runtime.report import analysis_report, compile_report
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.analysis.needs import needs
+from apc.runtime.answers.report import analysis_report, compile_report
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
 
 LONG = replaced(AVERAGE, ("user: {count: 3}", "a_long_name_of_a_group: {count: 2, set: {device.mass: 1 kg}}"))

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.rigid`."""
+"""Claims about `apc.runtime.eigen.rigid`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import lifted_groups
-from apc.runtime.modes import ClosedSystem, dense, modes
-from apc.runtime.rigid import find_rigid_modes
+from apc.runtime.analysis.analysis import lifted_groups
+from apc.runtime.eigen.modes import ClosedSystem, dense, modes
+from apc.runtime.eigen.rigid import find_rigid_modes
 from tests.sites import MS, grouped, paper
 
 

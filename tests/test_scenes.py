@@ -10,7 +10,7 @@ import pytest
 import apc
 from apc.compiler.pipeline import compile_topology, run_stages
 from apc.compiler.scene import Scene
-from apc.runtime.selfcheck import check_frame
+from apc.runtime.analysis.selfcheck import check_frame
 from tests.topologies import SCENES, compiled, replaced
 
 COMMON = "stable up to a common translation"

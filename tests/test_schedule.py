@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.schedule`: section by section, what an instant means."""
+"""Claims about `apc.runtime.frame.schedule`: section by section, what an instant means."""
 
 from __future__ import annotations
 
@@ -8,9 +8,19 @@ from typing import Any
 
 import pytest
 
-from apc.runtime.linearize import jacobians
-from apc.runtime.parameters import resolve
-from apc.runtime.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, Tick, Value, build_schedules
+from apc.runtime.frame.linearize import jacobians
+from apc.runtime.frame.parameters import resolve
+from apc.runtime.frame.schedule import (
+    ORDER,
+    Act,
+    Heard,
+    Propagate,
+    Schedule,
+    Send,
+    Tick,
+    Value,
+    build_schedules,
+)
 from tests.sites import MS, grouped, linked, paper
 
 

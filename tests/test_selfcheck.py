@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.selfcheck`."""
+"""Claims about `apc.runtime.analysis.selfcheck`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-import apc.runtime.selfcheck as selfcheck
-from apc.runtime.lift import LiftedSite, lift
-from apc.runtime.selfcheck import check_frame, skipped
+from apc.runtime.analysis import selfcheck
+from apc.runtime.analysis.selfcheck import check_frame, skipped
+from apc.runtime.frame.lift import LiftedSite, lift
 from tests.sites import MS, columned, edged, grouped, linked, paper
 
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.sensitivity`."""
+"""Claims about `apc.runtime.vary.sensitivity`."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import analyze
-from apc.runtime.balls import precision
-from apc.runtime.batch import BatchEvaluator
-from apc.runtime.evaluator import evaluator
-from apc.runtime.parameters import Free, Override, apply
-from apc.runtime.sensitivity import sensitivities, sensitivity_report
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.eigen.balls import precision
+from apc.runtime.frame.parameters import Free, Override, apply
+from apc.runtime.vary.batch import BatchEvaluator
+from apc.runtime.vary.evaluator import evaluator
+from apc.runtime.vary.sensitivity import sensitivities, sensitivity_report
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
 FINGER = (SCENES / "finger.yaml").read_text(encoding="utf-8")
@@ -22,7 +22,7 @@ def test_derivatives_are_central_differences_in_50_digits() -> None:
     """Eigenvalues in balls at p ± h, h = 2^−20 p: what a difference cuts off is below 1e-12."""
     import flint
 
-    from apc.runtime.balls import frame_balls, reduced_balls
+    from apc.runtime.eigen.balls import frame_balls, reduced_balls
 
     system = compiled(replaced(AVERAGE, ("contact:      {", "contact:      {damping: 1 N*s/m, ")))
     found = sensitivities(system)

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.spectrum`."""
+"""Claims about `apc.runtime.eigen.spectrum`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import pytest
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import Analysis, analyze
-from apc.runtime.enclosure import enclose_eigenvalues
-from apc.runtime.rigid import independent_places
-from apc.runtime.spectrum import _relative, oscillation, turned_along
+from apc.runtime.analysis.analysis import Analysis, analyze
+from apc.runtime.eigen.enclosure import enclose_eigenvalues
+from apc.runtime.eigen.rigid import independent_places
+from apc.runtime.eigen.spectrum import _relative, oscillation, turned_along
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS, RADII
 from tests.sites import MS, grouped, paper

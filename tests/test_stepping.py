@@ -8,10 +8,10 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.runtime.methods import Method, parse_method
-from apc.runtime.scales import integrals
-from apc.runtime.stepping import stepped
-from apc.runtime.trajectory import simulate
+from apc.runtime.simulate.methods import Method, parse_method
+from apc.runtime.simulate.scales import integrals
+from apc.runtime.simulate.stepping import stepped
+from apc.runtime.simulate.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
 
 S = Fraction(1)

@@ -18,10 +18,10 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.runtime import sweep_store
-from apc.runtime.analysis import Analysis
-from apc.runtime.sweep import Sweep, sweep
-from apc.runtime.sweep_work import Work, compute_part, model_bytes
+from apc.runtime.analysis.analysis import Analysis
+from apc.runtime.sweep import store as sweep_store
+from apc.runtime.sweep.sweep import Sweep, sweep
+from apc.runtime.sweep.work import Work, compute_part, model_bytes
 from tests.sweeping import CHEAP, alive, children, parts, start, wait_for_parts
 from tests.topologies import AVERAGE, ONE_MASS, compiled, told
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.grid import build_grid, parse_axis
-from apc.runtime.sweep import sweep
-from apc.runtime.sweep_local import cores, local_processes, this_process
-from apc.runtime.sweep_work import Work, compute_part, model_bytes
+from apc.runtime.sweep.grid import build_grid, parse_axis
+from apc.runtime.sweep.local import cores, local_processes, this_process
+from apc.runtime.sweep.sweep import sweep
+from apc.runtime.sweep.work import Work, compute_part, model_bytes
 from tests.sweeping import CHEAP, alive, children, parts
 from tests.topologies import compiled
 

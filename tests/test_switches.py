@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.switches`."""
+"""Claims about `apc.runtime.analysis.switches`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import analyze
-from apc.runtime.linearize import LinearSite, jacobians, linearize
-from apc.runtime.switches import SwitchingPart, bind, find_switches, switching_parts
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.analysis.switches import SwitchingPart, bind, find_switches, switching_parts
+from apc.runtime.frame.linearize import LinearSite, jacobians, linearize
 from tests.sites import alone
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 

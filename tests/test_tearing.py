@@ -19,7 +19,7 @@ from apc.compiler.flatten import FlatEquation
 from apc.compiler.functions import _Writer
 from apc.compiler.grammar import parse_equation
 from apc.compiler.symbolic import no_derivative, symbol, to_sympy
-from apc.runtime.linearize import jacobians, linearize
+from apc.runtime.frame.linearize import jacobians, linearize
 
 PLACE = Place("test.yaml", 1, 1)
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import lifted_groups
-from apc.runtime.modes import ClosedSystem, dense
+from apc.runtime.analysis.analysis import lifted_groups
+from apc.runtime.eigen.modes import ClosedSystem, dense
 from tests.topologies import compiled
 
 MS = Fraction(1, 1000)

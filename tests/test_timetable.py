@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.timetable`."""
+"""Claims about `apc.runtime.frame.timetable`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.exchange import build_exchange
-from apc.runtime.packets import Listener, PacketSource, channel_law
-from apc.runtime.parameters import resolve
-from apc.runtime.timetable import Timetable
+from apc.runtime.frame.exchange import build_exchange
+from apc.runtime.frame.packets import Listener, PacketSource, channel_law
+from apc.runtime.frame.parameters import resolve
+from apc.runtime.frame.timetable import Timetable
 from tests.sites import MS
 from tests.topologies import AVERAGE, compiled, replaced
 

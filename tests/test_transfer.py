@@ -1,11 +1,11 @@
-"""Claims about `apc.runtime.transfer`: what sites answer, within its bounds."""
+"""Claims about `apc.runtime.large.transfer`: what sites answer, within its bounds."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from apc.runtime.transfer import StateSpace, build_transfer, differentiate, respond
+from apc.runtime.large.transfer import StateSpace, build_transfer, differentiate, respond
 
 
 def _sites(seed: int, *, error: float = 0.0, chain: int = 2) -> StateSpace:

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.translation`: what nothing holds back, for every peer with its own numbers."""
+"""Claims about `apc.runtime.large.translation`: what nothing holds back, each peer with its own numbers."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis import lifted_groups
-from apc.runtime.modes import dense
-from apc.runtime.rigid import find_rigid_modes
-from apc.runtime.translation import common_translation, count_translations
+from apc.runtime.analysis.analysis import lifted_groups
+from apc.runtime.eigen.modes import dense
+from apc.runtime.eigen.rigid import find_rigid_modes
+from apc.runtime.large.translation import common_translation, count_translations
 from tests.populations import crowded, different
 from tests.sites import columned, grouped, linked, paper
 

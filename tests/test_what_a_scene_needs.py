@@ -9,8 +9,8 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis import analyze
-from apc.runtime.needs import needs
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.analysis.needs import needs
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 # Of every scene: motion, delayed forces and packets of a peer of each kind. Counted by hand: two masses or a

@@ -34,33 +34,33 @@ if TYPE_CHECKING:
     )
     from apc.compiler.compiled import CompiledSystem
     from apc.compiler.errors import ApcError
-    from apc.runtime.analysis import Analysis
-    from apc.runtime.box_proof import BoxProof
-    from apc.runtime.contact_modes import ContactModes
-    from apc.runtime.conventions import Conventions
-    from apc.runtime.critical import Critical
-    from apc.runtime.margins import Margins
-    from apc.runtime.paper import PaperRoute
-    from apc.runtime.region import Region
-    from apc.runtime.sensitivity import Sensitivities
-    from apc.runtime.sweep import Sweep
-    from apc.runtime.trajectory import Trajectory
+    from apc.runtime.analysis.analysis import Analysis
+    from apc.runtime.analysis.box_proof import BoxProof
+    from apc.runtime.analysis.contact_modes import ContactModes
+    from apc.runtime.analysis.conventions import Conventions
+    from apc.runtime.analysis.paper import PaperRoute
+    from apc.runtime.region.region import Region
+    from apc.runtime.simulate.trajectory import Trajectory
+    from apc.runtime.sweep.sweep import Sweep
+    from apc.runtime.vary.critical import Critical
+    from apc.runtime.vary.margins import Margins
+    from apc.runtime.vary.sensitivity import Sensitivities
 
 # Looked up when first used, so that `import apc` costs nothing and each command imports what it needs.
 _HOMES = {
-    "Analysis": "apc.runtime.analysis",
+    "Analysis": "apc.runtime.analysis.analysis",
     "ApcError": "apc.compiler.errors",
-    "BoxProof": "apc.runtime.box_proof",
+    "BoxProof": "apc.runtime.analysis.box_proof",
     "CompiledSystem": "apc.compiler.compiled",
-    "ContactModes": "apc.runtime.contact_modes",
-    "Conventions": "apc.runtime.conventions",
-    "Critical": "apc.runtime.critical",
-    "Margins": "apc.runtime.margins",
-    "PaperRoute": "apc.runtime.paper",
-    "Region": "apc.runtime.region",
-    "Sensitivities": "apc.runtime.sensitivity",
-    "Sweep": "apc.runtime.sweep",
-    "Trajectory": "apc.runtime.trajectory",
+    "ContactModes": "apc.runtime.analysis.contact_modes",
+    "Conventions": "apc.runtime.analysis.conventions",
+    "Critical": "apc.runtime.vary.critical",
+    "Margins": "apc.runtime.vary.margins",
+    "PaperRoute": "apc.runtime.analysis.paper",
+    "Region": "apc.runtime.region.region",
+    "Sensitivities": "apc.runtime.vary.sensitivity",
+    "Sweep": "apc.runtime.sweep.sweep",
+    "Trajectory": "apc.runtime.simulate.trajectory",
     "analyze": "apc.api",
     "compile": "apc.api",
     "contact_modes": "apc.api",

@@ -17,17 +17,17 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
-    from apc.runtime.analysis import Analysis
-    from apc.runtime.box_proof import BoxProof
-    from apc.runtime.contact_modes import ContactModes
-    from apc.runtime.conventions import Conventions
-    from apc.runtime.critical import Critical
-    from apc.runtime.margins import Margins
-    from apc.runtime.paper import PaperRoute
-    from apc.runtime.region import Region
-    from apc.runtime.sensitivity import Sensitivities
-    from apc.runtime.sweep import Sweep
-    from apc.runtime.trajectory import Trajectory
+    from apc.runtime.analysis.analysis import Analysis
+    from apc.runtime.analysis.box_proof import BoxProof
+    from apc.runtime.analysis.contact_modes import ContactModes
+    from apc.runtime.analysis.conventions import Conventions
+    from apc.runtime.analysis.paper import PaperRoute
+    from apc.runtime.region.region import Region
+    from apc.runtime.simulate.trajectory import Trajectory
+    from apc.runtime.sweep.sweep import Sweep
+    from apc.runtime.vary.critical import Critical
+    from apc.runtime.vary.margins import Margins
+    from apc.runtime.vary.sensitivity import Sensitivities
 
 Method = Literal["auto", "modes", "dense", "determinant", "krylov", "paper"]
 Format = Literal["text", "json", "dot", "svg"]
@@ -52,7 +52,7 @@ def compile(path: str | Path) -> CompiledSystem:
         The file is at fault; holds every mistake found.
     """
     from apc.compiler.pipeline import compile_topology
-    from apc.runtime.selfcheck import check_frame
+    from apc.runtime.analysis.selfcheck import check_frame
 
     system = compile_topology(Path(path))
     check_frame(system)
@@ -86,7 +86,7 @@ def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> Compiled
     ApcError
         A name is unknown, a unit is wrong, or a value lies outside its bounds.
     """
-    from apc.runtime.parameters import apply, parse_override
+    from apc.runtime.frame.parameters import apply, parse_override
 
     overrides = [parse_override(model, f"{name}={value}") for name, value in values.items()]
     return apply(model, overrides)
@@ -126,7 +126,7 @@ def analyze(
     ApcError
         The input is at fault, or the method can't serve the scene.
     """
-    from apc.runtime.answer import judge
+    from apc.runtime.answers.answer import judge
 
     return judge(_model(model, set), method=method, certify=certify)
 
@@ -155,7 +155,7 @@ def critical(
     ApcError
         The input is at fault.
     """
-    from apc.runtime import critical as crossings
+    from apc.runtime.vary import critical as crossings
 
     return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper)
 
@@ -168,7 +168,7 @@ def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None
     model, set
         As for `analyze`.
     """
-    from apc.runtime import margins as growth
+    from apc.runtime.vary import margins as growth
 
     return growth.margins(_model(model, set))
 
@@ -183,7 +183,7 @@ def sensitivities(
     model, set
         As for `analyze`.
     """
-    from apc.runtime import sensitivity
+    from apc.runtime.vary import sensitivity
 
     return sensitivity.sensitivities(_model(model, set))
 
@@ -196,7 +196,7 @@ def conventions(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | 
     model, set
         As for `analyze`.
     """
-    from apc.runtime import conventions as orders
+    from apc.runtime.analysis import conventions as orders
 
     return orders.conventions(_model(model, set))
 
@@ -211,7 +211,7 @@ def contact_modes(
     model, set
         As for `analyze`.
     """
-    from apc.runtime import contact_modes as switched
+    from apc.runtime.analysis import contact_modes as switched
 
     return switched.contact_modes(_model(model, set))
 
@@ -228,8 +228,8 @@ def prove_box(
     box
         Ranges by parameter, such as {"contact.stiffness": "±1%"} or "900 N/m:1100 N/m".
     """
-    from apc.runtime import box_proof
-    from apc.runtime.box import parse_range
+    from apc.runtime.analysis import box_proof
+    from apc.runtime.analysis.box import parse_range
 
     system = _model(model, set)
     ranges = [parse_range(system, f"{name}={value}") for name, value in box.items()]
@@ -249,7 +249,7 @@ def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | 
     ApcError
         E861 the scene has not the form these matrices need.
     """
-    from apc.runtime import paper
+    from apc.runtime.analysis import paper
 
     return paper.paper_route(_model(model, set))
 
@@ -281,8 +281,8 @@ def region(
     ApcError
         The input is at fault.
     """
-    from apc.runtime import region as stable_region
-    from apc.runtime.region_axes import parse_axes
+    from apc.runtime.region import region as stable_region
+    from apc.runtime.region.axes import parse_axes
 
     system = _model(model, set)
     return stable_region.region(system, parse_axes(system, x, y))
@@ -315,7 +315,7 @@ def sweep(
     cluster
         The address of a Dask scheduler.
     """
-    from apc.runtime import sweep as points
+    from apc.runtime.sweep import sweep as points
 
     path = None if out is None else Path(out)
     return points.sweep(_model(model, set), over, of=of, out=path, jobs=jobs, cluster=cluster)
@@ -373,8 +373,8 @@ def simulate(
     ApcError
         The input is at fault.
     """
-    from apc.runtime import trajectory
-    from apc.runtime.methods import DEFAULT, parse_method
+    from apc.runtime.simulate import trajectory
+    from apc.runtime.simulate.methods import DEFAULT, parse_method
 
     return trajectory.simulate(
         _model(model, set),

@@ -167,9 +167,9 @@ def _compile(path: Path, target: Path, *, timings: bool) -> None:
     """Compile, check, save and report; with `timings`, how long each of it took."""
     from apc.compiler.pipeline import each_stage
     from apc.compiler.store import save
-    from apc.runtime.needs import needs
-    from apc.runtime.report import compile_report, timings_report
-    from apc.runtime.selfcheck import check_frame
+    from apc.runtime.analysis.needs import needs
+    from apc.runtime.analysis.selfcheck import check_frame
+    from apc.runtime.answers.report import compile_report, timings_report
 
     taken: list[tuple[str, float]] = []
     last = time.perf_counter()

@@ -63,12 +63,12 @@ def analyze_command(
     never pull, which of them make it unstable.
     """
     from apc.inputs import open_scene
-    from apc.runtime.answer import answer
+    from apc.runtime.answers.answer import answer
 
     system = open_scene(file, settings)
     ranges = []
     if box:
-        from apc.runtime.box import parse_range
+        from apc.runtime.analysis.box import parse_range
 
         ranges = [parse_range(system, text) for text in box]
     found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)

@@ -77,21 +77,21 @@ def bench_command(
             raise click.UsageError("--scale compiles anew: no --set or --plot with it")
         _scale(Path(file) if file else find_input(compiled_too=False), counts, as_json)
         return
-    from apc.runtime.bench import bench
-    from apc.runtime.bench_report import bench_report
+    from apc.runtime.bench.bench import bench
+    from apc.runtime.bench.report import bench_report
 
     if plot is not None:
-        from apc.runtime.figures import check_format
+        from apc.runtime.simulate.figures import check_format
 
         check_format(plot)
     system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
     if settings:
-        from apc.runtime.parameters import apply, parse_override
+        from apc.runtime.frame.parameters import apply, parse_override
 
         system = apply(system, [parse_override(system, text) for text in settings])
     found = bench(system)
     if plot is not None:
-        from apc.runtime.bench_figure import save_bench
+        from apc.runtime.bench.figure import save_bench
 
         save_bench(found, plot)
     _print(found.to_dict(), bench_report(found), as_json)
@@ -101,8 +101,8 @@ def bench_command(
 
 def _hard(folder: Path, as_json: bool) -> None:
     """Report the hard cases; a failure is exit code 1."""
-    from apc.runtime.bench_hard import run_hard_cases
-    from apc.runtime.bench_report import hard_report
+    from apc.runtime.bench.hard import run_hard_cases
+    from apc.runtime.bench.report import hard_report
 
     found = run_hard_cases(folder)
     _print(found.to_dict(), hard_report(found), as_json)
@@ -115,8 +115,8 @@ def _hard(folder: Path, as_json: bool) -> None:
 
 def _scale(path: Path, counts: str, as_json: bool) -> None:
     """Report what more peers cost."""
-    from apc.runtime.bench_report import scale_report
-    from apc.runtime.bench_scale import scale
+    from apc.runtime.bench.report import scale_report
+    from apc.runtime.bench.scale import scale
 
     if path.suffix == ".apc":
         what = "is a compiled model, whose peers are counted"

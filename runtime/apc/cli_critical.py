@@ -36,7 +36,7 @@ def critical_command(
     topology or a compiled model.
     """
     from apc.inputs import open_scene
-    from apc.runtime.critical import critical
+    from apc.runtime.vary.critical import critical
 
     system = open_scene(file, settings)
     print_result(critical(system, path, lower=lower, upper=upper), as_json=as_json)

@@ -84,8 +84,8 @@ def region_command(
                    --out regions.svg
     """
     from apc.inputs import open_scene
-    from apc.runtime.region_files import check_region_path, write_panels
-    from apc.runtime.region_panels import compare_regions, parse_panel, parse_vary
+    from apc.runtime.region.files import check_region_path, write_panels
+    from apc.runtime.region.panels import compare_regions, parse_panel, parse_vary
 
     if out is not None:
         check_region_path(out)

@@ -113,11 +113,11 @@ def simulate_command(
         apc simulate --method semi-implicit:1ms --error
     """
     from apc.inputs import open_scene
-    from apc.runtime.accuracy import compare_with
-    from apc.runtime.methods import DEFAULT, parse_method
-    from apc.runtime.recording import open_recording
-    from apc.runtime.simulation import prepare
-    from apc.runtime.trajectory import (
+    from apc.runtime.simulate.accuracy import compare_with
+    from apc.runtime.simulate.methods import DEFAULT, parse_method
+    from apc.runtime.simulate.recording import open_recording
+    from apc.runtime.simulate.simulation import prepare
+    from apc.runtime.simulate.trajectory import (
         Keeper,
         duration_of,
         parse_duration,
@@ -132,21 +132,21 @@ def simulate_command(
         raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
     chosen = parse_method(method) if method is not None else DEFAULT
     if plot is not None:
-        from apc.runtime.figures import check_format
+        from apc.runtime.simulate.figures import check_format
 
         check_format(plot)
     if still is not None:
-        from apc.runtime.figures import check_format
+        from apc.runtime.simulate.figures import check_format
 
         check_format(still, "--still")
     system = open_scene(file, settings)
     if still is not None:
-        from apc.runtime.still import save_still
+        from apc.runtime.simulate.still import save_still
 
         save_still(system, still)
     seconds = duration_of(system, parse_duration(duration) if duration is not None else None)
     if runs is not None:
-        from apc.runtime.ensemble import play_many
+        from apc.runtime.simulate.ensemble import play_many
 
         with _progress(runs, "runs") as progress:
             many = play_many(
@@ -183,7 +183,7 @@ def simulate_command(
         raise
     estimate = comparison.estimate() if comparison is not None else None
     if plot is not None and keeper is not None:
-        from apc.runtime.figures import save
+        from apc.runtime.simulate.figures import save
 
         save(trajectory_of(simulation, keeper, summary, interrupted), plot)
     if as_json:

@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.options import json_option, print_result, set_option
 
 if TYPE_CHECKING:
-    from apc.runtime.sweep import Progress
+    from apc.runtime.sweep.sweep import Progress
 
 
 @click.command("sweep")
@@ -81,7 +81,7 @@ def sweep_command(
     changes, with its error).
     """
     from apc.inputs import open_scene
-    from apc.runtime.sweep import sweep
+    from apc.runtime.sweep.sweep import sweep
 
     values = _values(over)
     system = open_scene(file, settings)

@@ -104,7 +104,7 @@ def load_or_compile(path: Path) -> CompiledSystem:
         except ApcError:
             pass  # it is only a saving of time; the topology itself decides
     from apc.compiler.pipeline import compile_topology
-    from apc.runtime.selfcheck import check_frame
+    from apc.runtime.analysis.selfcheck import check_frame
 
     system = compile_topology(path)
     check_frame(system)
@@ -129,7 +129,7 @@ def open_scene(file: str | None, settings: Sequence[str]) -> CompiledSystem:
     system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
     if not settings:
         return system
-    from apc.runtime.parameters import apply, parse_override
+    from apc.runtime.frame.parameters import apply, parse_override
 
     return apply(system, [parse_override(system, text) for text in settings])
 

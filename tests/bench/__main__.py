@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from apc.runtime.bench import machine
+from apc.runtime.bench.bench import machine
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]

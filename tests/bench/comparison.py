@@ -28,8 +28,8 @@ from scipy.linalg import expm
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis import analyze
-from apc.runtime.bench_reference import Truth, spectral_truth
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.bench.reference import Truth, spectral_truth
 from apc.runtime.threads import single_threaded
 from tests.topologies import AVERAGE, compiled
 

@@ -14,9 +14,9 @@ from collections.abc import Callable
 import mpmath
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.critical import critical
-from apc.runtime.margins import margins
-from apc.runtime.sensitivity import sensitivities
+from apc.runtime.vary.critical import critical
+from apc.runtime.vary.margins import margins
+from apc.runtime.vary.sensitivity import sensitivities
 from tests.bruteforce import Scene, frame_matrix
 from tests.topologies import AVERAGE, MESH, compiled
 

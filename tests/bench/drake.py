@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.blocks import blocks
-from apc.runtime.simulation import prepare
+from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.simulation import prepare
 from apc.runtime.threads import single_threaded
 from tests.bench.simulate import MOVED, best, numpy_loop
 from tests.topologies import compiled

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from apc.runtime.analysis import Analysis, analyze, prepare
+from apc.runtime.analysis.analysis import Analysis, analyze, prepare
 from apc.runtime.threads import single_threaded
 from tests.populations import different
 from tests.sites import MS, grouped, linked, paper
@@ -30,7 +30,7 @@ PROCESS = """
 import resource, sys
 sys.path.insert(0, {root!r})
 from tests.bench.populations import scene
-from apc.runtime.analysis import analyze
+from apc.runtime.analysis.analysis import analyze
 found = analyze(scene({name!r}))
 memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 print(found.method, found.spectral_radius, found.spectral_radius_error, memory, found.verdict, sep="|")

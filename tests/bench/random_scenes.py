@@ -2,7 +2,7 @@
 """Random scenes, each verdict and bound against 256-bit arithmetic: `python -m tests.bench.random_scenes`.
 
 Graphs, clocks, delays, groups and couplings are drawn, and for each such structure numbers over many decades.
-The truth comes from the compiled functions alone, event by event (see `bench_reference`). A bound that does
+The truth comes from the compiled functions alone, event by event (see `bench.reference`). A bound that does
 not hold and a wrong verdict must be none.
 """
 
@@ -20,10 +20,10 @@ import flint
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis import Analysis, analyze
-from apc.runtime.balls import precision
-from apc.runtime.bench_reference import RIGID, classes_of, eigenvalues, frame_matrices
-from apc.runtime.parameters import Override, apply
+from apc.runtime.analysis.analysis import Analysis, analyze
+from apc.runtime.bench.reference import RIGID, classes_of, eigenvalues, frame_matrices
+from apc.runtime.eigen.balls import precision
+from apc.runtime.frame.parameters import Override, apply
 from apc.runtime.threads import single_threaded
 from tests.topologies import compiled
 

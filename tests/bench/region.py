@@ -14,14 +14,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from apc.runtime.analysis import prepare
-from apc.runtime.boundary import relative_to
-from apc.runtime.curves import between
-from apc.runtime.evaluator import evaluator
-from apc.runtime.parameters import Free, apply, parse_override
-from apc.runtime.region import Region, region
-from apc.runtime.region_axes import parse_axes
+from apc.runtime.analysis.analysis import prepare
+from apc.runtime.frame.parameters import Free, apply, parse_override
+from apc.runtime.region.axes import parse_axes
+from apc.runtime.region.boundary import relative_to
+from apc.runtime.region.curves import between
+from apc.runtime.region.region import Region, region
 from apc.runtime.threads import single_threaded
+from apc.runtime.vary.evaluator import evaluator
 from tests.bench.naive_region import stable_grid
 from tests.paper_limit import limit
 from tests.topologies import AVERAGE, MESH, ROOT, compiled

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.bench import FAILED, bench
+from apc.runtime.bench.bench import FAILED, bench
 from tests.topologies import SCENES
 
 

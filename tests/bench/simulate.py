@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from apc.runtime.analysis import analyze, lifted_groups
-from apc.runtime.blocks import blocks
-from apc.runtime.modes import dense
-from apc.runtime.simulation import prepare
+from apc.runtime.analysis.analysis import analyze, lifted_groups
+from apc.runtime.eigen.modes import dense
+from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.simulation import prepare
+from apc.runtime.simulate.trajectory import simulate
 from apc.runtime.threads import single_threaded
-from apc.runtime.trajectory import simulate
 from tests.eventwise import experiment, play
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 

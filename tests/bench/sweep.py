@@ -15,10 +15,10 @@ from pathlib import Path
 
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.store import save
-from apc.runtime.grid import build_grid, parse_axis
-from apc.runtime.parameters import apply
-from apc.runtime.quantities import find_quantity
-from apc.runtime.sweep import PART_POINTS
+from apc.runtime.frame.parameters import apply
+from apc.runtime.sweep.grid import build_grid, parse_axis
+from apc.runtime.sweep.quantities import find_quantity
+from apc.runtime.sweep.sweep import PART_POINTS
 from apc.runtime.threads import single_threaded
 from tests.sweeping import parts, start, wait_for_parts
 from tests.topologies import SCENES

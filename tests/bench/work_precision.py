@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.blocks import blocks
-from apc.runtime.methods import Method
-from apc.runtime.simulation import prepare
+from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.methods import Method
+from apc.runtime.simulate.simulation import prepare
 from apc.runtime.threads import single_threaded
 from tests.topologies import compiled
 
@@ -118,7 +118,7 @@ def draw(results: dict[str, dict[str, list[Point]]], path: Path) -> None:
     """Draw a panel a scene."""
     from matplotlib.figure import Figure
 
-    from apc.runtime.figures import write_figure
+    from apc.runtime.simulate.figures import write_figure
 
     figure = Figure(figsize=(11, 4), layout="constrained")
     axes = figure.subplots(1, len(results), sharey=True)

@@ -1,7 +1,7 @@
 """The truth about every scene here, to fifty digits: `python -m tests.hard.truths` writes truths.json.
 
 All peers (equal ones by a representative and the weights of its class) are followed event by event in ball
-arithmetic, see `bench_reference`; two precisions agree on every digit written. Nothing of the analysis takes
+arithmetic, see `bench.reference`; two precisions agree on every digit written. Nothing of the analysis takes
 part. A delay of a thousand frames comes as a polynomial, whose roots Arb encloses. The gains of the scenes
 `boundary-*` are found here by bisection and compared with those that stand in them.
 """
@@ -19,8 +19,7 @@ import flint
 import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.balls import precision
-from apc.runtime.bench_reference import (
+from apc.runtime.bench.reference import (
     DIGITS,
     RIGID,
     Truth,
@@ -29,6 +28,7 @@ from apc.runtime.bench_reference import (
     frame_matrices,
     spectral_truth,
 )
+from apc.runtime.eigen.balls import precision
 
 HERE = Path(__file__).resolve().parent
 TRUTHS = HERE / "truths.json"

@@ -1,0 +1,257 @@
+"""Is it stable, and by how much: the whole road from a compiled system to its spectrum.
+
+Takes: a `CompiledSystem`.
+Gives: `Analysis`, `analyze`; `Prepared`, `prepare` for many analyses of one system.
+Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
+delay; of equal input comes equal output.
+Does not: read files, or draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.analysis.plan import make_plan
+from apc.runtime.eigen.modes import Loop, close_loop
+from apc.runtime.eigen.peers import PeerGroup, peer_groups, states_of
+from apc.runtime.eigen.spectrum import Mode, Spectrum, solve_spectrum
+from apc.runtime.frame.discretize import TOO_LARGE
+from apc.runtime.frame.exchange import Exchange, build_exchange
+from apc.runtime.frame.linearize import SiteJacobians, jacobians
+from apc.runtime.frame.packets import nominal_notes
+from apc.runtime.frame.parameters import Numbers, resolve
+from apc.runtime.frame.schedule import ORDER, Schedule, build_schedules
+from apc.runtime.large.crowds import crowds
+from apc.runtime.large.determinant_spectrum import solve_crowds, solve_loops
+from apc.runtime.large.graph import deciding_loops, with_the_rest
+from apc.runtime.large.krylov import solve_sparse
+from apc.runtime.large.translation import common_translation, count_translations
+from apc.runtime.threads import single_threaded
+from apc.runtime.trouble import finite_equations
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """What analyses of one system with different numbers have in common.
+
+    The Jacobians (one a kind) hold for any numbers; the schedules (one a group) for these timings and this
+    order of coincident events.
+    """
+
+    jacobians: tuple[SiteJacobians, ...]
+    schedules: tuple[Schedule, ...]
+    timings: Mapping[str, Fraction]
+    order: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """The answer of an analysis; `spectral_radius` is per frame, rigid modes removed.
+
+    `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `plan.METHODS`.
+    `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
+    say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided.
+    """
+
+    topology: str
+    peers: int
+    frame_s: float
+    states_per_peer: int
+    method: str
+    verdict: str
+    stable: bool | None
+    spectral_radius: float
+    spectral_radius_error: float
+    rigid_modes: int
+    modes: tuple[Mode, ...]
+    linearized: bool
+    notes: tuple[str, ...]
+    proof: str = ""
+
+    def __str__(self) -> str:
+        """Return the verdict in words, the numbers, and the modes as a table."""
+        from apc.runtime.answers.report import analysis_report  # it needs this module
+
+        return analysis_report(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the analysis as plain data, ready for JSON."""
+        return {
+            "topology": self.topology,
+            "peers": self.peers,
+            "frame_s": self.frame_s,
+            "states_per_peer": self.states_per_peer,
+            "method": self.method,
+            "verdict": self.verdict,
+            "stable": self.stable,
+            "spectral_radius": self.spectral_radius,
+            "spectral_radius_error": self.spectral_radius_error,
+            "rigid_modes": self.rigid_modes,
+            "modes": [
+                {
+                    "eigenvalue": [mode.eigenvalue.real, mode.eigenvalue.imag],
+                    "magnitude": mode.magnitude,
+                    "multiplicity": mode.multiplicity,
+                    "frequency_hz": mode.frequency_hz,
+                    "damping_ratio": mode.damping_ratio,
+                    "shape": mode.shape,
+                    "participation": dict(mode.participation),
+                    "error": mode.error,
+                }
+                for mode in self.modes
+            ],
+            "linearized": self.linearized,
+            "notes": list(self.notes),
+            "proof": self.proof,
+        }
+
+
+def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared:
+    """Do what analyses with different numbers can share.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    order
+        The order of coincident events, see `schedule.ORDER`.
+    """
+    built = tuple(jacobians(kind) for kind in system.kinds)
+    return _scheduled(system, built, resolve(system).timings, tuple(order))
+
+
+def analyze(
+    system: CompiledSystem,
+    *,
+    method: str = "auto",
+    prepared: Prepared | None = None,
+    certify: bool = False,
+) -> Analysis:
+    """Analyse a system by the method that serves it, or by one that is asked for.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse (see `parameters.apply`).
+    method
+        One of `plan.METHODS`. "modes": a few small systems, where equal peers and the graph allow that;
+        "dense": all peers as one matrix, the check on all else, at the cost of N³; "determinant": the
+        zeros of a small characteristic function, for peers that all differ on complete graphs and for delays
+        of any length; "krylov": the largest eigenvalues of one sparse matrix, for peers that differ on sparse
+        graphs.
+    prepared
+        From `prepare`, of this system with any numbers; saves building the Jacobians again.
+    certify
+        Prove the verdict in ball arithmetic, whether or not floats leave it open.
+
+    Raises
+    ------
+    ApcError
+        E804 a system of too many states for its matrix, E806 numbers beyond floats, E850 a method that can't
+        serve this scene; and those of `peers.peer_groups`.
+    """
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        numbers = resolve(system)
+        prepared = _timed(system, prepared or prepare(system), numbers)
+        exchange = build_exchange(system, numbers.timings)
+        plan = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange, method)
+        if not plan.groups:
+            spectrum, notes = _solve_crowds(system, prepared, numbers, exchange, plan.method)
+        elif plan.ring:
+            spectrum, notes = _solve_ring(system, plan.groups, exchange, certify=certify)
+        elif plan.method == "determinant":
+            spectrum, notes = solve_loops(plan.loops), ()
+        else:
+            spectrum, notes = _solve_closed(system, plan.loops, certify=certify), ()
+        if certify and (not plan.groups or plan.method == "determinant"):
+            notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
+    return Analysis(
+        topology=system.name,
+        peers=exchange.peers,
+        frame_s=float(prepared.schedules[0].frame_s),
+        states_per_peer=max(
+            states_of(schedule, prepared.jacobians[group.kind])
+            for schedule, group in zip(prepared.schedules, system.groups, strict=True)
+        ),
+        method=plan.method,
+        verdict=spectrum.verdict,
+        stable=spectrum.stable,
+        spectral_radius=spectrum.spectral_radius,
+        spectral_radius_error=spectrum.spectral_radius_error,
+        rigid_modes=spectrum.rigid_modes,
+        modes=spectrum.modes,
+        linearized=not all(prepared.jacobians[group.kind].affine for group in system.groups),
+        notes=(*plan.notes, *notes, *spectrum.notes, *nominal_notes(system)),
+        proof=spectrum.proof,
+    )
+
+
+def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: bool) -> Spectrum:
+    """Solve loops by their matrices."""
+    closed = tuple(close_loop(loop) for loop in loops)
+    if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
+        raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
+    return solve_spectrum(closed, certify=certify)
+
+
+def _solve_ring(
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, certify: bool
+) -> tuple[Spectrum, tuple[str, ...]]:
+    """Solve equal peers on a large ring: those of its loops that decide."""
+    ring = deciding_loops(groups, exchange)
+    spectrum = _solve_closed(system, ring.arrangement.loops, certify=certify)
+    return with_the_rest(spectrum, ring), ring.arrangement.notes
+
+
+def _solve_crowds(
+    system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange, method: str
+) -> tuple[Spectrum, tuple[str, ...]]:
+    """Solve peers that all differ."""
+    listed = crowds(system, prepared.jacobians, prepared.schedules, numbers)
+    rounded = "what rounding does to the peers' own motion is estimated here, not bounded"
+    notes = (rounded,) if any(crowd.lifted.estimated for crowd in listed) else ()
+    if method == "krylov":
+        motions = common_translation(listed, exchange)
+        spectrum = solve_sparse(listed, exchange, motions)
+        free = "peers move freely one by one, or the first as not all others do: left open"
+        return spectrum, notes if motions is not None else (*notes, free)
+    rigid = count_translations(listed, exchange)
+    spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
+    free = "the first peer moves freely in a way that not all others do: left open"
+    return spectrum, notes if rigid is not None else (*notes, free)
+
+
+def lifted_groups(
+    system: CompiledSystem, *, prepared: Prepared | None = None
+) -> tuple[tuple[PeerGroup, ...], Exchange]:
+    """Return the peers of a system in groups of equal dynamics, lifted, and the exchange between them."""
+    numbers = resolve(system)
+    prepared = _timed(system, prepared or prepare(system), numbers)
+    exchange = build_exchange(system, numbers.timings)
+    groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
+    return groups, exchange
+
+
+def _timed(system: CompiledSystem, prepared: Prepared, numbers: Numbers) -> Prepared:
+    """Return what was prepared, with the schedules of these timings."""
+    if numbers.timings == prepared.timings:
+        return prepared
+    return _scheduled(system, prepared.jacobians, numbers.timings, prepared.order)
+
+
+def _scheduled(
+    system: CompiledSystem,
+    built: tuple[SiteJacobians, ...],
+    timings: Mapping[str, Fraction],
+    order: tuple[str, ...],
+) -> Prepared:
+    """Add the schedules of these timings to the Jacobians."""
+    schedules = build_schedules(system, timings, [site.pattern for site in built], order=order)
+    return Prepared(built, schedules, timings, order)

@@ -1,0 +1,333 @@
+"""Which parameters a box leaves open, and how far: `contact.stiffness=±1%`.
+
+Takes: a `CompiledSystem` and ranges as text.
+Gives: `Range`, `parse_range`; `Box`, `open_box`.
+Guarantees: a site's matrices are exact quotients of polynomials in the open parameters, and what depends on
+these by an expression follows.
+Does not: prove anything (see `box_proof`).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem, Group, Parameter
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import with_unit
+from apc.runtime.analysis.analysis import lifted_groups, prepare
+from apc.runtime.eigen.modes import ClosedSystem, split
+from apc.runtime.eigen.peers import PeerGroup, Runs
+from apc.runtime.eigen.ratios import NotRational, Ratio, Ratios
+from apc.runtime.frame.exact import evaluate_exact
+from apc.runtime.frame.linearize import LinearSite, site_of_row
+from apc.runtime.frame.parameters import Override, apply, find
+
+_PLACE = Place("box")
+
+# Where in the box the peers are sorted into groups: a place that no two given values share, so that peers are
+# alike there only if they are alike all over the box. Three, in case one of them is met by chance.
+GENERIC = (Fraction(6180339887, 10**10), Fraction(4142135623, 10**10), Fraction(7320508075, 10**10))
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """A parameter, of one group or of all (`group` None), left open from `low` to `high` (SI)."""
+
+    name: str
+    group: str | None
+    unit: str
+    low: Fraction
+    high: Fraction
+
+    @property
+    def label(self) -> str:
+        """The parameter as a person writes it."""
+        return self.name if self.group is None else f"{self.group}.{self.name}"
+
+    def __str__(self) -> str:
+        low, high = (with_unit(f"{float(one):.9g}", self.unit) for one in (self.low, self.high))
+        return f"{self.label} from {low} to {high}"
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A scene with parameters left open.
+
+    `systems` are its closed systems (at some point of the box); `sites[s][g]` are the matrices of site g of
+    system s, over `Fraction` and `Ratio` in the order of `ranges`.
+    """
+
+    ranges: tuple[Range, ...]
+    systems: tuple[ClosedSystem, ...]
+    sites: tuple[tuple[LinearSite, ...], ...]
+
+
+def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Range:
+    """Read `NAME=±P%` or `NAME=LOW UNIT:HIGH UNIT`.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    text
+        As written; the name as in `parameters.find`.
+    place
+        Where it stands, for messages.
+
+    Raises
+    ------
+    ApcError
+        E830 not of that form, E831 a parameter that a box can't leave open, E833 limits that can't be; those
+        of `parameters.find` and `units.quantity`.
+    """
+    # Imported here: reading a unit brings in pint, which an analysis without a box never needs.
+    from apc.compiler.units import quantity
+
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not (equals and name and value):
+        raise _malformed(text, place)
+    known, group = find(system, name, place)
+    parameter = _parameter(system, known, group, place)
+    if value.startswith(("±", "+-")):
+        share = _percentage(value.removeprefix("±").removeprefix("+-"), text, place)
+        middle = Fraction(parameter.value)
+        spread = abs(middle) * share
+        if not spread:
+            what = f"{name} is 0, and any share of it is 0 as well"
+            raise ApcError(Mistake("E833", place, what, hint=f"{name}=LOW:HIGH"))
+        low, high = middle - spread, middle + spread
+    else:
+        first, colon, last = (part.strip() for part in value.partition(":"))
+        if not (colon and first and last):
+            raise _malformed(text, place)
+        low, high = (quantity(one, place, what=name, unit=parameter.unit).value for one in (first, last))
+    _check_limits(parameter, low, high, name, place)
+    return Range(known, group, parameter.unit, low, high)
+
+
+def _malformed(text: str, place: Place) -> ApcError:
+    form = "NAME=±PERCENT% or NAME=LOW:HIGH"
+    return ApcError(Mistake("E830", place, "a box", form, text[:80], "contact.stiffness=±1%"))
+
+
+def _percentage(text: str, whole: str, place: Place) -> Fraction:
+    number = text.strip()
+    if not number.endswith("%"):
+        raise _malformed(whole, place)
+    try:
+        share = Fraction(number[:-1].strip()) / 100
+    except (ValueError, ZeroDivisionError):
+        raise _malformed(whole, place) from None
+    if share <= 0:
+        raise ApcError(Mistake("E833", place, "a box", "more than 0 %", number[:80]))
+    return share
+
+
+def _parameter(system: CompiledSystem, name: str, group: str | None, place: Place) -> Parameter:
+    """Return the parameter a box is about; refuse times and values that differ from peer to peer."""
+    common = {parameter.name: parameter for parameter in system.parameters}
+    if name not in common:
+        what = f"{name} is a time: what happens in a frame changes with it by jumps, not by degrees"
+        raise ApcError(Mistake("E831", place, what))
+    for one in system.groups:
+        own = {value.name: value for value in one.values}
+        columns = {column.name for column in one.columns}
+        if group == one.name:
+            if name in columns:
+                raise ApcError(Mistake("E831", place, f"{name} differs from peer to peer of {group}"))
+            return own.get(name, common[name])
+        if group is None and (name in own or name in columns):
+            what = f"{name} is not the same for all: {one.name} has its own"
+            raise ApcError(Mistake("E831", place, what, hint=f"{one.name}.{name}=±1%"))
+    return common[name]
+
+
+def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str, place: Place) -> None:
+    """Refuse an empty range, and one beyond the parameter's bounds."""
+    if not low < high:
+        raise ApcError(Mistake("E833", place, f"{name} runs from low to high", "a low below the high"))
+    least, most = parameter.minimum, parameter.maximum
+    if least is not None and (low < Fraction(least) or (parameter.open_minimum and low == Fraction(least))):
+        wanted = f"{'more than' if parameter.open_minimum else 'at least'} {least:g} {parameter.unit}"
+        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, f"{float(low):g}"))
+    if most is not None and high > Fraction(most):
+        wanted = f"at most {most:g} {parameter.unit}"
+        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, f"{float(high):g}"))
+
+
+def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
+    """Return a scene with parameters left open, as closed systems over these.
+
+    Raises
+    ------
+    ApcError
+        E831 a parameter left open twice, E832 a scene that is no rational function of the parameters.
+    """
+    for place, one in enumerate(ranges):
+        same = [other for other in ranges[:place] if other.name == one.name]
+        if any(other.group == one.group or None in (one.group, other.group) for other in same):
+            raise ApcError(Mistake("E831", _PLACE, f"{one.label} is left open twice"))
+    prepared = prepare(system)
+    if not all(site.affine and not site.edges for site in prepared.jacobians):
+        what = f"{system.name} is not linear: where it is linearized may move with the parameters"
+        raise ApcError(Mistake("E832", Place(system.name), what))
+    field = Ratios.of(len(ranges))
+    opened = [_opened(system, group, ranges, field) for group in system.groups]
+    for share in GENERIC:
+        point = [Override(one.name, one.group, one.low + share * (one.high - one.low)) for one in ranges]
+        groups, exchange = lifted_groups(apply(system, point), prepared=prepared)
+        members = [_members(group, exchange.starts) for group in groups]
+        if all(len({_reach(opened[place]) for place in own}) == 1 for own in members):
+            break
+    else:
+        raise AssertionError("peers of different groups are alike at three places of the box")
+    systems = split(groups, exchange).systems
+    known: dict[str, LinearSite] = {}
+    for group, own in zip(groups, members, strict=True):
+        known[group.name] = _open_site(group, opened[own[0]], system)
+    by_site = {id(group.site): known[group.name] for group in groups}
+    sites = tuple(tuple(by_site[id(group.site)] for group in one.sites) for one in systems)
+    return Box(tuple(ranges), systems, sites)
+
+
+def _members(group: PeerGroup, starts: NDArray[np.int64]) -> list[int]:
+    """Return the scene's groups, of which `starts` are the first peers, that peers of a group are of."""
+    if isinstance(group.peers, Runs):
+        ends = [(one.start, one.stop) for one in group.peers.ranges if len(one)]
+        return [
+            place
+            for place, (first, last) in enumerate(itertools.pairwise(starts.tolist()))
+            if any(start < last and stop > first for start, stop in ends)
+        ]
+    return [int(place) for place in np.unique(np.searchsorted(starts, group.peers, side="right") - 1)]
+
+
+def _reach(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """Return what of a group's parameters is open, in a form that can be compared."""
+    return tuple((name, f"{one.top}/{one.bottom}") for name, one in sorted(values.items()))
+
+
+def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field: Ratios) -> dict[str, Ratio]:
+    """Return those parameters of a group's kind that the open ones reach."""
+    holder = {parameter.name: parameter for parameter in system.parameters}
+    holder |= {value.name: value for value in group.values}
+    timings = {timing.name: timing.value for timing in system.timings}
+    varying = {column.name for column in group.columns}
+    known: dict[str, Any] = {
+        one.name: field.parameter(place)
+        for place, one in enumerate(ranges)
+        if one.group in (None, group.name)
+    }
+
+    def value_of(name: str) -> Any:
+        if name not in known:
+            known[name] = timings[name] if name not in holder else evaluated(holder[name])
+        return known[name]
+
+    def evaluated(parameter: Parameter) -> Any:
+        from apc.compiler.expression import names
+        from apc.compiler.grammar import parse_expression
+
+        if parameter.name in varying or parameter.expression is None:
+            return Fraction(parameter.value)
+        tree = parse_expression(parameter.expression, Place(parameter.name, 1, 1, parameter.expression))
+        parts = [".".join(node.parts) for node in names(tree)]
+        values = [value_of(part) for part in parts]  # all of them: only then it is known who varies
+        is_open = any(isinstance(value, Ratio) for value in values)
+        own = [part for part in parts if part in varying]
+        if own and is_open:
+            what = f"{parameter.name} depends on {own[0]}, which differs from peer to peer of {group.name}"
+            raise ApcError(Mistake("E832", _PLACE, what))
+        if own:
+            varying.add(parameter.name)
+        if not is_open:
+            return Fraction(parameter.value)
+        try:
+            return _evaluate(tree, lambda name: value_of(".".join(name)))
+        except NotRational as reason:
+            what = f"{parameter.name} = {parameter.expression[:60]} {reason}"
+            raise ApcError(Mistake("E832", _PLACE, what)) from None
+
+    found = {name: value_of(name) for name in system.kinds[group.kind].parameters}
+    return {name: value for name, value in found.items() if isinstance(value, Ratio)}
+
+
+def _evaluate(tree: Any, look_up: Callable[[tuple[str, ...]], Any]) -> Any:
+    """Return the value of an expression over rationals and quotients of polynomials."""
+    from apc.compiler.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not, Number
+
+    operators: dict[str, Callable[[Any, Any], Any]] = {
+        "+": lambda a, b: a + b,
+        "-": lambda a, b: a - b,
+        "*": lambda a, b: a * b,
+        "/": lambda a, b: a / b,
+        "^": _power,
+        "<": lambda a, b: a < b,
+        "<=": lambda a, b: a <= b,
+        ">": lambda a, b: a > b,
+        ">=": lambda a, b: a >= b,
+        "==": lambda a, b: a == b,
+        "!=": lambda a, b: a != b,
+    }
+    functions: dict[str, Callable[..., Any]] = {"abs": abs, "max": max, "min": min}
+
+    def value(node: Any) -> Any:
+        match node:
+            case Number():
+                return Fraction(node.value)
+            case Name():
+                return look_up(node.parts)
+            case Negate():
+                return -value(node.operand)
+            case Binary() | Compare():
+                return operators[node.operator](value(node.left), value(node.right))
+            case Logic():
+                left = value(node.left)
+                return (left and value(node.right)) if node.operator == "and" else left or value(node.right)
+            case Not():
+                return not value(node.operand)
+            case Conditional():
+                return value(node.then if value(node.condition) else node.otherwise)
+            case Call() if node.function in functions:
+                return functions[node.function](*(value(one) for one in node.arguments))
+            case Call():
+                raise NotRational(f"takes {node.function}() of a parameter that is left open")
+        raise AssertionError(f"no such expression: {node!r}")
+
+    return value(tree)
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    whole = int(exponent)
+    if whole != exponent:
+        raise NotRational("takes a power that is not whole")
+    return base**whole
+
+
+def _open_site(group: PeerGroup, opened: Mapping[str, Ratio], system: CompiledSystem) -> LinearSite:
+    """Return a site's matrices over the open parameters."""
+    built = group.jacobians
+    names = built.kind.parameters
+    vector = [
+        opened.get(name, Fraction(float(value))) for name, value in zip(names, group.parameters, strict=True)
+    ]
+    zeros = [[Fraction(0)] * built.function.numel_in(argument) for argument in range(4)]
+
+    def refuse(name: str, value: Any) -> Any:
+        raise NotRational(f"hold {name}(), which is no quotient of polynomials")
+
+    try:
+        flat = evaluate_exact(built.function, [*zeros, vector, [Fraction(0)]], rounded=refuse)[0]
+    except NotRational as reason:
+        what = f"the equations of {group.name} {reason}"
+        raise ApcError(Mistake("E832", Place(system.name), what)) from None
+    entries = np.empty(len(flat), dtype=object)
+    entries[:] = flat
+    return site_of_row(built, entries)

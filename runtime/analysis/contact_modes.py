@@ -1,0 +1,267 @@
+"""Which contact makes it unstable: the analysis of a scene in each of its modes.
+
+Takes: a `CompiledSystem` whose peers have parts that switch (see `switches`).
+Gives: `ContactMode`, `ContactModes`, `contact_modes`.
+Guarantees: in each mode every such part is wholly on or wholly off, and the rest is as in the scene; where a
+piece is linear, so is the answer, wherever the motion is.
+Does not: prove that a motion which changes from mode to mode stays bounded, or try peers of one group apart.
+
+The modes: every switching part on at every peer; none on; each group alone with all of its own on; and where
+several parts switch, each part alone on at every peer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.compiler.words import wrapped
+from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.runtime.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
+from apc.runtime.eigen.spectrum import UNSTABLE
+from apc.runtime.frame.linearize import SiteJacobians, linearize
+from apc.runtime.frame.parameters import resolve
+
+EVERYONE = "on at every peer"
+NOBODY = "on at no peer"
+
+MOST_NAMED = 30  # columns of a mode's name; a longer one has a line of its own
+
+# For each group of the scene, the names of the parts that are on.
+_Setting = tuple[frozenset[str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ContactMode:
+    """One mode: `on` lists (group, its parts that are on).
+
+    The spectral radius is per frame; `frequency_hz` is that of the mode of motion with it. `linearized` says
+    that some piece is not linear, so that the answer holds near the start values only. Where a mode can't be
+    analysed, `verdict` is "" and `refusal` says why.
+    """
+
+    name: str
+    on: tuple[tuple[str, tuple[str, ...]], ...]
+    verdict: str
+    stable: bool | None
+    spectral_radius: float
+    spectral_radius_error: float
+    frequency_hz: float
+    linearized: bool
+    refusal: str
+
+
+@dataclass(frozen=True, slots=True)
+class ContactModes:
+    """Every mode of a scene; none where nothing switches.
+
+    `parts` are the switching parts by name; `notes` say what was not looked into.
+    """
+
+    topology: str
+    parts: tuple[str, ...]
+    modes: tuple[ContactMode, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def unstable(self) -> tuple[str, ...]:
+        """The names of the modes that are unstable."""
+        return tuple(mode.name for mode in self.modes if mode.verdict == UNSTABLE)
+
+    @property
+    def summary(self) -> str:
+        """Which mode is unstable, in one sentence; "" where nothing switches."""
+        if not self.modes:
+            return ""
+        unstable = self.unstable
+        unknown = [mode.name for mode in self.modes if mode.stable is None]
+        if len(unstable) == len(self.modes):
+            words = "unstable in every mode"
+        elif unstable:
+            words = f"unstable when {' or '.join(unstable)}"
+        else:
+            words = "no mode is known to be unstable" if unknown else "stable in every mode"
+        if unknown:
+            words += f"; not decided when {' or '.join(unknown)}"
+        return f"{', '.join(self.parts)}: {words}"
+
+    def __str__(self) -> str:
+        """Return the modes as a table of at most 80 columns, and which is unstable in words."""
+        if not self.modes:
+            return "\n".join([f"{self.topology}: no part switches", *self.notes])
+        lines = [*wrapped(f"{self.topology}: {self.summary}"), ""]
+        lines += [f"  {name} on: it follows the motion; off: it does not" for name in self.parts]
+        width = min(MOST_NAMED, max(len(mode.name) for mode in self.modes))
+        lines += ["", f"  {'':<{width}}  {'spectral radius':<19}  {'frequency':>9}  verdict"]
+        for mode in self.modes:
+            if len(mode.name) > width:
+                lines.append(f"  {mode.name}")
+            head = f"  {mode.name if len(mode.name) <= width else '':<{width}}"
+            if mode.refusal:
+                lines += [f"{head}  not analysed:", *wrapped(mode.refusal, "    ", "    ")]
+                continue
+            radius = f"{mode.spectral_radius:.9f} ± {mode.spectral_radius_error:.0e}"
+            frequency = f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–"
+            verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
+            lines.append(f"{head}  {radius:<19}  {frequency:>9}  {verdict}{'*' if mode.linearized else ''}")
+        if any(mode.linearized for mode in self.modes):
+            lines += ["", "  * near the start values: this piece is not linear"]
+        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the modes as plain data, ready for JSON."""
+        return {
+            "topology": self.topology,
+            "parts": list(self.parts),
+            "unstable": list(self.unstable),
+            "modes": [
+                {
+                    "name": mode.name,
+                    "on": {group: list(parts) for group, parts in mode.on},
+                    "verdict": mode.verdict or None,
+                    "stable": mode.stable,
+                    "spectral_radius": mode.spectral_radius if mode.verdict else None,
+                    "spectral_radius_error": mode.spectral_radius_error if mode.verdict else None,
+                    "frequency_hz": mode.frequency_hz if mode.verdict else None,
+                    "linearized": mode.linearized,
+                    "refusal": mode.refusal,
+                }
+                for mode in self.modes
+            ],
+            "notes": list(self.notes),
+        }
+
+
+def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -> ContactModes:
+    """Analyse a scene in each mode of its contacts, walls and limits.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    prepared
+        From `analysis.prepare`, of this system with these timings; saves building the Jacobians again.
+
+    Raises
+    ------
+    ApcError
+        E863 a part that takes too many decisions.
+    """
+    prepared = prepared or prepare(system)
+    switched = [find_switches(kind) for kind in system.kinds]
+    hidden = dict.fromkeys(one.kind.name for one in switched if not one.walkable)
+    notes = tuple(f"not looked into: {name}, which has a nonlinear loop" for name in hidden)
+    numbers = resolve(system)
+    parts: list[tuple[SwitchingPart, ...]] = []
+    for index, one in enumerate(switched):
+        rows = [numbers.parameters[g][0] for g, group in enumerate(system.groups) if group.kind == index]
+        parts.append(switching_parts(one, rows[0]) if rows else ())
+    names = tuple(dict.fromkeys(part.name for listed in parts for part in listed))
+    has = [frozenset(part.name for part in parts[group.kind]) for group in system.groups]
+    scene = _Scene(system, prepared, switched, parts)
+    modes = [scene.analyze(name, setting) for name, setting in _settings(system, names, has)] if names else []
+    return ContactModes(system.name, names, tuple(modes), notes)
+
+
+def _settings(
+    system: CompiledSystem, names: Sequence[str], has: Sequence[frozenset[str]]
+) -> Iterator[tuple[str, _Setting]]:
+    """Yield the modes of a scene, each once."""
+    nothing: frozenset[str] = frozenset()
+    listed = [(EVERYONE, tuple(has)), (NOBODY, tuple(nothing for _ in has))]
+    if len(system.groups) > 1:
+        listed += [
+            (f"on at {group.name} alone", tuple(own if g == place else nothing for g, own in enumerate(has)))
+            for place, group in enumerate(system.groups)
+        ]
+    if len(names) > 1:
+        listed += [(f"{name} on alone", tuple(own & {name} for own in has)) for name in names]
+    known: set[_Setting] = set()
+    for name, setting in listed:
+        if setting not in known:
+            known.add(setting)
+            yield name, setting
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """A scene with its switches; one and the same piece of a kind is built once."""
+
+    system: CompiledSystem
+    prepared: Prepared
+    switched: Sequence[SwitchedKind]
+    parts: Sequence[tuple[SwitchingPart, ...]]
+
+    def analyze(self, name: str, setting: _Setting) -> ContactMode:
+        """Analyse the scene with these parts on."""
+        on = tuple(
+            (group.name, tuple(sorted(own))) for group, own in zip(self.system.groups, setting, strict=True)
+        )
+        # Groups of one kind with other parts on are of two kinds now.
+        numbers: dict[tuple[int, frozenset[str]], int] = {}
+        groups = tuple(
+            replace(group, kind=numbers.setdefault((group.kind, own), len(numbers)))
+            for group, own in zip(self.system.groups, setting, strict=True)
+        )
+        sites = tuple(self.site(kind, own) for kind, own in numbers)
+        kinds = tuple(self.system.kinds[kind] for kind, _ in numbers)
+        system = replace(self.system, kinds=kinds, groups=groups)
+        if refusal := _no_slope(system, sites):
+            return _refused(name, on, refusal)
+        prepared = replace(self.prepared, jacobians=sites)
+        try:
+            return _mode(name, on, analyze(system, prepared=prepared))
+        except ApcError as error:
+            return _refused(name, on, error.mistakes[0].sentence)
+
+    def site(self, kind: int, on: frozenset[str]) -> SiteJacobians:
+        """Return the Jacobians of a kind with these parts on and all others off."""
+        base = self.prepared.jacobians[kind]
+        settings: Mapping[int, bool] = {
+            place: value
+            for part in self.parts[kind]
+            for place, value in zip(part.decisions, part.on if part.name in on else part.off, strict=True)
+        }
+        return bind(self.switched[kind], base, settings) if self.switched[kind].decisions else base
+
+
+def _no_slope(system: CompiledSystem, sites: Sequence[SiteJacobians]) -> str:
+    """Say which peers' pieces have no slopes at the start values, "" if all have."""
+    numbers = resolve(system)
+    for group, rows in zip(system.groups, numbers.parameters, strict=True):
+        site = sites[group.kind]
+        if site.affine or site.edges:  # slopes everywhere, or found with those who are heard
+            continue
+        found = linearize(site, rows[0])
+        matrices = [
+            found.a,
+            found.b,
+            *(one for tick in found.ticks for one in (tick.x, tick.u, tick.m, tick.r)),
+        ]
+        if not all(np.isfinite(matrix).all() for matrix in matrices):
+            return f"this piece of {group.name} is not linear and has no slope at the start values"
+    return ""
+
+
+def _mode(name: str, on: tuple[tuple[str, tuple[str, ...]], ...], found: Analysis) -> ContactMode:
+    return ContactMode(
+        name=name,
+        on=on,
+        verdict=found.verdict,
+        stable=found.stable,
+        spectral_radius=found.spectral_radius,
+        spectral_radius_error=found.spectral_radius_error,
+        frequency_hz=found.modes[0].frequency_hz if found.modes else 0.0,
+        linearized=found.linearized,
+        refusal="",
+    )
+
+
+def _refused(name: str, on: tuple[tuple[str, tuple[str, ...]], ...], refusal: str) -> ContactMode:
+    nan = float("nan")
+    return ContactMode(name, on, "", None, nan, nan, 0.0, linearized=False, refusal=refusal)

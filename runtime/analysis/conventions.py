@@ -1,0 +1,325 @@
+"""Does the verdict hang on a convention: every order of coincident events, and both readings of the start.
+
+Takes: a `CompiledSystem`.
+Gives: `Outcome`, `Conventions`, `conventions`.
+Guarantees: every order of `schedule.ORDER` is covered; orders that mean the same frame are analysed once.
+Does not: leave anything out silently: what is not repeated says why.
+
+What coincides and does not commute: a packet that arrives at a tick, a packet without delay, a force without
+delay, a hold that switches as a tick or a packet reads it. Before the first packet a receiver holds the
+sender's start values, or nothing (zero); that can matter only where the linearization depends on what is
+heard.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.errors import ApcError
+from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.runtime.frame.linearize import LinearSite, SiteJacobians
+from apc.runtime.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value, build_schedules
+
+# The pairs of events whose order at one instant can change the frame, and what each order other than the
+# default means. Sending and ticking read the same instant and write different things: their order can't.
+DEPARTURES = {
+    ("tick", "deliver"): "a tick misses a packet that arrives with it",
+    ("deliver", "send"): "a packet without delay is delivered a tick of its link later",
+    ("act", "tick"): "a hold switches before the tick; a force without delay acts a tick later",
+    ("act", "send"): "a hold switches before a packet that carries it is sent",
+}
+DEFAULT = "sent, delivered, computed, acting (the default)"
+
+ORDERS = math.factorial(len(ORDER))
+
+SENDER = "the sender's start values"
+NOTHING = "nothing"
+
+# A plain analysis repeats at most so much: cubes of states, and events of a frame, over all repetitions. Each
+# takes some milliseconds (measured: 1e6 cubes 10 ms, 1,000 events 15 ms).
+QUICK_CUBES = 1_500_000
+QUICK_EVENTS = 2_000
+QUICK_METHODS = ("modes", "dense")  # those whose cost the cubes say
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one reading of the conventions leads to.
+
+    `orders` are the orders of coincident events that mean this frame, `departures` in words what they all do
+    other than the default order; `start` is what is heard before the first packet, "" where it can't matter.
+    Where the analysis refuses this reading, `verdict` is "" and `refusal` says why.
+    """
+
+    orders: tuple[tuple[str, ...], ...]
+    departures: tuple[str, ...]
+    start: str
+    verdict: str
+    stable: bool | None
+    spectral_radius: float
+    spectral_radius_error: float
+    frame_s: float
+    refusal: str
+
+    @property
+    def words(self) -> str:
+        """The reading in words."""
+        order = "; ".join(self.departures) or DEFAULT
+        return f"{order}; before the first packet {self.start}" if self.start else order
+
+
+@dataclass(frozen=True, slots=True)
+class Conventions:
+    """The outcomes, the default one first; `repeated` says whether there are others to compare it with.
+
+    `not_repeated` says why not. `start_matters` says whether the linearization depends on what is heard.
+    """
+
+    topology: str
+    outcomes: tuple[Outcome, ...]
+    start_matters: bool
+    not_repeated: str
+
+    @property
+    def repeated(self) -> bool:
+        """Whether the analysis was repeated under every convention."""
+        return not self.not_repeated
+
+    @property
+    def flips(self) -> bool:
+        """Whether the verdict depends on the conventions."""
+        return len({(one.verdict, bool(one.refusal)) for one in self.outcomes}) > 1
+
+    @property
+    def warning(self) -> str:
+        """A warning in one sentence if the verdict flips, else ""."""
+        default = self.outcomes[0]
+        other = next((one for one in self.outcomes if one.verdict != default.verdict), None)
+        if other is None:
+            return ""
+        verdict = other.verdict or "not analysed"
+        return f"the verdict hangs on a convention: {verdict} if {other.words} (--conventions lists all)"
+
+    def __str__(self) -> str:
+        """Return the outcomes as lines of at most 80 columns."""
+        lines = [f"{self.topology}: {self._headline()}", ""]
+        for number, one in enumerate(self.outcomes, 1):
+            radius = f"{one.spectral_radius:.9f} ± {one.spectral_radius_error:.0e}"
+            lines.append(f"  {number}  {one.verdict or 'not analysed'}")
+            lines.append(f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}")
+            lines += [f"     {departure}" for departure in one.departures or (DEFAULT,)]
+            if one.start:
+                lines.append(f"     heard before the first packet: {one.start}")
+            shown = " < ".join(one.orders[0])
+            lines.append(f"     {len(one.orders)} of {ORDERS} orders, such as {shown}")
+        if self.repeated and not self.start_matters:
+            lines += ["", "  What is heard before the first packet can't change the verdict."]
+        return "\n".join(lines)
+
+    def _headline(self) -> str:
+        if not self.repeated:
+            return self.not_repeated
+        if self.flips:
+            return "the verdict depends on the conventions"
+        return "the same verdict under every convention"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the outcomes as plain data, ready for JSON."""
+        return {
+            "topology": self.topology,
+            "flips": self.flips,
+            "repeated": self.repeated,
+            "not_repeated": self.not_repeated,
+            "start_matters": self.start_matters,
+            "outcomes": [
+                {
+                    "orders": [list(order) for order in one.orders],
+                    "departures": list(one.departures),
+                    "start": one.start,
+                    "verdict": one.verdict or None,
+                    "stable": one.stable,
+                    "spectral_radius": one.spectral_radius if one.verdict else None,
+                    "spectral_radius_error": one.spectral_radius_error if one.verdict else None,
+                    "frame_s": one.frame_s,
+                    "refusal": one.refusal,
+                }
+                for one in self.outcomes
+            ],
+        }
+
+
+def conventions(
+    system: CompiledSystem,
+    *,
+    prepared: Prepared | None = None,
+    default: Analysis | None = None,
+    quick: bool = False,
+) -> Conventions:
+    """Repeat an analysis under every convention of time.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    prepared
+        From `analysis.prepare`, of this system with these timings; saves building the Jacobians again.
+    default
+        The analysis under the default conventions, if it was done before.
+    quick
+        Give up, and say so, where repeating would take more than some tens of milliseconds.
+
+    Raises
+    ------
+    ApcError
+        Whatever the analysis under the default conventions raises.
+    """
+    prepared = prepared or prepare(system)
+    default = default or analyze(system, prepared=prepared)
+    used = [prepared.jacobians[group.kind] for group in system.groups]
+    matters = any(_hearing_matters(site) for site in used)
+    carried = any(send.u.any() for site in used for send in site.pattern.sends)
+    pairs = {pair: words for pair, words in DEPARTURES.items() if pair != ("act", "send") or carried}
+    first = _outcome(default, (ORDER,), {}, SENDER if matters else "")
+    if quick and (why := _too_much(prepared, default, 1)):
+        return Conventions(system.name, (first,), matters, why)
+    classes = _classes(system, prepared)
+    readings = [SENDER, NOTHING] if matters else [""]
+    if quick and (why := _too_much(prepared, default, len(classes) * len(readings) - 1)):
+        return Conventions(system.name, (first,), matters, why)
+    silent = tuple(_silent(site) for site in prepared.jacobians)
+    outcomes = []
+    for orders, schedules in classes:
+        for start in readings:
+            if ORDER in orders and start != NOTHING:
+                outcomes.append(_outcome(default, orders, pairs, start))
+                continue
+            heard = silent if start == NOTHING else prepared.jacobians
+            changed = Prepared(heard, schedules, prepared.timings, orders[0])
+            try:
+                found = analyze(system, prepared=changed)
+            except ApcError as refused:
+                outcomes.append(_refused(refused, orders, pairs, start, float(schedules[0].frame_s)))
+            else:
+                outcomes.append(_outcome(found, orders, pairs, start))
+    return Conventions(system.name, tuple(outcomes), matters, "")
+
+
+def _classes(
+    system: CompiledSystem, prepared: Prepared
+) -> list[tuple[tuple[tuple[str, ...], ...], tuple[Schedule, ...]]]:
+    """Return the orders that mean the same frame, with their schedules; the default's first."""
+    patterns = [site.pattern for site in prepared.jacobians]
+    built: dict[tuple[bool, ...], tuple[Hashable, tuple[Schedule, ...]]] = {}
+    found: dict[Hashable, list[tuple[str, ...]]] = {}
+    schedules: dict[Hashable, tuple[Schedule, ...]] = {}
+    for order in [ORDER, *(one for one in itertools.permutations(ORDER) if one != ORDER)]:
+        key = tuple(order.index(a) < order.index(b) for a, b in DEPARTURES)
+        if key not in built:
+            made = build_schedules(system, prepared.timings, patterns, order=order)
+            kinds = [patterns[group.kind] for group in system.groups]
+            built[key] = tuple(_meaning(*pair) for pair in zip(made, kinds, strict=True)), made
+        meaning, made = built[key]
+        found.setdefault(meaning, []).append(order)
+        schedules.setdefault(meaning, made)
+    return [(tuple(orders), schedules[meaning]) for meaning, orders in found.items()]
+
+
+def _meaning(schedule: Schedule, pattern: LinearSite) -> Hashable:
+    """Return what a schedule does, whatever the order of events at one instant that commute."""
+    acting: list[Value | None] = list(schedule.acting)
+
+    def reads(matrix: Any) -> Hashable:
+        return tuple(acting[h] for h in np.flatnonzero(np.asarray(matrix).any(axis=0)))
+
+    course: list[Hashable] = []
+    instant: set[Hashable] = set()
+    for event in schedule.events:
+        match event:
+            case Propagate(duration):
+                course += [frozenset(instant), duration, reads(pattern.b)]
+                instant = set()
+            case Act(hold, value):
+                acting[hold] = value
+            case Send(partition, rows):
+                sent = tuple((channel, schedule.sent[row]) for channel, row in rows)
+                instant.add(("send", partition, sent, reads(pattern.sends[partition].u)))
+            case Tick(partition, index, heard):
+                names = tuple(tuple(schedule.heard[row] for row in rows) for rows in heard)
+                instant.add(("tick", partition, index, names, reads(pattern.ticks[partition].u)))
+    return tuple(course), frozenset(instant)
+
+
+def _hearing_matters(site: SiteJacobians) -> bool:
+    """Say whether a site's linearization depends on what it hears."""
+    if site.affine:
+        return False
+    if not all(edge.affine for edge in site.edges.values()) or not site.walkable:
+        return True
+    heard = site.function.sx_in()[3]
+    return bool(heard.numel() and casadi.depends_on(site.function(*site.function.sx_in()), heard))
+
+
+def _silent(site: SiteJacobians) -> SiteJacobians:
+    """Return a site whose start value of everything it sends is zero; how it sends is not changed."""
+    return replace(site, kind=replace(site.kind, sends=tuple(_no_sends(site.kind))))
+
+
+def _no_sends(kind: Kind) -> list[Any]:
+    found = []
+    for sending in kind.sends:
+        symbols = [casadi.SX.sym(f"i{i}", sending.send.sparsity_in(i)) for i in range(sending.send.n_in())]
+        nothing = casadi.Function("nothing", symbols, [casadi.SX.zeros(len(sending.channels))])
+        found.append(replace(sending, send=nothing))
+    return found
+
+
+def _too_much(prepared: Prepared, default: Analysis, times: int) -> str:
+    """Say why an analysis is not repeated so many times in passing, "" if it is."""
+    if default.method not in QUICK_METHODS:
+        return f"not repeated under other conventions: a {default.method} analysis is no passing matter"
+    sizes = Counter(mode.shape for mode in default.modes)
+    events = max(len(schedule.events) for schedule in prepared.schedules) * len(set(prepared.schedules))
+    if times * sum(size**3 for size in sizes.values()) > QUICK_CUBES or times * events > QUICK_EVENTS:
+        return "not repeated under other conventions: too large to do in passing"
+    return ""
+
+
+_Pairs = Mapping[tuple[str, str], str]
+
+
+def _outcome(found: Analysis, orders: Sequence[tuple[str, ...]], pairs: _Pairs, start: str) -> Outcome:
+    return Outcome(
+        orders=tuple(orders),
+        departures=_departures(orders, pairs),
+        start=start,
+        verdict=found.verdict,
+        stable=found.stable,
+        spectral_radius=found.spectral_radius,
+        spectral_radius_error=found.spectral_radius_error,
+        frame_s=found.frame_s,
+        refusal="",
+    )
+
+
+def _refused(
+    error: ApcError, orders: Sequence[tuple[str, ...]], pairs: _Pairs, start: str, frame_s: float
+) -> Outcome:
+    nan = float("nan")
+    sentence = error.mistakes[0].sentence
+    return Outcome(tuple(orders), _departures(orders, pairs), start, "", None, nan, nan, frame_s, sentence)
+
+
+def _departures(orders: Sequence[tuple[str, ...]], pairs: _Pairs) -> tuple[str, ...]:
+    """Return what all of these orders do other than the default one, in words."""
+    return tuple(
+        words for (a, b), words in pairs.items() if all(order.index(a) < order.index(b) for order in orders)
+    )

@@ -1,0 +1,216 @@
+"""How a system is going to be analysed: by which method, as which systems.
+
+Takes: a `CompiledSystem` with its Jacobians, schedules and numbers, and the exchange between its peers.
+Gives: `Plan`, `make_plan`, `METHODS`.
+Guarantees: nothing is solved, and no matrix of a whole system is built.
+Does not: analyse (see `analysis`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.eigen.modes import Loop, arrange, dense_loop
+from apc.runtime.eigen.peers import (
+    MOST_STATES,
+    PeerGroup,
+    more_differ,
+    peer_groups,
+    states_of,
+    too_large,
+    used_ways,
+)
+from apc.runtime.frame.exchange import Exchange
+from apc.runtime.frame.linearize import SiteJacobians
+from apc.runtime.frame.parameters import Numbers
+from apc.runtime.frame.schedule import Schedule
+from apc.runtime.large.graph import is_large_ring
+
+METHODS = ("auto", "modes", "dense", "determinant", "krylov")
+
+# Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
+# says more.
+FEW_STATES = 200
+
+# Up to so many peers a complete graph is written out as arcs.
+MOST_FULL = 500
+
+# Equal peers on a graph without a closed form: of so many, its eigenvalues are not computed.
+MANY_PEERS = 1500
+
+# From so many packets on their way on, leaving them out of the state is quicker.
+LONG_LINES = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The method, and the groups of equal peers with their loops; of peers by the thousand neither.
+
+    `ring` says that of the loops, one an eigenvalue of a large ring, only those that decide are made.
+    `systems` are (how many, how large): states, or rows of a determinant.
+    """
+
+    method: str
+    groups: tuple[PeerGroup, ...]
+    loops: tuple[Loop, ...]
+    ring: bool
+    systems: tuple[tuple[int, int], ...]
+    notes: tuple[str, ...]
+
+
+def make_plan(
+    system: CompiledSystem,
+    jacobians: Sequence[SiteJacobians],
+    schedules: Sequence[Schedule],
+    numbers: Numbers,
+    exchange: Exchange,
+    method: str = "auto",
+) -> Plan:
+    """Choose the method that serves a system, or see that one serves it that is asked for.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    jacobians, schedules, numbers, exchange
+        One a kind, one a group, and what they are evaluated with.
+    method
+        One of `METHODS`.
+
+    Raises
+    ------
+    ApcError
+        E804 a system of too many states for its matrix, E850 a method that can't serve this scene; and those
+        of `peers.peer_groups`.
+    """
+    assert method in METHODS, f"no such method: {method}"
+    if method in ("auto", "determinant", "krylov"):
+        reason = _not_crowds(system, jacobians)
+        if method == "krylov" and reason:
+            raise cannot_serve(system, method, reason)
+        whole = method == "krylov" or (method == "determinant" and _prompt(schedules, numbers, exchange))
+        if not reason and (whole or _many(system, jacobians, schedules, numbers, exchange)):
+            return _plan_crowds(system, jacobians, schedules, exchange, method)
+    groups = peer_groups(system, jacobians, schedules, numbers, exchange)
+    if method in ("auto", "modes") and is_large_ring(groups, exchange):
+        states = states_of(groups[0].schedule, groups[0].jacobians)
+        return Plan("modes", groups, (), True, ((exchange.peers // 2 + 1, states),), ())
+    if method == "dense":
+        _refuse_dense(groups, exchange)
+        loops: tuple[Loop, ...] = (dense_loop(groups, exchange),)
+        found, notes = "dense", tuple[str, ...]()
+    else:
+        arranged = arrange(groups, exchange)
+        if method == "modes" and arranged.method != "modes":
+            raise cannot_serve(system, method, arranged.notes[0])
+        loops, found, notes = arranged.loops, arranged.method, arranged.notes
+        packets = max(sum(sum(group.schedule.depths) for group in loop.sites) for loop in loops)
+        if method == "determinant":
+            found = method
+        elif method == "auto" and (
+            max(sum(group.schedule.depths) for loop in loops for group in loop.sites) > LONG_LINES
+            or (packets > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)
+        ):
+            found = "determinant"
+            notes = (*notes, f"{packets:,} packets are on their way at a time, none of which is made a state")
+    if found != "determinant":
+        for loop in loops:
+            if loop.states > MOST_STATES:
+                raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
+    return Plan(found, groups, loops, False, _sizes(loops, found), notes)
+
+
+def cannot_serve(system: CompiledSystem, method: str, reason: str) -> ApcError:
+    """Return the refusal of a method that can't serve a scene."""
+    what = f"method {method} can't serve this scene: {reason}"
+    return ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto"))
+
+
+def _sizes(loops: Sequence[Loop], method: str) -> tuple[tuple[int, int], ...]:
+    """Return how many loops there are of which size."""
+    found: dict[int, int] = {}
+    for loop in loops:
+        rows = sum(len(group.schedule.sent) for group in loop.sites)
+        size = rows if method == "determinant" else loop.states
+        found[size] = found.get(size, 0) + 1
+    return tuple((count, size) for size, count in found.items())
+
+
+def _refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
+    """Refuse so many peers before each of them is looked at."""
+    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
+    if states > MOST_STATES:
+        raise too_large(exchange, f"{exchange.peers:,} peers", states)
+
+
+def _not_crowds(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> str:
+    """Say why peers can't be taken by the thousand, "" if they can."""
+    for kind, site in zip(system.kinds, jacobians, strict=True):
+        if site.edges:
+            return f"{kind.name} looks at each sender by itself"
+        if not site.affine:
+            return f"{kind.name} is not linear, so that each peer is linearized where it starts"
+    return ""
+
+
+def _many(
+    system: CompiledSystem,
+    jacobians: Sequence[SiteJacobians],
+    schedules: Sequence[Schedule],
+    numbers: Numbers,
+    exchange: Exchange,
+) -> bool:
+    """Say whether so many peers differ, or have so large a graph, that they are not worth an object each."""
+    shapes = {exchange.links[way.link].graph.shape for way in used_ways(schedules)}
+    if shapes - {"complete", "ring", "star"} and exchange.peers > MANY_PEERS:
+        return True
+    states = sum(
+        len(rows) * len(system.kinds[group.kind].states)
+        for rows, group in zip(numbers.parameters, system.groups, strict=True)
+    )
+    if states <= FEW_STATES:
+        return False
+    most = max(len(kind.states) for kind in system.kinds)
+    return more_differ(system, jacobians, numbers, exchange, FEW_STATES // most)
+
+
+def _prompt(schedules: Sequence[Schedule], numbers: Numbers, exchange: Exchange) -> bool:
+    """Say whether peers differ, all hear all others, and few packets are on their way."""
+    complete = all(exchange.is_complete(way.link) for way in used_ways(schedules))
+    short = max(sum(schedule.depths) for schedule in schedules) <= LONG_LINES
+    return complete and short and sum(map(len, numbers.parameters)) > 1
+
+
+def _plan_crowds(
+    system: CompiledSystem,
+    jacobians: Sequence[SiteJacobians],
+    schedules: Sequence[Schedule],
+    exchange: Exchange,
+    method: str,
+) -> Plan:
+    """Plan for peers by the thousand."""
+    links = [way.link for way in used_ways(schedules)]
+    sparse = [link for link in links if not exchange.is_complete(link)]
+    full = [link for link in links if exchange.is_complete(link)]
+    if method == "auto":
+        method = "krylov" if sparse else "determinant"
+    if method == "determinant" and sparse:
+        reason = f"the peers differ, and not all of them hear all others over {sparse[0]}"
+        raise cannot_serve(system, method, reason)
+    if method == "krylov" and full and exchange.peers > MOST_FULL:
+        reason = f"all of {exchange.peers:,} peers hear each other over {full[0]}: nothing is sparse"
+        raise cannot_serve(system, method, reason)
+    if method == "krylov":
+        states = sum(
+            group.count * states_of(schedule, jacobians[group.kind])
+            for group, schedule in zip(system.groups, schedules, strict=True)
+        )
+        return Plan(method, (), (), False, ((1, states),), ("all peers as one sparse matrix",))
+    rows = len(
+        {(exchange.role(place), sent) for place, schedule in enumerate(schedules) for sent in schedule.sent}
+    )
+    note = "peers of different numbers, by one determinant of what is sent in a frame"
+    return Plan(method, (), (), False, ((1, rows),), (note,))

@@ -1,0 +1,353 @@
+"""Where a peer's equations switch between linear pieces: contacts, walls, limits.
+
+Takes: a kind of a `CompiledSystem`.
+Gives: `Decision`, `SwitchedKind`, `SwitchingPart`, `find_switches`, `switching_parts`, `bind`.
+Guarantees: found in the equations themselves: a comparison, an `if`, a `max`, `min`, `abs` or `sign` of
+something that moves is a decision, whatever the part is called.
+Does not: know which pieces a motion can reach, or switch what depends on time and parameters alone.
+
+Each decision becomes a number d, 0 or 1 (c a condition):
+
+    c: d     max(a, b), min(a, b): d a + (1 − d) b     |a|: (2 d − 1) a     sign(a): 2 d − 1
+
+With all d set, what is left has the slopes of one piece.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Kind
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.frame.linearize import SiteJacobians, jacobians, start_values
+
+# A part with more decisions than this is refused: its pieces are as many as 2 to that power.
+MOST_DECISIONS = 6
+
+_EXTREMES = (casadi.OP_FMIN, casadi.OP_FMAX)
+_COMPARISONS = (casadi.OP_LT, casadi.OP_LE)
+# Equal, not equal: of things that move they are so at an instant at most.
+_POINTS = {casadi.OP_EQ: 0.0, casadi.OP_NE: 1.0}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """A decision: its symbol, and the names of what it changes."""
+
+    symbol: Any  # casadi.SX
+    changes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Opened:
+    """A function with its decisions as symbols: `where` it stands, its inputs, its output column."""
+
+    where: tuple[str, int, int]  # ("derivative" | "tick" | "send" | "edge", partition, receive)
+    inputs: tuple[Any, ...]  # casadi.SX
+    output: Any  # casadi.SX
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SwitchedKind:
+    """A kind with its decisions laid open. `walkable` is False where a nonlinear loop hides them."""
+
+    kind: Kind
+    decisions: tuple[Decision, ...]
+    functions: tuple[_Opened, ...]
+    walkable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SwitchingPart:
+    """What switches as one: on, its force follows the motion; off, it does not, or less.
+
+    `name` is what it computes, such as `contact.push`; `on` and `off` are settings, decision by decision, of
+    `decisions` (their places in the kind).
+    """
+
+    name: str
+    decisions: tuple[int, ...]
+    on: tuple[bool, ...]
+    off: tuple[bool, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """A value on the walk: its expression, its number (equal expressions have one), and what it hangs on."""
+
+    expression: Any  # casadi.SX
+    number: int
+    moves: bool
+    decided: bool
+
+
+class _Walk:
+    """Opens the functions of one kind; equal decisions, wherever they stand, are one."""
+
+    def __init__(self) -> None:
+        self.numbers: dict[Any, int] = {}
+        self.symbols: dict[int, Any] = {}
+        self.operands: dict[int, list[Any]] = {}
+
+    def number(self, key: Any) -> int:
+        return self.numbers.setdefault(key, len(self.numbers))
+
+    def decide(self, code: int, operands: Sequence[_Step]) -> _Step:
+        """Return the symbol of a decision between these operands."""
+        number = self.number(("decision", code, *(one.number for one in operands)))
+        if number not in self.symbols:
+            self.symbols[number] = casadi.SX.sym(f"d{len(self.symbols)}")
+            self.operands[number] = [one.expression for one in operands]
+        return _Step(self.symbols[number], number, moves=False, decided=True)
+
+    def open(self, function: Any, names: Sequence[str]) -> tuple[tuple[Any, ...], Any]:
+        """Return the inputs and the output column of a function with its decisions as symbols.
+
+        `names` are the arguments', "p" and "t" those that do not move.
+        """
+        inputs = tuple(casadi.SX.sym(name, function.sparsity_in(i)) for i, name in enumerate(names))
+        nonzeros = [casadi.vertsplit(one.nz[:]) if one.nnz() else [] for one in inputs]
+        results = [casadi.SX(0.0)] * function.nnz_out(0)
+        work: list[Any] = [None] * function.sz_w()
+        for index in range(function.n_instructions()):
+            code = function.instruction_id(index)
+            into, out = function.instruction_input(index), function.instruction_output(index)
+            if code == casadi.OP_INPUT:
+                name = names[into[0]]
+                number = self.number((name, into[1]))
+                moves = name not in ("p", "t")
+                work[out[0]] = _Step(nonzeros[into[0]][into[1]], number, moves, decided=False)
+            elif code == casadi.OP_OUTPUT:
+                results[out[1]] = work[into[0]].expression
+            elif code == casadi.OP_CONST:
+                value = function.instruction_constant(index)
+                work[out[0]] = _Step(casadi.SX(value), self.number(("constant", value)), False, False)
+            else:
+                work[out[0]] = self.apply(code, [work[place] for place in into])
+        column = casadi.SX(function.sparsity_out(0), casadi.vertcat(*results)) if results else casadi.SX(0, 1)
+        return inputs, casadi.densify(column)
+
+    def apply(self, code: int, operands: Sequence[_Step]) -> _Step:
+        """Return an operation of the function, or what a decision makes of it."""
+        number = self.number((code, *(one.number for one in operands)))
+        moves = any(one.moves for one in operands)
+        decided = any(one.decided for one in operands)
+        values = [one.expression for one in operands]
+        if moves and code in _COMPARISONS:
+            return self.decide(code, operands)
+        if moves and code in _POINTS:
+            return _Step(casadi.SX(_POINTS[code]), number, False, False)
+        if moves and code in _EXTREMES:
+            d = self.decide(code, operands).expression
+            return _Step(d * values[0] + (1 - d) * values[1], number, True, True)
+        if moves and code in (casadi.OP_FABS, casadi.OP_SIGN):
+            d = self.decide(casadi.OP_SIGN, operands).expression
+            value = (2 * d - 1) * values[0] if code == casadi.OP_FABS else 2 * d - 1
+            return _Step(value, number, code == casadi.OP_FABS, True)
+        if code == casadi.OP_IF_ELSE_ZERO and operands[0].decided:
+            return _Step(values[0] * values[1], number, moves, True)
+        one_or_two = casadi.SX.unary if len(values) == 1 else casadi.SX.binary
+        return _Step(one_or_two(code, *values), number, moves, decided)
+
+
+def find_switches(kind: Kind) -> SwitchedKind:
+    """Lay a kind's decisions open."""
+    functions = _functions(kind)
+    if not all(function.is_a("SXFunction") for _, function, _ in functions):
+        return SwitchedKind(kind, (), (), walkable=False)
+    walk = _Walk()
+    opened = tuple(_Opened(where, *walk.open(function, names)) for where, function, names in functions)
+    decisions = []
+    for number, symbol in walk.symbols.items():
+        changed: dict[str, None] = {}
+        for one in opened:
+            if casadi.depends_on(one.output, symbol):
+                changed |= dict.fromkeys(_changed(kind, one, symbol, walk.operands[number]))
+        decisions.append(Decision(symbol, tuple(changed)))
+    return SwitchedKind(kind, tuple(decisions), opened, walkable=True)
+
+
+def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> tuple[SwitchingPart, ...]:
+    """Group a kind's decisions by what they change, and find each group's pieces "on" and "off".
+
+    Parameters
+    ----------
+    switched
+        The kind.
+    parameters
+        A vector (n_p,) of this kind: where two pieces depend on the same motions, the steeper is "on".
+
+    Raises
+    ------
+    ApcError
+        E863 a part with too many decisions.
+    """
+    parts = []
+    for places in _together(switched.decisions):
+        names = list(dict.fromkeys(name for place in places for name in switched.decisions[place].changes))
+        owners = {one.rpartition(".")[0] for one in names}
+        name = owners.pop() if len(names) > 1 and len(owners) == 1 else ", ".join(names)
+        if len(places) > MOST_DECISIONS:
+            what = (
+                f"{name} of {switched.kind.name} takes {len(places)} decisions; "
+                f"at most {MOST_DECISIONS} are analysed piece by piece"
+            )
+            raise ApcError(Mistake("E863", Place(switched.kind.name), what))
+        found = _extremes(switched, places, parameters)
+        if found is not None:
+            parts.append(SwitchingPart(name, places, *found))
+    return tuple(parts)
+
+
+def bind(switched: SwitchedKind, base: SiteJacobians, settings: Mapping[int, bool]) -> SiteJacobians:
+    """Return the Jacobians of a kind with every decision set.
+
+    Parameters
+    ----------
+    switched
+        The kind.
+    base
+        Its ordinary Jacobians: states, start values and structural patterns stay theirs, so that every piece
+        has the same frame and the same states.
+    settings
+        By the place of the decision; what is left out is off.
+    """
+    return replace(jacobians(_bound(switched, settings)), kind=base.kind, pattern=base.pattern)
+
+
+def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...]]]:
+    """Return a kind's functions: where each stands, itself, and its arguments' names."""
+    listed: list[tuple[tuple[str, int, int], Any, tuple[str, ...]]] = [
+        (("derivative", 0, 0), kind.derivative, ("x", "u", "p", "t"))
+    ]
+    for p, partition in enumerate(kind.clocks):
+        names = ("x", "u", f"m{p}", f"r{p}", "p", "t")
+        listed.append((("tick", p, 0), partition.tick, names))
+        for place, receive in enumerate(partition.receives):
+            if receive.edge is not None:
+                edge = ("x", "u", f"m{p}", f"s {receive.link}", "p", "t")
+                listed.append((("edge", p, place), receive.edge, edge))
+    listed += [(("send", p, 0), one.send, ("x", "u", "p", "t")) for p, one in enumerate(kind.sends)]
+    return listed
+
+
+def _changed(kind: Kind, one: _Opened, symbol: Any, operands: Sequence[Any]) -> list[str]:
+    """Return the names of what a decision changes in a function."""
+    what, p, place = one.where
+    rows = [row for row in range(one.output.numel()) if casadi.depends_on(one.output[row], symbol)]
+    if what == "tick":
+        return [kind.clocks[p].outputs[row] for row in rows]
+    if what == "send":
+        return [kind.sends[p].channels[row] for row in rows]
+    if what == "edge":
+        partition = kind.clocks[p]
+        inputs = partition.tick.sx_in()
+        outputs = partition.tick(*inputs)
+        return [
+            name
+            for row, name in enumerate(partition.outputs)
+            if casadi.depends_on(outputs[row], inputs[3][place])
+        ]
+    # A continuous force has no name in the equations of motion; the part whose parameters decide has.
+    symbols = casadi.vertsplit(one.inputs[2]) if kind.parameters else []
+    used = [
+        name
+        for name, parameter in zip(kind.parameters, symbols, strict=True)
+        if any(casadi.depends_on(operand, parameter) for operand in operands)
+    ]
+    moving = {state.name.rpartition(".")[0] for state in kind.states}
+    owners = dict.fromkeys(name.rpartition(".")[0] for name in used)
+    named = [owner for owner in owners if owner and owner not in moving]
+    return named or [kind.states[row].name for row in rows]
+
+
+def _together(decisions: Sequence[Decision]) -> list[tuple[int, ...]]:
+    """Return the places of decisions that change something in common."""
+    groups: list[tuple[set[str], list[int]]] = []
+    for place, decision in enumerate(decisions):
+        names, places = set(decision.changes), [place]
+        if not names:  # nobody reads what it decides
+            continue
+        apart = []
+        for others, theirs in groups:
+            if names & others:
+                names |= others
+                places = theirs + places
+            else:
+                apart.append((others, theirs))
+        groups = [*apart, (names, places)]
+    return sorted(tuple(sorted(places)) for _, places in groups)
+
+
+def _extremes(
+    switched: SwitchedKind, places: Sequence[int], parameters: NDArray[np.float64]
+) -> tuple[tuple[bool, ...], tuple[bool, ...]] | None:
+    """Return the settings of the steepest and the flattest piece, None where all have the same slopes.
+
+    Steeper is what depends on more motions, then what has the larger slopes (in SI) at the start values.
+    """
+    slopes: dict[tuple[bool, ...], tuple[int, float, bytes]] = {}
+    for setting in itertools.product((True, False), repeat=len(places)):
+        site = jacobians(_bound(switched, dict(zip(places, setting, strict=True))))
+        x, u, m = start_values(site, list(parameters))
+        memories = [value for one in m for value in one]
+        heard = [0.0] * site.function.numel_in(3)
+        flat = np.asarray(site.function(x, u, memories, heard, parameters, 0.0), dtype=np.float64).ravel()
+        for edge in site.edges.values():
+            moving = (edge.function.numel_in(i) for i in range(4))
+            values = edge.function(*([0.0] * size for size in moving), parameters, 0.0)
+            flat = np.append(flat, np.asarray(values, dtype=np.float64).ravel()[1:])
+        finite = np.nan_to_num(flat, posinf=0.0, neginf=0.0)
+        structural = sum(int(matrix.sum()) for matrix in _patterns(site))
+        slopes[setting] = (structural, float(np.linalg.norm(finite)), flat.tobytes())
+    steepest = max(slopes, key=lambda setting: slopes[setting][:2])
+    flattest = min(slopes, key=lambda setting: slopes[setting][:2])
+    if slopes[steepest][:2] == slopes[flattest][:2]:  # as |x| has, of slopes ±1
+        others = [setting for setting in slopes if slopes[setting][2] != slopes[steepest][2]]
+        return (steepest, others[0]) if others else None
+    return steepest, flattest
+
+
+def _patterns(site: SiteJacobians) -> list[NDArray[Any]]:
+    """Return a site's structural patterns; edges' own parts are among the ticks'."""
+    pattern = site.pattern
+    listed = [pattern.a, pattern.b]
+    for tick in pattern.ticks:
+        channels = np.array([len(one) for one in tick.channels], dtype=np.int64)
+        listed += [tick.x, tick.u, tick.m, tick.r * channels]
+    for send in pattern.sends:
+        listed += [send.x, send.u]
+    return listed
+
+
+def _bound(switched: SwitchedKind, settings: Mapping[int, bool]) -> Kind:
+    """Return the kind with its decisions set to numbers; those left out are off."""
+    symbols = casadi.vertcat(*(decision.symbol for decision in switched.decisions))
+    values = casadi.vertcat(
+        *(casadi.SX(float(settings.get(place, False))) for place in range(len(switched.decisions)))
+    )
+    found: dict[tuple[str, int, int], Any] = {}
+    for one in switched.functions:
+        output = casadi.substitute(one.output, symbols, values) if switched.decisions else one.output
+        found[one.where] = casadi.Function(one.where[0], list(one.inputs), [casadi.sparsify(output)])
+    kind = switched.kind
+    clocks = tuple(
+        replace(
+            partition,
+            tick=found["tick", p, 0],
+            receives=tuple(
+                replace(receive, edge=found["edge", p, place]) if receive.edge is not None else receive
+                for place, receive in enumerate(partition.receives)
+            ),
+        )
+        for p, partition in enumerate(kind.clocks)
+    )
+    sends = tuple(replace(one, send=found["send", p, 0]) for p, one in enumerate(kind.sends))
+    return replace(kind, derivative=found["derivative", 0, 0], clocks=clocks, sends=sends)

@@ -1,0 +1,1 @@
+"""Everything `apc analyze` answers, put together and printed."""

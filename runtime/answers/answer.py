@@ -1,0 +1,173 @@
+"""The whole answer of `apc analyze`: the verdict, and what stands beside it.
+
+Takes: a `CompiledSystem`.
+Gives: `Answer`, `answer`, `judge`.
+Guarantees: what stands beside the verdict never changes it; what could not be had is said in a note.
+Does not: compute any of it itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.runtime.analysis.box import Range
+from apc.runtime.analysis.box_proof import BoxProof, prove_box
+from apc.runtime.analysis.contact_modes import ContactModes, contact_modes
+from apc.runtime.analysis.conventions import Conventions, conventions
+from apc.runtime.analysis.paper import analyze_paper
+from apc.runtime.vary.margins import Margins, margins
+from apc.runtime.vary.sensitivity import Sensitivities, sensitivities
+
+# More peers than this, that differ or stand on a graph, are more than can be differentiated in passing.
+FEW_PEERS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """An analysis with what moves its spectral radius most, its margins, and its modes of contact.
+
+    `conventions` holds the analyses under every order of coincident events, or under those that could be had
+    in passing; `detailed` says that they were asked for. `box` is the proof over a box of parameters, where
+    one was asked for.
+    """
+
+    analysis: Analysis
+    sensitivities: Sensitivities
+    margins: Margins
+    contact_modes: ContactModes | None
+    conventions: Conventions
+    detailed: bool
+    box: BoxProof | None
+
+    def __str__(self) -> str:
+        """Return the answer as text of at most 80 columns."""
+        from apc.runtime.answers.report import answer_report  # it needs this module
+
+        return answer_report(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the answer as plain data, ready for JSON: the analysis with more keys."""
+        found = self.analysis.to_dict() | {
+            "sensitivities": self.sensitivities.to_dict(),
+            "margins": [one.to_dict() for one in self.margins.rows],
+            "margins_note": self.margins.note,
+            "contact_modes": self.contact_modes.to_dict() if self.contact_modes else None,
+            "warnings": [self.conventions.warning] if self.conventions.warning else [],
+        }
+        if self.detailed:
+            found["conventions"] = self.conventions.to_dict()
+        if self.box is not None:
+            found["box"] = self.box.to_dict()
+        return found
+
+
+def judge(
+    system: CompiledSystem, *, method: str = "auto", certify: bool = False, prepared: Prepared | None = None
+) -> Analysis:
+    """Analyse a system by one of the methods of `analysis.analyze`, or "paper" (see `paper`).
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    method
+        The method.
+    certify
+        Prove the verdict in ball arithmetic.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
+    """
+    if method != "paper":
+        return analyze(system, method=method, certify=certify, prepared=prepared)
+    if certify:
+        what = "method paper gives no proof: its matrices hold every sample of a frame, rounded"
+        raise ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto --certify"))
+    return analyze_paper(system)
+
+
+def answer(
+    system: CompiledSystem,
+    *,
+    method: str = "auto",
+    certify: bool = False,
+    box: Sequence[Range] = (),
+    every_convention: bool = False,
+) -> Answer:
+    """Analyse a system and look at what stands beside the verdict.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    method
+        See `analysis.analyze`.
+    certify
+        Prove the verdict in ball arithmetic.
+    box
+        Ranges of parameters over which to prove stability as well.
+    every_convention
+        Repeat the analysis under every order of coincident events, however long it takes.
+
+    Raises
+    ------
+    ApcError
+        As `analysis.analyze` and `box_proof.prove_box`.
+    """
+    prepared = prepare(system)
+    found = judge(system, method=method, certify=certify, prepared=prepared)
+    modes, notes = _contact_modes(system, prepared)
+    compared = conventions(system, prepared=prepared, default=found, quick=not every_convention)
+    if compared.not_repeated and not every_convention:
+        notes = (*notes, compared.not_repeated)
+    return Answer(
+        analysis=replace(found, notes=(*found.notes, *notes)),
+        sensitivities=_sensitivities(system, prepared, found),
+        margins=_margins(system, prepared, found),
+        contact_modes=modes,
+        conventions=compared,
+        detailed=every_convention,
+        box=prove_box(system, box) if box else None,
+    )
+
+
+def _sensitivities(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:
+    """Return what moves the spectral radius most, or only why it couldn't be had."""
+    if _is_large(system, found):
+        note = "what moves it most: not looked for in so large a population"
+        return Sensitivities(found.spectral_radius, (), (), note)
+    try:
+        return sensitivities(system, prepared=prepared)
+    except ApcError as error:
+        note = f"what moves it most: not looked for: {error.mistakes[0].what}"
+        return Sensitivities(found.spectral_radius, (), (), note)
+
+
+def _is_large(system: CompiledSystem, found: Analysis) -> bool:
+    """Say whether the population is more than few small matrices, which are what is differentiated."""
+    complete = all(link.graph.shape == "complete" for link in system.links)
+    apart = found.method in ("determinant", "krylov") or not complete
+    return apart and system.peers > FEW_PEERS
+
+
+def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Margins:
+    """Return the margins, or only why they couldn't be had."""
+    if _is_large(system, found):
+        return Margins((), "not looked for in so large a population")
+    try:
+        return margins(system, prepared=prepared)
+    except ApcError as error:
+        return Margins((), f"not looked for: {error.mistakes[0].what}")
+
+
+def _contact_modes(system: CompiledSystem, prepared: Prepared) -> tuple[ContactModes | None, tuple[str, ...]]:
+    """Return the modes of contact, None where nothing switches, and what to say where they can't be had."""
+    try:
+        found = contact_modes(system, prepared=prepared)
+    except ApcError as error:
+        return None, (f"modes of contact: {error.mistakes[0].sentence}",)
+    return (found if found.modes else None), ()

@@ -1,0 +1,176 @@
+"""What a person reads: results as text of at most 80 columns.
+
+Takes: results. Gives: text.
+Guarantees: every number that decides something stands with its error.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.words import WIDTH, counted, wrapped
+from apc.runtime.analysis.analysis import Analysis
+from apc.runtime.analysis.needs import Needs
+from apc.runtime.analysis.selfcheck import skipped
+from apc.runtime.answers.answer import Answer
+from apc.runtime.eigen.spectrum import Mode
+
+MOST_ROWS = 16
+LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
+LARGE = 1e4  # a larger magnitude needs another notation to fit its column
+MOVES_WIDTH = 30  # what the other columns leave of 80
+
+_WORDS = {
+    "stable": "Every motion dies out.",
+    "stable up to a common translation": (
+        "Nothing ties the peers to the ground; moved together they stay where they are.\n"
+        "Every other motion dies out."
+    ),
+    "drifts": "Nothing slows a common motion down. Every other motion dies out.",
+    "unstable": "Some motion grows until the devices shake or hit their limits.",
+}
+
+
+def compile_report(system: CompiledSystem, needs: Needs, target: Path, difference: float) -> str:
+    """Return what `apc compile` prints.
+
+    Parameters
+    ----------
+    system, needs
+        The compiled scene and what it keeps.
+    target
+        The file written.
+    difference
+        The largest relative difference the self-check found.
+    """
+    ticks = ", ".join(
+        f"{name} ticks {count} times" if count != 1 else f"{name} once" for name, count in needs.ticks
+    )
+    lines = [
+        f"{system.name} → {target}",
+        *_note(str(replace(needs, pairs=()))),  # they follow, with their reason
+        f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
+        *_note(f"self-check: {_self_check(system, difference)}"),
+    ]
+    for note in (*_pairwise(system), *(f"left out: {name}, as {reason}" for name, reason in system.dropped)):
+        lines += _note(note)
+    return "\n".join(lines)
+
+
+def _self_check(system: CompiledSystem, difference: float) -> str:
+    left_out = skipped(system)
+    compared = f"one frame event by event and lifted differ by {difference:.0e}"
+    if not left_out:
+        return compared
+    if len(left_out) == len(system.kinds):
+        return "no frame is compared, as no peer here is linear"
+    return f"{compared} (not {' and '.join(left_out)}, which is not linear)"
+
+
+def _pairwise(system: CompiledSystem) -> Iterator[str]:
+    """Yield what is evaluated once a pair of peers, and why it can't be once a peer."""
+    found = {
+        receive.name: receive
+        for kind in system.kinds
+        for clock in kind.clocks
+        for receive in clock.receives
+        if receive.edge is not None or receive.operator in ("max", "min")
+    }
+    for name, receive in found.items():
+        why = (
+            f"what it runs over is not linear in what the others send over {receive.link}"
+            if receive.edge is not None and receive.operator in ("sum", "mean")
+            else f"a {receive.operator} can't be taken apart into one number a peer"
+        )
+        yield f"costs N²: {name} is evaluated once a pair of peers, as {why}"
+
+
+def timings_report(taken: Sequence[tuple[str, float]]) -> str:
+    """Return what `apc compile --timings` prints: stages and their seconds."""
+    total = sum(seconds for _, seconds in taken)
+    rows = [*taken, ("all", total)]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"  {name:<{width}}  {seconds * 1e3:8.1f} ms" for name, seconds in rows)
+
+
+def analysis_report(result: Analysis) -> str:
+    """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
+    lines = [f"{result.topology}: {result.verdict}", ""]
+    words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
+    lines += [f"  {line}" for line in words.splitlines()]
+    removed = ""
+    if result.rigid_modes:
+        removed = f", {counted(result.rigid_modes, 'translation')} left out"
+    lines += [
+        "",
+        f"  spectral radius  {result.spectral_radius:.12g} ± {result.spectral_radius_error:.0e}"
+        f" per frame of {_time(result.frame_s)}",
+        f"  peers            {result.peers}, {result.states_per_peer} states each",
+        f"  method           {result.method}{removed}",
+    ]
+    if result.proof:
+        lines.append(f"  proof            {result.proof}")
+    lines += ["", _mode_table(result.modes)]
+    for note in result.notes:
+        lines += _note(note)
+    return "\n".join(lines)
+
+
+def answer_report(found: Answer) -> str:
+    """Return what `apc analyze` prints: the analysis, and what stands beside it."""
+    parts = [analysis_report(found.analysis), str(found.sensitivities), str(found.margins)]
+    if found.contact_modes is not None:
+        parts.append(str(found.contact_modes))
+    if found.detailed:
+        parts.append(str(found.conventions))
+    elif found.conventions.warning:
+        parts.append("\n".join(wrapped(f"Warning: {found.conventions.warning}")))
+    if found.box is not None:
+        parts.append(str(found.box))
+    return "\n\n".join(parts)
+
+
+def _mode_table(modes: tuple[Mode, ...]) -> str:
+    # What can't be told from zero is counted only: its rounding differs from machine to machine.
+    alive = [mode for mode in modes if mode.magnitude > max(mode.error, LEAST_MAGNITUDE)]
+    rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
+    shown = rows[:MOST_ROWS]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for heading in ("magnitude", "shape", "times", "frequency", "damping"):
+        table.add_column(heading, justify="left" if heading == "shape" else "right", no_wrap=True)
+    table.add_column("moves most", max_width=MOVES_WIDTH)
+    for mode in shown:
+        table.add_row(
+            f"{mode.magnitude:.6f}" if mode.magnitude < LARGE else f"{mode.magnitude:.6e}",
+            mode.shape,
+            str(mode.multiplicity),
+            f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–",
+            f"{mode.damping_ratio:.3g}",
+            _leading(mode),
+        )
+    stream = io.StringIO()
+    Console(file=stream, width=WIDTH - 2, color_system=None).print(table)
+    text = "\n".join("  " + line.rstrip() for line in stream.getvalue().splitlines())
+    left = len(modes) - len(alive) + len(rows) - len(shown)
+    return f"{text}\n  and {left} faster-dying ones (--json lists all)" if left else text
+
+
+def _leading(mode: Mode) -> str:
+    largest = sorted(mode.participation, key=lambda item: -item[1])[:2]
+    return ", ".join(f"{name} {share:.0%}" for name, share in largest)
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds * 1e3:.6g} ms" if seconds < 1 else f"{seconds:.6g} s"
+
+
+def _note(text: str) -> list[str]:
+    return wrapped(text, "  ", "    ")

@@ -1,0 +1,359 @@
+"""Speed against error: every method on one scene, on this machine, beside the truth.
+
+Takes: a `CompiledSystem`.
+Gives: `Measured`, `Comparison`, `Bench`, `bench`; `pareto_front`.
+Guarantees: times are medians over rounds in which all methods take turns; an error is the distance from a
+reference of fifty digits, and is left out where there is none.
+Does not: draw (see `bench.figure`), or grow the scene (see `bench.scale`).
+"""
+
+from __future__ import annotations
+
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
+from functools import partial
+from importlib.metadata import version
+from os import cpu_count
+from typing import Any
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Column, CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.runtime.analysis.analysis import Analysis, analyze
+from apc.runtime.analysis.paper import analyze_paper
+from apc.runtime.bench.reference import PRECISIONS, Truth, exact_course, spectral_truth
+from apc.runtime.eigen.balls import precision
+from apc.runtime.frame.discretize import UNIT
+from apc.runtime.frame.parameters import resolve
+from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.methods import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method
+from apc.runtime.simulate.simulation import Simulation, prepare
+from apc.runtime.threads import single_threaded
+
+Floats = NDArray[np.float64]
+
+# Rounds in which every method takes its turn; a method gets fewer once its runs took so many seconds.
+ROUNDS, LEAST_ROUNDS, ENOUGH = 15, 3, 3.0
+
+# Errors below this many roundings of the largest value are one: which of two is smaller is luck.
+SAME = 64 * UNIT
+
+# How long the scene is played: what balls can follow in a few seconds, and longer than any start-up.
+DURATION = Fraction(1, 4)
+MOST_PLAYED = 30  # peers: each of them is followed in balls
+MOVED = 0.01  # m: where the first peer starts in a scene that starts at rest
+
+FAILED = "FAILED, which is a bug"
+
+# Of `analyze(method=…)`, and the two that are called otherwise.
+CERTIFIED, PAPER = "certified", "paper"
+ANALYSES = ("modes", "dense", "determinant", "krylov", CERTIFIED, PAPER)
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One method: median `seconds`, `spread` (half the distance between the quartiles), over `rounds` runs.
+
+    `error` is the true one, None without a reference; `bound` what the method itself says, None if it says
+    nothing. `front` says that no other method is both faster and more right; `chosen` that it is the default.
+    """
+
+    name: str
+    seconds: float
+    spread: float
+    rounds: int
+    error: float | None
+    bound: float | None
+    chosen: bool
+    front: bool = False
+
+    @property
+    def fails(self) -> bool:
+        """Whether the true error is above what the method says it is at most."""
+        return self.error is not None and self.bound is not None and self.error > self.bound
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """All methods of one task, the fastest first.
+
+    `quantity` says what `error` is of. `reference` is the truth in words, or why there is none; `refused`
+    are the methods that can't serve the scene, with the reason.
+    """
+
+    task: str
+    quantity: str
+    measured: tuple[Measured, ...]
+    reference: str
+    refused: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def chosen(self) -> Measured | None:
+        """The default method."""
+        return next((one for one in self.measured if one.chosen), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Both tasks on a scene; `machine` says where."""
+
+    topology: str
+    peers: int
+    machine: Mapping[str, str]
+    comparisons: tuple[Comparison, ...]
+
+    def __str__(self) -> str:
+        """Return tables of at most 80 columns."""
+        from apc.runtime.bench.report import bench_report  # it needs this module
+
+        return bench_report(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data, ready for JSON."""
+        return asdict(self)
+
+
+def bench(system: CompiledSystem, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
+    """Measure every method of analysis and of simulation on a scene.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to use.
+    rounds
+        Runs of each method, fewer of slow ones.
+    duration
+        How long the scene is played, in seconds.
+
+    Raises
+    ------
+    ApcError
+        The scene can't be analysed at all.
+    """
+    with single_threaded():
+        comparisons = (
+            bench_analysis(system, rounds=rounds),
+            bench_simulation(system, duration, rounds=rounds),
+        )
+    return Bench(system.name, system.peers, machine(), comparisons)
+
+
+def machine() -> dict[str, str]:
+    """Return what was measured on."""
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": str(cpu_count()),
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("apc", "numpy", "scipy", "casadi", "python-flint")},
+    }
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:  # noqa: PTH123 -- one line of a file of the kernel's
+            return next(
+                (line.partition(":")[2].strip() for line in file if line.startswith("model name")), ""
+            )
+    except OSError:
+        return platform.processor()
+
+
+def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Comparison:
+    """Measure every method of analysis, from the compiled scene to its verdict.
+
+    The error is that of the spectral radius, rigid modes left out.
+    """
+    calls: dict[str, Callable[[], Analysis]] = {
+        name: partial(analyze, system, method=name) for name in ANALYSES if name not in (CERTIFIED, PAPER)
+    }
+    calls[CERTIFIED] = partial(analyze, system, certify=True)
+    calls[PAPER] = partial(analyze_paper, system)
+    default = analyze(system)
+    truth = spectral_truth(system)
+    results, refused = _first(calls)
+    times = _take_turns({name: calls[name] for name in results}, rounds)
+    measured = [
+        _measured(
+            name,
+            times[name],
+            error=_radius_error(found, truth) if isinstance(truth, Truth) else None,
+            bound=found.spectral_radius_error,
+            chosen=name == default.method,
+        )
+        for name, found in results.items()
+    ]
+    said = truth if isinstance(truth, str) else f"spectral radius {truth.digits}"
+    notes = [
+        f"{name} says {found.verdict}, {default.method} {default.verdict}"
+        for name, found in results.items()
+        if found.stable is not None and found.verdict != default.verdict
+    ]
+    notes += [f"WRONG: the bound of {one.name} does not hold" for one in measured if one.fails]
+    return Comparison("analyze", "spectral radius", pareto_front(measured), said, refused, tuple(notes))
+
+
+def _radius_error(found: Analysis, truth: Truth) -> float:
+    with precision(PRECISIONS[0]):
+        return float(abs(truth.radius - flint.arb(found.spectral_radius)).mid())
+
+
+def bench_simulation(
+    system: CompiledSystem, duration: Fraction = DURATION, *, rounds: int = ROUNDS
+) -> Comparison:
+    """Measure every method of simulation, from the first instant to the last.
+
+    The error is the largest of any continuous state at any tick, relative to the largest value that a state
+    of its unit takes.
+    """
+    notes = []
+    if _at_rest(system):
+        system = _moved(system)
+        notes.append(f"the scene starts at rest: its first peer is moved by {1000 * MOVED:g} mm")
+    if system.peers > MOST_PLAYED:
+        truth: tuple[tuple[str, ...], Any] | str = f"{system.peers:,} peers are too many to follow in balls"
+    else:
+        truth = exact_course(system, duration)
+    calls = {str(method): partial(_ready, system, duration, method) for method in _methods(system)}
+    ready, refused = _first(calls)
+    times = _take_turns({name: partial(_play, one) for name, one in ready.items()}, rounds)
+    chosen = prepare(system, duration).how
+    measured = [
+        _measured(
+            name,
+            times[name],
+            error=None if isinstance(truth, str) else _course_error(one, truth),
+            bound=None,
+            chosen=name == chosen or (name == str(DEFAULT) and chosen != EXACT),
+        )
+        for name, one in ready.items()
+    ]
+    said = truth if isinstance(truth, str) else f"{len(truth[1])} instants in ball arithmetic"
+    quantity = f"states over {float(duration):g} s"
+    return Comparison("simulate", quantity, pareto_front(measured), said, refused, tuple(notes))
+
+
+def _methods(system: CompiledSystem) -> list[Method]:
+    """Return the methods to compare, their steps cut from the period of the fastest clock."""
+    seconds = resolve(system).timings
+    tick = min((seconds[clock.period] for clock in system.clocks), default=Fraction(1, 1000))
+    return [
+        Method(EXACT),
+        *(Method(RK4, step=tick / parts) for parts in (1, 4, 16)),
+        *(Method(SEMI_IMPLICIT, step=tick / parts) for parts in (1, 10)),
+        *(Method(CVODES, tolerance=tolerance) for tolerance in (1e-6, 1e-8, 1e-10)),
+    ]
+
+
+def _at_rest(system: CompiledSystem) -> bool:
+    """Say whether nothing moves the peers and nobody starts elsewhere than at zero."""
+    numbers = resolve(system)
+    for group, rows in zip(system.groups, numbers.parameters, strict=True):
+        kind = system.kinds[group.kind]
+        places = [kind.parameters.index(state.start) for state in kind.states]
+        if np.any(rows[:, places]):
+            return False
+        x, u = np.zeros(len(kind.states)), np.zeros(len(kind.holds))
+        for row in rows[:MOST_PLAYED]:
+            if any(np.any(np.asarray(kind.derivative(x, u, row, t))) for t in (0.0, 0.1, 1.0)):
+                return False
+    return True
+
+
+def _moved(system: CompiledSystem) -> CompiledSystem:
+    """Let the first peer start elsewhere."""
+    first, *others = system.groups
+    start = system.kinds[first.kind].states[0].start
+    values = np.zeros(first.count)
+    values[0] = MOVED
+    columns = (*(one for one in first.columns if one.name != start), Column(start, values))
+    return replace(system, groups=(replace(first, columns=columns), *others))
+
+
+def _ready(system: CompiledSystem, duration: Fraction, method: Method) -> Simulation:
+    return prepare(system, duration, method=method)
+
+
+def _play(simulation: Simulation) -> None:
+    for _ in blocks(simulation):
+        pass
+
+
+def _course_error(simulation: Simulation, truth: tuple[tuple[str, ...], Floats]) -> float:
+    """Return the largest error of any state, relative to the largest value of its unit."""
+    names, rows = truth
+    values = np.concatenate([block.values for block in blocks(simulation)])
+    place = {signal.name: number for number, signal in enumerate(simulation.signals)}
+    units = np.array([simulation.signals[place[name]].unit for name in names])
+    if len(values) < len(rows):
+        return np.inf  # it left the range of floats
+    apart = np.abs(values[:, [place[name] for name in names]] - rows)
+    worst = 0.0
+    for unit in dict.fromkeys(units.tolist()):
+        largest = float(np.abs(rows[:, units == unit]).max())
+        error = float(apart[:, units == unit].max())
+        worst = max(worst, error / largest if largest else error)
+    return worst
+
+
+def _first(calls: Mapping[str, Callable[[], Any]]) -> tuple[dict[str, Any], tuple[tuple[str, str], ...]]:
+    """Call everything once; return what came out, and what was refused and why."""
+    results, refused = {}, []
+    for name, call in calls.items():
+        try:
+            results[name] = call()
+        except ApcError as error:
+            refused.append((name, error.mistakes[0].sentence))
+        except Exception as error:  # a bug of one method is a result, and no reason to lose the others'
+            refused.append((name, f"{FAILED}: {error!r}"))
+    return results, tuple(refused)
+
+
+def _take_turns(calls: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
+    """Time all calls in rounds, so that what slows the machine for a while slows them alike."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for number in range(rounds):
+        for name, call in calls.items():
+            if number >= LEAST_ROUNDS and sum(times[name]) > ENOUGH:
+                continue
+            began = time.perf_counter()
+            call()
+            times[name].append(time.perf_counter() - began)
+    return times
+
+
+def _measured(
+    name: str, times: Sequence[float], *, error: float | None, bound: float | None, chosen: bool
+) -> Measured:
+    low, _, high = statistics.quantiles(times, n=4) if len(times) > 1 else (times[0],) * 3
+    return Measured(name, statistics.median(times), (high - low) / 2, len(times), error, bound, chosen)
+
+
+def pareto_front(measured: Sequence[Measured]) -> tuple[Measured, ...]:
+    """Mark what no other is better than in both ways, and sort by time.
+
+    Faster is what is faster by more than both spreads; more right, what errs less by more than luck (`SAME`).
+    Without errors there is no front.
+    """
+    return tuple(
+        replace(
+            one,
+            front=one.error is not None
+            and not any(_beats(other, one) for other in measured if other.error is not None),
+        )
+        for one in sorted(measured, key=lambda one: one.seconds)
+    )
+
+
+def _beats(one: Measured, other: Measured) -> bool:
+    faster = one.seconds + one.spread + other.spread < other.seconds
+    mine, its = (max(m.error or 0.0, SAME) for m in (one, other))
+    return (faster and mine <= its) or (mine < its and one.seconds <= other.seconds)

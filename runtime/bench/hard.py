@@ -1,0 +1,188 @@
+"""The hard cases: scenes whose truth is known to fifty digits, each analysed and compared with it.
+
+Takes: a folder of topologies and its `truths.json`.
+Gives: `HardCase`, `HardReport`, `run_hard_cases`.
+Guarantees: an error is computed exactly from the stored digits; a bound that does not hold, a wrong verdict
+and a wrong number of rigid modes fail.
+Does not: compute any truth (see the script beside the scenes).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.pipeline import compile_topology
+from apc.runtime.analysis.analysis import Analysis, analyze
+
+TRUTHS = "truths.json"
+REPEATS = 3  # of each analysis; its time is the median
+ENOUGH = 2.0  # seconds after which one is not repeated
+
+
+@dataclass(frozen=True, slots=True)
+class HardCase:
+    """One scene: the answer beside the truth.
+
+    `error` is |ρ − truth|, `bound` what the analysis says it is at most, both divided by max(ρ, 1) where ρ
+    is the truth. `seconds` is the median time of the analysis. `failed` says what is wrong, "" if nothing is.
+    """
+
+    name: str
+    about: str
+    peers: int
+    method: str
+    verdict: str
+    radius: str
+    error: float
+    bound: float
+    seconds: float
+    failed: str
+
+    @property
+    def looseness(self) -> float:
+        """Bound ÷ error; infinite where there is no error."""
+        return self.bound / self.error if self.error else math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class HardReport:
+    """All cases of a folder, and its scenes without a truth."""
+
+    folder: str
+    cases: tuple[HardCase, ...]
+    without: tuple[str, ...]
+
+    @property
+    def failures(self) -> tuple[HardCase, ...]:
+        """The cases that failed."""
+        return tuple(case for case in self.cases if case.failed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as plain data, ready for JSON."""
+        return {
+            "folder": self.folder,
+            "cases": [
+                asdict(case) | {"bound_over_error": case.looseness if case.error else None}
+                for case in self.cases
+            ],
+            "without_truth": list(self.without),
+            "failed": [case.name for case in self.failures],
+        }
+
+
+def run_hard_cases(
+    folder: Path,
+    *,
+    repeats: int = REPEATS,
+    solve: Callable[[CompiledSystem], Analysis] = analyze,
+) -> HardReport:
+    """Analyse every scene of a folder and compare.
+
+    Parameters
+    ----------
+    folder
+        Holds topologies and `truths.json`: by the name of a file without its suffix, `spectral_radius` (text,
+        many digits), `rigid_modes`, `verdict`.
+    repeats
+        Analyses of each scene, of which the median time counts.
+    solve
+        The analysis.
+
+    Raises
+    ------
+    ApcError
+        E920 no such folder, no truths in it or truths that can't be read; and those of compiling and
+        analysing.
+    """
+    truths = _truths(folder)
+    cases, without = [], []
+    for path in sorted(folder.glob("*.yaml")):
+        if path.stem not in truths:
+            without.append(path.name)
+            continue
+        system = compile_topology(path)
+        times: list[float] = []
+        while len(times) < repeats and sum(times) < ENOUGH:
+            began = time.perf_counter()
+            found = solve(system)
+            times.append(time.perf_counter() - began)
+        cases.append(compare(system, found, truths[path.stem], statistics.median(times), path.stem))
+    if not cases:
+        what = "holds no topology whose truth is known"
+        raise ApcError(Mistake("E920", Place(str(folder)), what, hint="--hard tests/hard"))
+    return HardReport(str(folder), tuple(cases), tuple(without))
+
+
+def compare(
+    system: CompiledSystem, found: Analysis, truth: Mapping[str, Any], seconds: float, name: str
+) -> HardCase:
+    """Compare an analysis with the truth.
+
+    Parameters
+    ----------
+    system, found
+        The scene and its analysis.
+    truth
+        An entry of `truths.json`.
+    seconds
+        What it took.
+    name
+        The name of the case.
+    """
+    radius = Fraction(truth["spectral_radius"])
+    finite = math.isfinite(found.spectral_radius)
+    apart = abs(Fraction(found.spectral_radius) - radius) if finite else None
+    size = float(max(radius, Fraction(1)))
+    bound = found.spectral_radius_error
+    wrong = []
+    if apart is None or (math.isfinite(bound) and apart > Fraction(bound)):
+        wrong.append("the bound does not hold")
+    if found.stable is not None and found.verdict != truth["verdict"]:
+        wrong.append(f"the verdict is wrong: {truth['verdict']}")
+    if found.rigid_modes != truth["rigid_modes"]:
+        wrong.append(f"{truth['rigid_modes']} rigid modes, not {found.rigid_modes}")
+    return HardCase(
+        name=name,
+        about=system.about,
+        peers=system.peers,
+        method=found.method + (" + proof" if found.proof else ""),
+        verdict=found.verdict,
+        radius=str(truth["spectral_radius"]),
+        error=math.inf if apart is None else float(apart) / size,
+        bound=bound / size,
+        seconds=seconds,
+        failed="; ".join(wrong),
+    )
+
+
+def _truths(folder: Path) -> dict[str, Any]:
+    """Read the truths of a folder."""
+    path = folder / TRUTHS
+    place = Place(str(path))
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        what = f"can't be read: {error.strerror or error}"
+        raise ApcError(Mistake("E920", place, what, hint="--hard tests/hard")) from error
+    except ValueError as error:
+        raise ApcError(Mistake("E920", place, f"is not JSON: {error}")) from error
+    listed: list[tuple[str, Any]] = list(found.items()) if isinstance(found, dict) else [("", None)]
+    for name, truth in listed:
+        try:
+            Fraction(truth["spectral_radius"]), int(truth["rigid_modes"]), str(truth["verdict"])
+        except (TypeError, KeyError, ValueError) as error:
+            expected = "spectral_radius (digits), rigid_modes and verdict of each scene"
+            raise ApcError(
+                Mistake("E920", place, name or "the truths", expected, "something else")
+            ) from error
+    return dict(found)

@@ -1,0 +1,232 @@
+"""The frame of a closed system in ball arithmetic: every entry an interval that holds the true number.
+
+Takes: a `ClosedSystem`; its sites' matrices as exact rationals.
+Gives: `precision`, `unprovable`, `rational_ball`, `site_balls`, `frame_steps`, `compose`, `frame_balls`,
+`reduced_balls`, `square`.
+Guarantees: the true matrix, of the numbers the sites hold, lies in the balls, whatever the number of bits;
+more bits make them smaller.
+Does not: decide anything (see `certify`).
+
+The frame is followed event by event over the state of the closed system itself (`lift.follow`), all sites
+side by side, so that a frame of a thousand ticks needs no more columns than there are states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from fractions import Fraction
+from typing import Any
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.modes import ClosedSystem, Packet, packet_places
+from apc.runtime.frame.discretize import step_balls
+from apc.runtime.frame.exact import is_rational
+from apc.runtime.frame.exchange import Surd
+from apc.runtime.frame.lift import follow
+from apc.runtime.frame.linearize import LinearSite, entrywise
+from apc.runtime.frame.schedule import Propagate, Schedule, Way
+
+Balls = NDArray[Any]  # of flint.arb, and the integers 0 and 1 where these are exact
+
+# [F G] by duration in quanta, for one site.
+Steps = Mapping[int, Balls]
+
+
+@contextmanager
+def precision(bits: int) -> Iterator[None]:
+    """Set python-flint's working precision for a while."""
+    before, flint.ctx.prec = flint.ctx.prec, bits
+    try:
+        yield
+    finally:
+        flint.ctx.prec = before
+
+
+def unprovable(system: ClosedSystem) -> str:
+    """Return why a system's coefficients can't be had exactly, or "" when they can."""
+    if not system.sites:
+        return "its matrix was not composed from sites"
+    for group in {id(group.jacobians): group for group in system.sites}.values():
+        functions = [group.jacobians.function, *(edge.function for edge in group.jacobians.edges.values())]
+        if not all(function.is_a("SXFunction") for function in functions):
+            return f"the equations of {group.name} hold a nonlinear loop, whose solution is rounded"
+        if not all(is_rational(function) for function in functions):
+            return f"the equations of {group.name} hold functions whose values are rounded"
+    return ""
+
+
+def rational_ball(value: Fraction | int) -> Any:
+    """Return a rational as a ball at the present precision; 0 and 1 stay what they are."""
+    if value == 0 or value == 1:
+        return int(value)
+    exact = Fraction(value)
+    return flint.arb(flint.fmpq(exact.numerator, exact.denominator))
+
+
+def site_balls(system: ClosedSystem) -> list[LinearSite]:
+    """Return the sites' matrices as balls at the present precision; equal sites are worked out once."""
+    known: dict[int, LinearSite] = {}
+    found = []
+    for group in system.sites:
+        if id(group.site) not in known:
+            known[id(group.site)] = entrywise(group.exact(), rational_ball)
+        found.append(known[id(group.site)])
+    return found
+
+
+def frame_steps(
+    site: LinearSite,
+    schedule: Schedule,
+    step: Callable[[Balls, Balls, Fraction], Balls] = step_balls,
+) -> Steps:
+    """Return a site's exponentials by duration, at the present precision."""
+    durations = {event.duration for event in schedule.events if isinstance(event, Propagate)}
+    return {duration: step(site.a, site.b, duration * schedule.quantum) for duration in sorted(durations)}
+
+
+def frame_balls(system: ClosedSystem) -> Balls:
+    """Return the closed matrix (n, n) of a system as balls at the present precision."""
+    sites = site_balls(system)
+    known: dict[tuple[int, int], Steps] = {}
+    steps = []
+    for site, group in zip(sites, system.sites, strict=True):
+        key = (id(site), id(group.schedule))
+        if key not in known:
+            known[key] = frame_steps(site, group.schedule)
+        steps.append(known[key])
+    return compose(system, sites, steps)
+
+
+def compose(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[Steps]) -> Balls:
+    """Follow all sites of a closed system through one frame, over its state.
+
+    Parameters
+    ----------
+    system
+        The closed system: who hears whom.
+    sites, steps
+        Every site's matrices and exponentials, over numbers that can be added and multiplied with each other,
+        with integers and with balls.
+
+    Returns
+    -------
+    The closed matrix (n, n).
+    """
+    n = len(system.names)
+    unit = np.eye(n, dtype=np.int64).astype(object)
+    place_of = packet_places(system.sites, system.packets, system.offsets)
+    rows_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
+    weights = _weights(system)
+    sent: dict[tuple[int, int], Balls] = {}
+
+    def hearing(g: int) -> Callable[[int], Balls | None]:
+        def hear(line: int) -> Balls | None:
+            one = system.sites[g].schedule.heard[line]
+            total = np.zeros(n, dtype=object)
+            for h, weight in weights[one.way][g]:
+                row = rows_of[h][one.sent]
+                if one.lag:
+                    total = total + unit[place_of[Packet(h, row, one.lag)]] * weight
+                elif (h, row) in sent:
+                    total = total + sent[h, row] * weight
+                else:
+                    return None
+            return total
+
+        return hear
+
+    matrix = np.zeros((n, n), dtype=object)
+    courses = {}
+    for g, (group, site, own) in enumerate(zip(system.sites, sites, steps, strict=True)):
+        end = system.offsets[g] + len(group.lifted.z_names)
+        start = unit[system.offsets[g] : end]
+        courses[g] = follow(site, group.schedule, own, start, hearing(g), multiply=_multiply)
+    while courses:
+        known = len(courses), len(sent)
+        for g, course in tuple(courses.items()):
+            try:
+                # On until it has to wait, so that everybody is sooner or later heard.
+                while (spoken := next(course))[0] >= 0:
+                    sent[g, spoken[0]] = spoken[1]
+            except StopIteration as end_of_frame:
+                state, _ = end_of_frame.value
+                matrix[system.offsets[g] : system.offsets[g] + len(state)] = state
+                del courses[g]
+        assert (len(courses), len(sent)) != known, "a packet is heard before it is sent"
+    for packet, place in place_of.items():
+        earlier = Packet(packet.site, packet.row, packet.lag - 1)
+        matrix[place] = unit[place_of[earlier]] if packet.lag > 1 else sent[packet.site, packet.row]
+    return matrix
+
+
+def _weights(system: ClosedSystem) -> dict[Way, list[list[tuple[int, Any]]]]:
+    """Return, way by way and site by site, whom it hears with what weight, the doubts included."""
+    found: dict[Way, list[list[tuple[int, Any]]]] = {}
+    for way, rows in system.coupling.items():
+        if way in system.surds:
+            found[way] = [[(0, _surd_ball(system.surds[way]))]]
+            continue
+        doubt = system.doubts.get(way, 0.0)
+        spread = flint.arb(0, doubt) if doubt else 0
+        found[way] = [
+            [(h, rational_ball(weight) + spread) for h, weight in enumerate(row) if weight or doubt]
+            for row in rows
+        ]
+    return found
+
+
+def _surd_ball(surd: Surd) -> Any:
+    """Return a number in closed form as a ball at the present precision."""
+    cosine = flint.arb.cos_pi_fmpq(flint.fmpq(2 * surd.turn.numerator, surd.turn.denominator))
+    return rational_ball(surd.scale) * cosine * flint.arb(surd.square).sqrt()
+
+
+def _multiply(matrix: Balls, rows: Balls) -> Balls:
+    """Return the product with a matrix that is mostly zeros."""
+    product = np.zeros((len(matrix), rows.shape[1]), dtype=object)
+    for line, entries in enumerate(matrix):
+        for place, entry in enumerate(entries):
+            if not isinstance(entry, int) or entry:  # an exact zero is the integer
+                product[line] += rows[place] * entry
+    return product
+
+
+def square(balls: Balls) -> Any:
+    """Return an array of balls as a matrix of python-flint."""
+    return flint.arb_mat(len(balls), len(balls), [flint.arb(entry) for entry in balls.ravel()])
+
+
+def reduced_balls(
+    matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: Sequence[int], rest: Sequence[int]
+) -> tuple[Balls, Balls]:
+    """Return the matrix without its rigid motions, in relative coordinates, and W = V_r V_p⁻¹.
+
+    Parameters
+    ----------
+    matrix
+        The closed matrix (n, n).
+    vectors
+        V: the rigid motions, exact, each (n,).
+    held, rest
+        The places p, as many as there are motions, whose coordinates go, and all others.
+
+    Notes
+    -----
+    The relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr, as V spans an invariant space.
+    """
+    within = matrix[np.ix_(rest, rest)]
+    if not vectors:
+        return within, np.zeros((len(rest), 0), dtype=object)
+    exact = [[flint.fmpq(v[place].numerator, v[place].denominator) for v in vectors] for place in held]
+    others = [[flint.fmpq(v[place].numerator, v[place].denominator) for v in vectors] for place in rest]
+    count = len(held)
+    weights = flint.fmpq_mat(len(rest), count, [e for row in others for e in row])
+    weights = weights * flint.fmpq_mat(count, count, [e for row in exact for e in row]).inv()
+    relative: Balls = np.empty(len(rest) * count, dtype=object)
+    relative[:] = [rational_ball(Fraction(int(e.p), int(e.q))) for e in weights.entries()]
+    relative = relative.reshape(len(rest), count)
+    return within - _multiply(relative, matrix[np.ix_(held, rest)]), relative

@@ -1,0 +1,214 @@
+"""How far out the eigenvalues of an uncertain matrix can be, whether or not it has a set of eigenvectors.
+
+Takes: square matrices, real or complex, and bounds on what they may be off by.
+Gives: `balance`, `pseudospectral_radius`, `cluster_radius`, `norms`.
+Guarantees: `pseudospectral_radius` and `cluster_radius` are bounds, rounding included, and finite whenever
+the matrix is; neither asks for diagonalizability.
+Does not: find eigenvalues, or the smallest bound there is.
+
+The ε-pseudospectrum holds the eigenvalues of all matrices within ε (in the 2-norm): the z with
+‖(z − M)⁻¹‖ ≥ 1/ε (Trefethen and Embree, Spectra and Pseudospectra, 2005, chapter 2).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.frame.discretize import UNIT
+
+Floats = NDArray[np.float64]
+Matrix = NDArray[Any]  # float64 or complex128
+
+# Rounding errors charged to each product of matrices, in units of n·UNIT·|A||B|, entry by entry; the
+# classical bound is 1 for real and 2√2 for complex matrices (Higham, Accuracy and Stability, 3.6).
+PRODUCT_ROUNDINGS = 4
+
+# How many powers' norms are taken one by one, fewer of a matrix so large that they would fill the memory;
+# then how many times the last of them is squared.
+POWERS, FEWER_POWERS, LARGE = 64, 16, 300
+SQUARINGS = 24
+
+# Bounds tried: from the largest, the norm, towards the estimate, each time nearer by this factor.
+RADII, NEARER = 220, 2.0**-0.25
+
+# Relative error charged to ‖M^k‖ R^(−k) by way of logarithms: k·|log| below 10¹⁰, times UNIT.
+LOGARITHMS = 1e-5
+
+# Sweeps of balancing; chains that nobody answers would go on forever, to no one's use.
+SWEEPS = 12
+
+
+# A norm below it can't be scaled to 1 within the range of floats.
+SMALLEST = 2.0**-1000
+
+
+def norms(stack: Matrix) -> Floats:
+    """Return upper bounds on the 2-norms of matrices (…, n, m): the least of Frobenius and √(‖·‖₁‖·‖∞)."""
+    size = np.abs(stack)
+    if 0 in size.shape[-2:]:
+        return np.zeros(size.shape[:-2])
+    frobenius = _frobenius(size)
+    mixed = np.sqrt(size.sum(axis=-2).max(axis=-1)) * np.sqrt(size.sum(axis=-1).max(axis=-1))
+    return np.asarray(np.minimum(frobenius, mixed) * (1 + 4 * sum(size.shape[-2:]) * UNIT))
+
+
+def balance(size: Floats) -> Floats:
+    """Return d, powers of two, that make the rows and columns of D⁻¹ |M| D alike in norm.
+
+    Parameters
+    ----------
+    size
+        Magnitudes |M| (n, n). Where an entry is zero by chance but uncertain, its error should be added: it
+        must not grow without limit.
+
+    Notes
+    -----
+    Parlett and Reinsch's loop (Numerische Mathematik 13, 1969) in the 2-norm, the diagonal left out.
+    """
+    squared = np.square(size)
+    np.fill_diagonal(squared, 0.0)
+    scale = np.ones(len(size))
+    for _ in range(SWEEPS):
+        settled = True
+        for i in range(len(size)):
+            column, row = float(squared[:, i].sum()), float(squared[i].sum())
+            if not (0 < column < np.inf and 0 < row < np.inf):
+                continue
+            factor = 2.0 ** round(np.log2(row / column) / 4)
+            if factor != 1.0:
+                settled = False
+                scale[i] *= factor
+                squared[:, i] *= factor * factor
+                squared[i] /= factor * factor
+        if settled:
+            break
+    return scale
+
+
+def pseudospectral_radius(matrix: Matrix, error: float) -> float:
+    """Return R such that no matrix within `error` (in the 2-norm) of this one has an eigenvalue beyond R.
+
+    Notes
+    -----
+    For |z| ≥ R the Neumann series of the resolvent, grouped by K powers, gives
+
+        ‖(z − M)⁻¹‖ ≤ Σ_{k<K} ‖M^k‖ R^(−k−1) / (1 − q),   q = ‖M^K‖ R^(−K) < 1,
+
+    and while that is less than 1/error, z is no eigenvalue. Squaring M^K doubles K and multiplies the sum by
+    at most 1 + q. The bound falls with R, so that one R is as good a proof as the whole circle; a chain of
+    packets, whose eigenvalues rounding scatters far out, has powers that simply end.
+    """
+    n = len(matrix)
+    if not n:
+        return 0.0
+    largest = float(norms(matrix)) * (1 + UNIT) + error  # no eigenvalue is larger than the norm
+    if not 0 < largest < np.inf:
+        return largest
+    nearest = float(np.abs(np.linalg.eigvals(matrix)).max())
+    # A power of two near the estimate keeps the powers within the range of floats.
+    unit = 2.0 ** np.ceil(np.log2(max(nearest, largest * 2.0**-8)))
+    exponents, logs = _powers(matrix / unit)
+    steps = (largest - nearest) * NEARER ** np.arange(RADII)
+    radii = np.append(nearest + steps, 1.0)  # 1 itself: there the verdict falls
+    depth = np.log(radii / unit)[:, None]
+    base = _base(n)
+    passing = radii >= largest
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+        terms = np.exp(logs - exponents * depth) * (1 + LOGARITHMS)
+        bound = terms[:, :base].sum(axis=1) / radii * (1 + 8 * base * UNIT)
+        for q in terms[:, base:].T:
+            passing |= (q < 1) & (bound * error < (1 - q) * (1 - LOGARITHMS))
+            bound = bound * (1 + q)
+    return float(min(largest, radii[passing].min(initial=largest)))
+
+
+def _base(n: int) -> int:
+    """Return how many powers of a matrix of order n are taken one by one."""
+    return POWERS if n <= LARGE else FEWER_POWERS
+
+
+def _powers(matrix: Matrix) -> tuple[Floats, Floats]:
+    """Return exponents k = 0, 1, … K−1, K, 2K, 4K, … and the logarithms of bounds on ‖M^k‖.
+
+    An error of P ≈ M^i and one of Q ≈ M^j make one of at most ‖ΔP‖‖Q‖ + ‖P‖‖ΔQ‖ + ‖ΔP‖‖ΔQ‖ in P Q, and the
+    product adds its roundings, `PRODUCT_ROUNDINGS`·n·UNIT·|P||Q|; `norms` bounds the 2-norm of |P| too.
+    """
+    n = len(matrix)
+    base = _base(n)
+    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    tiny = n * n * float(np.finfo(np.float64).tiny)  # what underflow hides
+
+    def worse(off: Any, size: Any, other_off: float, other_size: float) -> Any:
+        return off * other_size + size * other_off + off * other_off + charge * size * other_size + tiny
+
+    # M, M², then M³ and M⁴ from these, and so on, doubling to the K-th; `off` bounds what each is off by.
+    stack = np.array(matrix, ndmin=3)
+    size, off = norms(stack), np.zeros(1)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
+        while len(stack) < base:
+            last, last_size, last_off = stack[-1], float(size[-1]), float(off[-1])
+            off = np.append(off, worse(off, size, last_off, last_size))
+            stack = np.concatenate([stack, stack @ last])
+            size = norms(stack)
+        logs = [0.0, *np.log(size + off)]
+        exponents = list(range(base + 1))
+        power, power_off = stack[-1], float(off[-1])
+        shift = 0.0  # the power is 2^shift times what is kept of it, near 1 so that nothing is lost
+        for _ in range(SQUARINGS):
+            power_size = float(norms(power))
+            if not SMALLEST < power_size < np.inf:  # nothing of it is left to square
+                break
+            step = -float(np.round(np.log2(power_size)))
+            power, power_size, power_off = power * 2.0**step, power_size * 2.0**step, power_off * 2.0**step
+            shift = 2 * (shift - step)
+            power_off = float(worse(power_off, power_size, power_off, power_size))
+            power = power @ power
+            logs.append(np.log(float(norms(power)) + power_off) + shift * np.log(2.0))
+            exponents.append(2 * exponents[-1])
+            if not power_off < 1:  # nothing is known any more
+                break
+        return np.array(exponents, dtype=np.float64), np.array(logs)
+
+
+def _frobenius(stack: Matrix) -> Floats:
+    """Return the Frobenius norms, of entries however small: squares of these would vanish."""
+    size = np.abs(stack)
+    peak = size.max(axis=(-2, -1), keepdims=True)
+    peak = np.where(peak > 0, peak, 1.0)
+    return np.asarray(np.sqrt(np.square(size / peak).sum(axis=(-2, -1))) * peak[..., 0, 0])
+
+
+def cluster_radius(count: int, departure: float, error: float) -> float:
+    """Return how far from the nearest eigenvalue of a block an eigenvalue of a block within `error` can be.
+
+    Parameters
+    ----------
+    count
+        Order m of the block.
+    departure
+        Departure from normality Δ, the norm of the strict upper triangle of its Schur form.
+    error
+        Bound on the change in the 2-norm.
+
+    Notes
+    -----
+    The d with Σ_{k<m} Δ^k d^(−k−1) = 1/error (Henrici, Numerische Mathematik 4, 1962): the error itself for
+    m = 1 or Δ = 0, its m-th root for a Jordan block.
+    """
+    if count == 1 or departure == 0.0 or error == 0.0:
+        return error
+
+    def passing(distance: float) -> bool:
+        ratio = departure / distance
+        return error / distance * sum(ratio**k for k in range(count)) <= 1
+
+    # One of the m terms is at least the m-th part: an upper bound to start from.
+    high = max(float((count * error * departure**k) ** (1 / (k + 1))) for k in range(count))
+    low = error
+    for _ in range(8):
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if passing(middle) else (middle, high)
+    return high

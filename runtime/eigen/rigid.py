@@ -1,0 +1,493 @@
+"""The motions that nothing holds back, found in exact arithmetic.
+
+Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
+Gives: `RigidModes`, `find_rigid_modes`; `stays_rigid`; `independent_places`, `relative_places`,
+`relative_coordinates`.
+Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
+a stiffness of exactly zero frees what it held.
+Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
+more than two (a motion growing with t²).
+
+A rigid mode is a constant solution of the homogeneous equations,
+
+    A x + B u = 0,   u = y,   y = X x + U u + M y + R r,   r = W s,   s = X x + U u,
+
+which makes an eigenvector of the frame's map with eigenvalue 1. A drift is a solution x(t) = x₁ + t x₀ with
+x₀ such a constant: every value y computed at a tick and every packet s as it was at its own time of sending.
+It makes a generalized eigenvector, a Jordan pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.modes import ClosedSystem, Loop
+from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.frame.exchange import QUICK_PRIME
+from apc.runtime.frame.linearize import LinearSite
+from apc.runtime.frame.schedule import Act, Propagate, Send, Tick, Value
+
+Floats = NDArray[np.float64]
+
+# A linear form in the unknowns, sparse.
+Form = dict[int, Fraction]
+
+
+@dataclass(frozen=True, slots=True)
+class RigidModes:
+    """The invariant subspace to remove before eigenvalues are computed.
+
+    `directions` (n, k) are eigenvectors with eigenvalue 1, `generalized` (n, drifts) the second vectors
+    of Jordan pairs, both over the state of the closed system; `names` says what moves in each direction.
+    `exact` holds the same vectors, directions first, as rationals.
+    """
+
+    directions: Floats
+    generalized: Floats
+    names: tuple[str, ...]
+    exact: tuple[tuple[Fraction, ...], ...]
+
+    @property
+    def drifts(self) -> int:
+        """The number of motions that grow with time for want of damping."""
+        return int(self.generalized.shape[1])
+
+    @property
+    def basis(self) -> Floats:
+        """All vectors to remove (n, k + drifts)."""
+        return np.hstack([self.directions, self.generalized])
+
+
+def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> RigidModes:
+    """Find the rigid modes of a closed system and the drifts among them, in exact rationals.
+
+    Parameters
+    ----------
+    system
+        The closed system.
+    with_drifts
+        Whether to look for drifts, which is most of the work.
+    """
+    exact = _exact_sites(system.sites)
+    numbering = _Numbering(system.sites)
+    still = _standing_solutions(system, exact, numbering)
+    vectors = [_standing_state(system, exact, numbering, solution) for solution in still]
+    pairs = _drifts(system, exact, numbering, still) if still and with_drifts else []
+    n = len(system.names)
+    return RigidModes(
+        directions=_columns(vectors, n),
+        generalized=_columns(pairs, n),
+        names=tuple(
+            ", ".join(name for name, entry in zip(system.names, vector, strict=True) if entry)
+            for vector in vectors
+        ),
+        exact=tuple(tuple(vector) for vector in (*vectors, *pairs)),
+    )
+
+
+def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bool:
+    """Say whether the directions of a system's rigid modes are rigid with other matrices of its sites, too.
+
+    Parameters
+    ----------
+    system
+        The closed system.
+    others
+        Matrices of each site, over rationals or quotients of polynomials: then for all values of these.
+    """
+    numbering = _Numbering(system.sites)
+    exact = _exact_sites(system.sites)
+    for solution in _standing_solutions(system, exact, numbering):
+        if any(_value(form, solution) for form in _standing(system, others, numbering)):
+            return False
+        moved = zip(
+            _standing_state(system, others, numbering, solution),
+            _standing_state(system, exact, numbering, solution),
+            strict=True,
+        )
+        if any(one - other for one, other in moved):
+            return False
+    return True
+
+
+def _standing_solutions(
+    system: ClosedSystem | Loop, exact: Sequence[LinearSite], numbering: _Numbering
+) -> list[list[Fraction]]:
+    """Return the standing solutions whose states are independent.
+
+    An output nobody reads may be free without being part of the state.
+    """
+    still = _null_space(
+        list(_standing(system, exact, numbering)), numbering.size, split=numbering.size, known=0
+    )
+    kept = _independent([_standing_state(system, exact, numbering, solution) for solution in still])
+    return [still[place] for place in kept]
+
+
+def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
+    """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
+    left = np.array(rows)
+    places: list[int] = []
+    for _ in range(len(rows)):
+        scaled = np.abs(left) / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        line, place = divmod(int(np.argmax(scaled)), rows.shape[1])
+        places.append(place)
+        if left[line, place] != 0:
+            pivot = left[line] / left[line, place]
+            left = left - left[:, [place]] * pivot
+            left[line] = 0.0
+    return np.array(sorted(places), dtype=np.intp)
+
+
+def relative_places(basis: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the places p whose coordinates rigid motions V (n, d) take away, d of them, and all others r."""
+    held = independent_places(basis.T)
+    return held, np.delete(np.arange(len(basis)), held)  # np.setdiff1d imports numpy.ma, 10 ms
+
+
+def relative_coordinates(basis: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Return p and r as `relative_places`, and W = V_r V_p⁻¹ (n − d, d), of rigid motions V = [V_p; V_r].
+
+    As V spans an invariant space, the relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr.
+    """
+    held, rest = relative_places(basis)
+    return held, rest, basis[rest] @ np.linalg.inv(basis[held])
+
+
+class _Numbering:
+    """Numbers the unknowns of the standing solution: every site's states, then its clocks' outputs."""
+
+    def __init__(self, sites: Sequence[PeerGroup]) -> None:
+        self.states: list[int] = []
+        self.outputs: list[list[int]] = []
+        self.size = 0
+        for group in sites:
+            kind = group.jacobians.kind
+            self.states.append(self.size)
+            self.size += len(kind.states)
+            starts = []
+            for partition in kind.clocks:
+                starts.append(self.size)
+                self.size += len(partition.outputs)
+            self.outputs.append(starts)
+
+
+def _exact_sites(sites: Sequence[PeerGroup]) -> list[LinearSite]:
+    """Return every site's exact matrices; equal sites are worked out once."""
+    known: dict[int, LinearSite] = {}
+    return [known.setdefault(id(group.site), group.exact()) for group in sites]
+
+
+def _add(form: Form, weight: Any, other: Mapping[int, Fraction]) -> None:
+    """Add weight · other to a form in place."""
+    if weight:
+        for index, value in other.items():
+            form[index] = form.get(index, Fraction(0)) + weight * value
+
+
+def _combine(terms: Iterable[tuple[Any, Form]]) -> Form:
+    """Return the sum of weight · form."""
+    total: Form = {}
+    for weight, form in terms:
+        _add(total, weight, form)
+    return total
+
+
+def _standing(system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: _Numbering) -> Iterator[Form]:
+    """Yield the equations of a constant solution, each a form that must vanish."""
+    sent = [_standing_sends(site, number, g) for g, site in enumerate(exact)]
+    for g, site in enumerate(exact):
+        x, u = _standing_inputs(site, number, g)
+        for row_a, row_b in zip(site.a, site.b, strict=True):
+            yield _combine([*zip(row_a, x, strict=True), *zip(row_b, u, strict=True)])
+        for p, (tick, partition) in enumerate(zip(site.ticks, site.kind.clocks, strict=True)):
+            y = [{number.outputs[g][p] + o: Fraction(1)} for o in range(len(partition.outputs))]
+            m = [y[o] for o in partition.memories]
+            schedule = system.sites[g].schedule
+            r = [
+                _combine(
+                    (weight, sent[h].get((way.link, channel), {}))
+                    for way, channel in schedule.ways(p, place)
+                    for h, weight in enumerate(system.coupling[way][g])
+                )
+                for place in range(len(partition.receives))
+            ]
+            for o in range(len(partition.outputs)):
+                terms = [*zip(tick.x[o], x, strict=True), *zip(tick.u[o], u, strict=True)]
+                terms += [*zip(tick.m[o], m, strict=True), *zip(tick.r[o], r, strict=True)]
+                yield _combine([*terms, (-1, y[o])])
+
+
+def _standing_inputs(site: LinearSite, number: _Numbering, g: int) -> tuple[list[Form], list[Form]]:
+    """Return x and u of a site as forms in the unknowns of the standing solution."""
+    partition_of = {partition.clock: p for p, partition in enumerate(site.kind.clocks)}
+    x: list[Form] = [{number.states[g] + i: Fraction(1)} for i in range(len(site.kind.states))]
+    u: list[Form] = [
+        {number.outputs[g][partition_of[hold.clock]] + hold.output: Fraction(1)} for hold in site.kind.holds
+    ]
+    return x, u
+
+
+def _standing_sends(site: LinearSite, number: _Numbering, g: int) -> dict[tuple[str, str], Form]:
+    """Return what a site sends in the standing solution, by link and channel."""
+    x, u = _standing_inputs(site, number, g)
+    return {
+        (sending.link, channel): _combine([*zip(send.x[c], x, strict=True), *zip(send.u[c], u, strict=True)])
+        for send, sending in zip(site.sends, site.kind.sends, strict=True)
+        for c, channel in enumerate(sending.channels)
+    }
+
+
+def _standing_state(
+    system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: _Numbering, solution: Sequence[Fraction]
+) -> list[Fraction]:
+    """Return the closed system's state that belongs to a standing solution."""
+    state: list[Fraction] = []
+    for g, group in enumerate(system.sites):
+        start = number.states[g]
+        state += solution[start : start + len(group.jacobians.kind.states)]
+        state += [solution[number.outputs[g][v.partition] + v.output] for v in group.schedule.carried]
+        sends = _standing_sends(exact[g], number, g)
+        for packet in system.packets:
+            if packet.site == g:
+                one = group.schedule.sent[packet.row]
+                state.append(_value(sends[one.link, one.channel], solution))
+    return state
+
+
+def _value(form: Form, solution: Sequence[Fraction]) -> Fraction:
+    """Return the value of a form at a solution."""
+    return sum((weight * solution[index] for index, weight in form.items()), Fraction(0))
+
+
+class _Ramp:
+    """The ramps x(t) = x₁ + t x₀ as forms in their unknowns.
+
+    The unknowns are the weights of the standing solutions in x₀, every site's x₁, and every value its clocks
+    compute in a frame; a frame later a value has grown by the frame's length times its standing value.
+    """
+
+    def __init__(
+        self,
+        system: ClosedSystem | Loop,
+        exact: Sequence[LinearSite],
+        number: _Numbering,
+        still: Sequence[Sequence[Fraction]],
+    ) -> None:
+        self.system, self.exact, self.number, self.still = system, exact, number, still
+        self.frame = system.sites[0].schedule.frame_s
+        self.size = len(still)
+        self.starts: list[int] = []
+        self.values: list[dict[Value, int]] = []
+        for group in system.sites:
+            kind = group.jacobians.kind
+            self.starts.append(self.size)
+            self.size += len(kind.states)
+            computed = [
+                Value(p, o, index)
+                for p, partition in enumerate(kind.clocks)
+                for o in range(len(partition.outputs))
+                for index in range(group.schedule.ticks[p])
+            ]
+            self.values.append({one: self.size + place for place, one in enumerate(computed)})
+            self.size += len(computed)
+
+    def slope(self, form: Form) -> Form:
+        """Return what a form of the standing solution is in x₀: a form in the weights."""
+        return _combine(
+            (weight, {place: solution[unknown] for place, solution in enumerate(self.still)})
+            for unknown, weight in form.items()
+        )
+
+    def rate(self, g: int, state: int) -> Form:
+        """Return the constant rate of a continuous state."""
+        return self.slope({self.number.states[g] + state: Fraction(1)})
+
+    def position(self, g: int, time: Fraction) -> list[Form]:
+        """Return the continuous states of site g at a time in seconds."""
+        start, count = self.starts[g], len(self.exact[g].kind.states)
+        return [_combine([(1, {start + i: Fraction(1)}), (time, self.rate(g, i))]) for i in range(count)]
+
+    def value(self, g: int, one: Value | None) -> Form:
+        """Return a value of site g, of whatever frame."""
+        ticks = self.system.sites[g].schedule.ticks[one.partition] if one else 0
+        if one is None or not ticks:
+            return {}
+        frames, index = divmod(one.index, ticks)
+        grown = self.slope({self.number.outputs[g][one.partition] + one.output: Fraction(1)})
+        first = {self.values[g][Value(one.partition, one.output, index)]: Fraction(1)}
+        return _combine([(1, first), (frames * self.frame, grown)])
+
+    def sends(self, g: int) -> tuple[dict[int, Form], dict[int, Form]]:
+        """Return what site g sends, and how fast that grows, by row of s."""
+        site, schedule = self.exact[g], self.system.sites[g].schedule
+        sent: dict[int, Form] = {}
+        for event, time, acting in _walk(self.system.sites[g]):
+            if isinstance(event, Send):
+                matrices = site.sends[event.partition]
+                inputs = [*self.position(g, time), *(self.value(g, one) for one in acting)]
+                for channel, row in event.rows:
+                    weights = [*matrices.x[channel], *matrices.u[channel]]
+                    sent[row] = _combine(zip(weights, inputs, strict=True))
+        standing = _standing_sends(site, self.number, g)
+        growth = {row: self.slope(standing[one.link, one.channel]) for row, one in enumerate(schedule.sent)}
+        return sent, growth
+
+    def heard(
+        self, g: int, rows: Iterable[int], sent: Sequence[tuple[dict[int, Form], dict[int, Form]]]
+    ) -> Form:
+        """Return what site g hears at some rows of r together, each packet as it was when it was sent."""
+        total: Form = {}
+        for one in (self.system.sites[g].schedule.heard[row] for row in rows):
+            for h, weight in enumerate(self.system.coupling[one.way][g]):
+                if weight:
+                    row = self.system.sites[h].schedule.sent.index(one.sent)
+                    _add(total, weight, sent[h][0][row])
+                    _add(total, -weight * one.lag * self.frame, sent[h][1][row])
+        return total
+
+    def equations(self, sent: Sequence[tuple[dict[int, Form], dict[int, Form]]]) -> Iterator[Form]:
+        """Yield the equations of a ramp: every value as computed, every rate at both ends of an interval."""
+        for g, (site, group) in enumerate(zip(self.exact, self.system.sites, strict=True)):
+            for event, time, acting in _walk(group):
+                x, u = self.position(g, time), [self.value(g, one) for one in acting]
+                if isinstance(event, Propagate):
+                    end = self.position(g, time + event.duration * group.schedule.quantum)
+                    for i, (a, b) in enumerate(zip(site.a, site.b, strict=True)):
+                        for at in (x, end):
+                            terms = [*zip(a, at, strict=True), *zip(b, u, strict=True)]
+                            yield _combine([*terms, (-1, self.rate(g, i))])
+                elif isinstance(event, Tick):
+                    tick, partition = site.ticks[event.partition], site.kind.clocks[event.partition]
+                    before = (Value(event.partition, o, event.index - 1) for o in partition.memories)
+                    inputs = [*x, *u, *(self.value(g, one) for one in before)]
+                    inputs += [self.heard(g, rows, sent) for rows in event.heard]
+                    for o in range(len(partition.outputs)):
+                        row = [*tick.x[o], *tick.u[o], *tick.m[o], *tick.r[o]]
+                        own = self.value(g, Value(event.partition, o, event.index))
+                        yield _combine([*zip(row, inputs, strict=True), (-1, own)])
+
+
+def _drifts(
+    system: ClosedSystem | Loop,
+    exact: Sequence[LinearSite],
+    number: _Numbering,
+    still: Sequence[Sequence[Fraction]],
+) -> list[list[Fraction]]:
+    """Return the states at the start of a frame of the ramps on top of the standing solutions `still`."""
+    ramp = _Ramp(system, exact, number, still)
+    sent = [ramp.sends(g) for g in range(len(exact))]
+    states = []
+    for solution in _null_space(list(ramp.equations(sent)), ramp.size, split=len(still), known=len(still)):
+        state: list[Fraction] = []
+        for g, group in enumerate(system.sites):
+            state += [_value(form, solution) for form in ramp.position(g, Fraction(0))]
+            state += [_value(ramp.value(g, one), solution) for one in group.schedule.carried]
+            for packet in system.packets:
+                if packet.site == g:
+                    now, growth = sent[g][0][packet.row], sent[g][1][packet.row]
+                    before = _combine([(1, now), (-packet.lag * ramp.frame, growth)])
+                    state.append(_value(before, solution))
+        states.append(state)
+    return states
+
+
+def _walk(group: PeerGroup) -> Iterator[tuple[Any, Fraction, tuple[Value | None, ...]]]:
+    """Yield each event of a frame with its time in seconds and what every hold puts out just before it."""
+    schedule = group.schedule
+    acting = list(schedule.acting)
+    now = 0
+    for event in schedule.events:
+        yield event, now * schedule.quantum, tuple(acting)
+        if isinstance(event, Propagate):
+            now += event.duration
+        elif isinstance(event, Act):
+            acting[event.hold] = event.value
+
+
+def _null_space(equations: Sequence[Form], size: int, *, split: int, known: int) -> list[list[Fraction]]:
+    """Return the solutions of homogeneous equations that do not vanish on the first `split` unknowns.
+
+    The number of vectors is the dimension of the solutions' part in these unknowns, and their parts there
+    are independent. `known` solutions that vanish there are known to exist.
+
+    Notes
+    -----
+    Reduced with the unknowns in reverse order, each pivot is bound by unknowns before it; a free unknown
+    among the first `split` then stands for one vector, and the later free ones vanish on these.
+    """
+    rows = [form for form in equations if any(form.values())]
+    if not size or (rows and _surely_none(rows, size, known)):
+        return []
+    matrix = flint.fmpq_mat(max(len(rows), 1), size)
+    for line, form in enumerate(rows):
+        for index, weight in form.items():
+            exact = Fraction(weight)
+            matrix[line, size - 1 - index] = flint.fmpq(exact.numerator, exact.denominator)
+    reduced, rank = matrix.rref()
+    pivots = []
+    column = 0
+    for line in range(rank):
+        while reduced[line, column] == 0:
+            column += 1
+        pivots.append(column)
+    taken = set(pivots)
+    basis = []
+    for unknown in range(split):
+        column = size - 1 - unknown
+        if column in taken:
+            continue
+        vector = [Fraction(0)] * size
+        vector[unknown] = Fraction(1)
+        for line, pivot in enumerate(pivots):
+            entry = reduced[line, column]
+            vector[size - 1 - pivot] = Fraction(-int(entry.p), int(entry.q))
+        basis.append(vector)
+    return basis
+
+
+def _surely_none(rows: Sequence[Form], size: int, known: int) -> bool:
+    """Say whether a look modulo a prime already shows no more than `known` solutions; False proves nothing.
+
+    Independent whole-number solutions, freed of common factors, stay independent modulo a prime: there are at
+    least as many solutions modulo the prime as over the rationals.
+    """
+    matrix = flint.nmod_mat(len(rows), size, QUICK_PRIME)
+    for line, form in enumerate(rows):
+        for index, weight in form.items():
+            exact = Fraction(weight)
+            if exact.denominator % QUICK_PRIME == 0:
+                return False
+            scaled = exact.numerator * pow(exact.denominator, -1, QUICK_PRIME)
+            matrix[line, index] = scaled % QUICK_PRIME
+    return bool(size - matrix.rank() <= known)
+
+
+def _independent(vectors: Sequence[Sequence[Fraction]]) -> list[int]:
+    """Return the places of the vectors that are no combination of those before them."""
+    if not vectors or not vectors[0]:
+        return []
+    matrix = flint.fmpq_mat(
+        [
+            [flint.fmpq(entry.numerator, entry.denominator) for entry in row]
+            for row in zip(*vectors, strict=True)
+        ]
+    )
+    reduced, rank = matrix.rref()
+    return [next(c for c in range(len(vectors)) if reduced[line, c] != 0) for line in range(rank)]
+
+
+def _columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
+    """Return exact vectors as the columns of a float matrix (n, len(vectors))."""
+    return (
+        np.array([[float(entry) for entry in vector] for vector in vectors], dtype=np.float64)
+        .reshape(-1, n)
+        .T
+    )

@@ -1,0 +1,1 @@
+"""One peer over one frame: equations linearized, intervals put together, in floats and exactly."""

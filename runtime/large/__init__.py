@@ -1,0 +1,1 @@
+"""Populations: many different peers, large graphs and long delays, without a matrix of them all."""

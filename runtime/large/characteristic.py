@@ -1,0 +1,245 @@
+"""The characteristic function of a population: small, whatever the number of peers and the length of delays.
+
+Takes: the `Transfer`s of all sites, and how what they send comes back to them.
+Gives: `Characteristic`, `characteristic_ball`, `count_around`, `refine`, `null_vectors`,
+`weights_at`.
+Guarantees: its value in a disc comes with a bound; an eigenvalue of the whole system is a zero of it, or a
+pole of a site that the zero would have to cancel.
+Does not: know who the sites are (see `determinant`).
+
+    f(ζ) = det(I − T(ζ) W(ζ)),   W(ζ) = Σ_l W_l ζ^(−l)
+
+The sites answer what they hear, s = T r, and hear what was sent l frames ago, r = W s. f has a zero where
+that holds without any cause, goes to 1 as ζ goes to infinity, and has the sites' poles: all zeros less all
+poles of the sites outside of a circle are the negative of how often f goes around 0 along it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS
+from apc.runtime.frame.discretize import UNIT
+from apc.runtime.large.counting import Ball, wind
+from apc.runtime.large.transfer import Transfer, differentiate, respond
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# Steps of the power method for a scaling, and the least ratio of its entries.
+POWER_STEPS, FLOOR, TINY = 4, 1e-12, 1e-300
+
+# Steps of Newton's method, none longer than this share of |ζ|; the relative step at which it has arrived, and
+# that from which on rounding alone moves it. Nobody looks for a zero beyond the last.
+STEPS, LONGEST, ARRIVED, NEAR, FARTHEST = 40, 0.1, 1e-15, 1e-6, 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Characteristic:
+    """f(ζ) = det(I − T W); `weights` (l, n_r, n_s) are W_l, `lags` the l.
+
+    The weights are right to `weight_errors`.
+    """
+
+    transfers: tuple[Transfer, ...]
+    lags: tuple[int, ...]
+    weights: Floats
+    weight_errors: Floats
+
+    @property
+    def innermost(self) -> float:
+        """The least |ζ| at which it can be evaluated."""
+        return 2 * max(one.inner for one in self.transfers)
+
+
+def weights_at(function: Characteristic, points: Complexes) -> Complexes:
+    """Return W (z, n_r, n_s)."""
+    powers = points[:, None] ** -np.array(function.lags)
+    return np.asarray(np.einsum("zl,lrs->zrs", powers, function.weights))
+
+
+def _bounded(function: Characteristic, points: Complexes, reach: Floats) -> tuple[Complexes, Floats]:
+    """Return I − T W (z, n, n) at the centres of discs, and a bound on its change in each."""
+    lags = np.array(function.lags)
+    value, doubt = respond(function.transfers, points, reach)
+    weight = weights_at(function, points)
+    # |ζ^−l − ζ₀^−l| ≤ l·reach/(|ζ₀| − reach)^(l+1); a power by way of logarithms loses a rounding a turn.
+    near = np.maximum(np.abs(points) - reach, np.finfo(np.float64).tiny)[:, None]
+    largest = near**-lags
+    wander = largest * (lags * reach[:, None] / near + (8 + 8 * lags) * UNIT)
+    off = np.einsum("zl,lrs->zrs", wander, np.abs(function.weights))
+    off += np.einsum("zl,lrs->zrs", largest, function.weight_errors)
+    size = np.einsum("zl,lrs->zrs", np.abs(points[:, None]) ** -lags, np.abs(function.weights))
+    n_s, n_r = value.shape[1:]
+    total = np.abs(value) @ off + doubt @ (size + off)
+    total += PRODUCT_ROUNDINGS * (n_s + n_r + 2) * UNIT * (np.abs(value) @ size + np.eye(n_s))
+    return np.eye(n_s) - value @ weight, total
+
+
+def characteristic_ball(function: Characteristic, points: Complexes, reach: Floats) -> Ball:
+    """Return f at points, and how much it changes at most in discs about them.
+
+    Parameters
+    ----------
+    function
+        f.
+    points, reach
+        The discs (z,).
+
+    Notes
+    -----
+    With |E| ≤ V entry by entry and F the Frobenius norm of D⁻¹ |A⁻¹| V D, for any scaling D > 0,
+    det(A + E)/det A = Π (1 + λ_i) with Σ |λ_i|² ≤ F² (Schur), so it differs from 1 by at most
+    (1 + F/√n)^n − 1.
+    """
+    with np.errstate(all="ignore"):
+        matrix, doubt = _bounded(function, points, reach)
+        n = matrix.shape[-1]
+        fine = np.asarray(np.isfinite(doubt).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2)))
+        matrix = np.where(fine[:, None, None], matrix, np.eye(n))
+        sign, logarithm = np.linalg.slogdet(matrix)
+        fine &= np.isfinite(logarithm)
+        matrix = np.where(fine[:, None, None], matrix, np.eye(n))
+        inverse, wrong = _inverse(matrix)
+        fine &= wrong < 0.5
+        doubt = np.where(fine[:, None, None], doubt, 0.0)
+        share = _scaled_norm(inverse @ doubt)
+        change = np.where(fine, np.expm1(n * np.log1p(share / np.sqrt(n))) * (1 + 1e-9), np.inf)
+    return Ball(sign, change)
+
+
+def _inverse(matrix: Complexes) -> tuple[Floats, Floats]:
+    """Return bounds on |A⁻¹| (z, n, n), good while the computed inverse Y is: F = I − Y A, ‖F‖ (z,) < 1/2.
+
+    A⁻¹ = (I − F)⁻¹ Y, and |(I − F)⁻¹| is at most I + 2‖F‖ in every entry.
+    """
+    n = matrix.shape[-1]
+    inverse = np.linalg.inv(matrix)
+    size = np.abs(inverse)
+    off = np.abs(np.eye(n) - inverse @ matrix)
+    off += PRODUCT_ROUNDINGS * (n + 2) * UNIT * (size @ np.abs(matrix))
+    wrong = off.sum(axis=2).max(axis=1)
+    return size + 2 * wrong[:, None, None] * size.max(axis=1, keepdims=True), wrong
+
+
+def _scaled_norm(matrices: Floats) -> Floats:
+    """Return Frobenius norms of matrices without negative entries (z, n, n), scaled to be small.
+
+    Between the vectors of Perron of either side a matrix of rank one is symmetric; a few steps of the power
+    method come near them, and any scaling will do.
+    """
+    right, left = np.ones(matrices.shape[:2]), np.ones(matrices.shape[:2])
+    for _ in range(POWER_STEPS):
+        right = (matrices @ right[..., None])[..., 0]
+        left = (left[:, None, :] @ matrices)[:, 0]
+        right = np.maximum(right / np.maximum(right.max(axis=1, keepdims=True), TINY), FLOOR)
+        left = np.maximum(left / np.maximum(left.max(axis=1, keepdims=True), TINY), FLOOR)
+    scale = np.sqrt(right / left)
+    scaled = matrices / scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.norm(scaled, axis=(1, 2)))
+
+
+def count_around(
+    function: Characteristic, centre: float | complex, radius: float, *, arcs: int, most: int
+) -> int | None:
+    """Return zeros less poles of f within a circle, None if that can't be told.
+
+    Parameters
+    ----------
+    function
+        f.
+    centre, radius, arcs, most
+        As `counting.wind` has them.
+    """
+    return wind(
+        lambda points, reach: characteristic_ball(function, points, reach),
+        centre,
+        radius,
+        arcs=arcs,
+        most=most,
+    )
+
+
+def refine(
+    function: Characteristic,
+    starts: Sequence[complex] | Complexes,
+    *,
+    poles: Complexes,
+    found: Complexes | None = None,
+) -> Complexes:
+    """Return zeros of f by Newton's method from many starts; where it does not arrive, NaN.
+
+    Parameters
+    ----------
+    function
+        f.
+    starts
+        Where to begin (z,).
+    poles
+        Poles of f to take out (m,), with their conjugates: Newton's method on Π (ζ − p) f, which they no
+        longer turn away.
+    found
+        Zeros that are known, taken out with their conjugates (Maehly), so that others are found.
+    """
+    points = np.array(starts, dtype=np.complex128)
+    steps = np.full(len(points), np.inf)
+    active = np.flatnonzero(np.isfinite(points))
+    out, known = (_whole(np.zeros(0, np.complex128) if one is None else one) for one in (poles, found))
+    with np.errstate(all="ignore"):
+        for _ in range(STEPS):
+            if not len(active):
+                break
+            now = points[active]
+            rate = _log_rate(function, now)
+            rate = rate + (1 / (now[:, None] - out)).sum(axis=1) - (1 / (now[:, None] - known)).sum(axis=1)
+            step = -1 / rate
+            longest = LONGEST * np.abs(now)
+            step = np.where(np.abs(step) > longest, step / np.abs(step) * longest, step)
+            moved = now + step
+            size = np.abs(moved)
+            lost = ~np.isfinite(size) | (size <= function.innermost) | (size > FARTHEST)
+            before, steps[active] = steps[active], np.abs(step) / size
+            points[active] = np.where(lost, np.nan, moved)
+            # Far below what is `NEAR`, steps that no longer shrink are rounding.
+            arrived = (steps[active] <= ARRIVED) | (
+                (steps[active] < NEAR**1.5) & (steps[active] > before / 2)
+            )
+            active = active[~lost & ~arrived]
+        # Rounding may keep it from standing still; who has found a zero is told by the bounds.
+        return np.where(steps < NEAR, points, np.nan)
+
+
+def _whole(upper: Complexes) -> Complexes:
+    """Return points of the upper half plane with their conjugates."""
+    return np.concatenate([upper, upper[upper.imag != 0].conj()])
+
+
+def _log_rate(function: Characteristic, points: Complexes) -> Complexes:
+    """Return f′/f = tr((I − T W)⁻¹ (I − T W)′), infinite at a zero."""
+    lags = np.array(function.lags)
+    value, slope = differentiate(function.transfers, points)
+    weight = weights_at(function, points)
+    weight_slope = np.einsum("zl,lrs->zrs", -lags * points[:, None] ** (-lags - 1), function.weights)
+    matrix = np.eye(value.shape[1]) - value @ weight
+    change = -(slope @ weight + value @ weight_slope)
+    sign, _ = np.linalg.slogdet(matrix)
+    fine = np.abs(sign) > 0.5
+    # A zero to the last digit is arrived at; on a pole nothing is known.
+    rate = np.where(np.isfinite(matrix).all(axis=(1, 2)), complex(np.inf), complex(np.nan))
+    rate[fine] = np.trace(np.linalg.solve(matrix[fine], change[fine]), axis1=1, axis2=2)
+    return rate
+
+
+def null_vectors(function: Characteristic, point: complex) -> tuple[Complexes, Complexes]:
+    """Return s and χ with (I − T W) s ≈ 0 and χ (I − T W) ≈ 0, of norm 1, at a zero of f.
+
+    s is what is sent in the mode, χ what weighs it.
+    """
+    at = np.array([point])
+    value, weight = differentiate(function.transfers, at)[0][0], weights_at(function, at)[0]
+    left, _, right = np.linalg.svd(np.eye(len(value)) - value @ weight)
+    return right[-1].conj(), left[:, -1].conj()

@@ -1,0 +1,211 @@
+"""Peers by the thousand, all different: the matrices of every one, without an object for each.
+
+Takes: a `CompiledSystem`, its numbers, Jacobians and schedules.
+Gives: `Crowd`, `crowds`, `some_rows`, `lift_one`, `hear_themselves`.
+Guarantees: a crowd costs what its different peers cost in one array operation each, not in one Python call
+each; equal peers of a crowd are counted.
+Does not: merge equal peers of different groups (see `peers`), or take sites that are not affine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.frame.batch_lift import CHUNK, LiftedRows, lift_rows
+from apc.runtime.frame.discretize import UNIT
+from apc.runtime.frame.lift import LiftedSite, lift
+from apc.runtime.frame.linearize import SiteJacobians, linearize_rows, site_of_row
+from apc.runtime.frame.parameters import Numbers
+from apc.runtime.frame.schedule import Schedule
+from apc.runtime.large.transfer import StateSpace
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# The matrices of `LiftedRows`, one a site.
+ROWS = ("p", "q", "s", "d", "p_error", "q_error", "s_error", "d_error")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crowd:
+    """The peers of one group of the scene, k different ones.
+
+    `group` is its place in the scene; `parameters` (k, n_p) and `lifted` are the different peers', `rows`
+    (count,) says which each peer is, `counts` (k,) how many are.
+    """
+
+    name: str
+    group: int
+    jacobians: SiteJacobians
+    schedule: Schedule
+    parameters: Floats
+    lifted: LiftedRows
+    rows: Integers
+    counts: Floats
+
+    def sends(self, link: str) -> bool:
+        """Say whether these peers send over a link."""
+        return any(sending.link == link for sending in self.jacobians.kind.sends)
+
+
+def crowds(
+    system: CompiledSystem,
+    jacobians: Sequence[SiteJacobians],
+    schedules: Sequence[Schedule],
+    numbers: Numbers,
+) -> tuple[Crowd, ...]:
+    """Linearize and lift all different peers of a system.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, every kind of it affine and without edge functions.
+    jacobians
+        One a kind.
+    schedules
+        One a group of the scene.
+    numbers
+        The parameters and timings.
+    """
+    found = []
+    for place, (group, schedule) in enumerate(zip(system.groups, schedules, strict=True)):
+        site, parameters = jacobians[group.kind], numbers.parameters[place]
+        lifted = lift_rows(site, schedule, linearize_rows(site, parameters))
+        rows = numbers.rows[place]
+        counts = np.bincount(rows, minlength=len(parameters)).astype(np.float64)
+        found.append(Crowd(group.name, place, site, schedule, parameters, lifted, rows, counts))
+    return tuple(found)
+
+
+def some_rows(lifted: LiftedRows, places: slice | Integers) -> LiftedRows:
+    """Return some of the sites."""
+    return replace(lifted, **{name: getattr(lifted, name)[places] for name in ROWS})
+
+
+def rows_of(lifted: LiftedSite, count: int) -> LiftedRows:
+    """Return `count` copies of one lifted site."""
+
+    def copies(matrix: Floats) -> Floats:
+        return np.broadcast_to(matrix, (count, *matrix.shape))
+
+    return LiftedRows(
+        z_names=lifted.z_names,
+        frame_s=lifted.frame_s,
+        p=copies(lifted.p),
+        q=copies(lifted.q),
+        s=copies(lifted.s),
+        d=copies(lifted.d),
+        p_error=copies(lifted.p_error),
+        q_error=copies(lifted.q_error),
+        s_error=copies(lifted.s_error),
+        d_error=copies(lifted.d_error),
+    )
+
+
+def lift_one(crowd: Crowd, row: int) -> LiftedSite:
+    """Lift one of the different peers by itself, with what happens inside of the frame."""
+    vector = crowd.parameters[row]
+    site = site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, vector[None])[0])
+    return lift(site, crowd.schedule)
+
+
+def hear_themselves(lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats) -> StateSpace:
+    """Let every site hear its own packets, weighed, and leave the rest of what it hears open.
+
+    Parameters
+    ----------
+    lifted
+        k sites.
+    schedule
+        Theirs.
+    own
+        What each line of r weighs the site's own packets by (k, n_r).
+    others
+        What each line weighs what still comes from outside by (k, n_r).
+
+    Notes
+    -----
+    The state is z, then the packets on their way, row by row of s, the youngest first. With A₀ and B_p
+    picking what each line hears of this frame's packets and of those on their way,
+    r = others·τ + own·(A₀ s + B_p q) and s = S z + D r: as in `modes.close_loop`, D A₀ is nilpotent.
+    """
+    parts = []
+    for start in range(0, len(own), CHUNK):
+        chunk = slice(start, start + CHUNK)
+        parts.append(_hear_themselves(some_rows(lifted, chunk), schedule, own[chunk], others[chunk]))
+    joined = zip(*parts, strict=True)
+    return StateSpace(*(np.concatenate(part) for part in joined))
+
+
+def _hear_themselves(
+    lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats
+) -> tuple[Floats, ...]:
+    """Close a chunk of sites, with the errors."""
+    now, before, count = lines_of(schedule)
+    blocks = (lifted.p, lifted.q, lifted.s, lifted.d)
+    errors = (lifted.p_error, lifted.q_error, lifted.s_error, lifted.d_error)
+    large = [np.abs(block) for block in blocks]
+    wide = [block + error for block, error in zip(large, errors, strict=True)]
+    value = _closed(blocks, own, others, now, before, schedule, count)
+    bound = _closed(large, np.abs(own), np.abs(others), now, before, schedule, count)
+    upper = _closed(wide, np.abs(own), np.abs(others), now, before, schedule, count)
+    terms = lifted.p.shape[-1] + 2 * len(schedule.heard) + 4
+    roundings = 4 * terms * (1 + len(schedule.sent)) * UNIT
+    return (*value, *((u - b) + roundings * u for u, b in zip(upper, bound, strict=True)))
+
+
+def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:
+    """Return A₀ (n_r, n_s), B_p (n_r, n_q) and the number n_q of packets on their way."""
+    place = {one: row for row, one in enumerate(schedule.sent)}
+    starts = np.cumsum([0, *schedule.depths])
+    now = np.zeros((len(schedule.heard), len(schedule.sent)))
+    before = np.zeros((len(schedule.heard), int(starts[-1])))
+    for line, one in enumerate(schedule.heard):
+        if one.sent not in place:  # this kind does not send it
+            continue
+        if one.lag == 0:
+            now[line, place[one.sent]] = 1.0
+        else:
+            before[line, starts[place[one.sent]] + one.lag - 1] = 1.0
+    return now, before, int(starts[-1])
+
+
+def _closed(
+    blocks: Sequence[Floats],
+    own: Floats,
+    others: Floats,
+    now: Floats,
+    before: Floats,
+    schedule: Schedule,
+    packets: int,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return M, B, S and D of the sites with their own packets closed."""
+    p, q, s, d = blocks
+    sites, n_z = p.shape[:2]
+    in_frame = own[:, :, None] * now  # (k, n_r, n_s)
+    spread = np.broadcast_to(np.eye(len(schedule.heard)), (sites, *[len(schedule.heard)] * 2))
+    if in_frame.any() and d.any():  # Neumann's series ends: nothing is heard before it is sent
+        loop = term = in_frame @ d
+        for _ in range(len(schedule.sent)):
+            spread, term = spread + term, term @ loop
+        assert not term.any(), "a packet is heard before it is sent"
+    r_z = spread @ (in_frame @ s)
+    r_q = spread @ (own[:, :, None] * before)
+    r_t = spread * others[:, None, :]
+    s_all = np.concatenate([s + d @ r_z, d @ r_q], axis=2)
+    s_t = d @ r_t
+    m = np.zeros((sites, n_z + packets, n_z + packets))
+    b = np.zeros((sites, n_z + packets, len(schedule.heard)))
+    m[:, :n_z, :n_z], m[:, :n_z, n_z:], b[:, :n_z] = p + q @ r_z, q @ r_q, q @ r_t
+    place = n_z
+    for row, depth in enumerate(schedule.depths):
+        if depth:
+            m[:, place], b[:, place] = s_all[:, row], s_t[:, row]
+            m[:, range(place + 1, place + depth), range(place, place + depth - 1)] = 1.0
+        place += depth
+    return m, b, s_all, s_t

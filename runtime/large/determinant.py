@@ -1,0 +1,196 @@
+"""Populations by a small determinant: all different on a complete graph, or delays of any length.
+
+Takes: crowds of different peers on complete graphs; or a few sites that hear each other.
+Gives: `of_crowds`, `of_loop`; `Places`, `senders_of`.
+Guarantees: the determinant's size is what is sent in a frame, by one peer of each role or by the few sites,
+whatever the number of peers or the length of a delay.
+Does not: find its zeros (see `zeros`).
+
+A peer on a complete graph hears r_i = c_i L(ζ) (σ − s_i), with σ the sum of what all send and L the delays:
+hearing −c_i of itself makes it a site T_i, s_i = T_i L σ, and det(I − Σ_i T_i L) = 0. Sites that hear each
+other by weights, r_g = Σ_h W_gh ζ^(−lag) s_h, are det(I − T W) = 0, T = diag(T_g): no state for a packet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.modes import Coupling
+from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.frame.discretize import UNIT
+from apc.runtime.frame.exchange import Exchange, check_mean
+from apc.runtime.frame.schedule import Heard, Sent, Way
+from apc.runtime.large.characteristic import Characteristic
+from apc.runtime.large.crowds import Crowd, hear_themselves
+from apc.runtime.large.transfer import StateSpace, build_transfer
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+def senders_of(listed: Sequence[Crowd], exchange: Exchange) -> list[Floats]:
+    """Return, for each crowd, how many others each line of r could hear over its complete graph (n_r,)."""
+    senders = {
+        link: float(sum(crowd.counts.sum() for crowd in listed if crowd.sends(link)))
+        for link in exchange.links
+    }
+    return [
+        np.array(
+            [senders[one.way.link] - (1 if crowd.sends(one.way.link) else 0) for one in crowd.schedule.heard]
+        )
+        for crowd in listed
+    ]
+
+
+def heard_weights(listed: Sequence[Crowd], exchange: Exchange) -> list[Floats]:
+    """Return, for each crowd, what each line of r weighs another's packet by on complete graphs (n_r,).
+
+    Raises
+    ------
+    ApcError
+        E801 a mean over nobody.
+    """
+    weights = []
+    for crowd, senders in zip(listed, senders_of(listed, exchange), strict=True):
+        own = np.ones(len(senders))
+        for line, (one, others) in enumerate(zip(crowd.schedule.heard, senders.tolist(), strict=True)):
+            if one.way.operator == "mean":
+                first = int(exchange.starts[crowd.group])
+                check_mean(exchange, first, one.way.link, "mean", others > 0, Fraction(others))
+                own[line] = 1.0 / others
+        weights.append(own)
+    return weights
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where in s and r of the whole each crowd's rows are; what it weighs its own packets and others' by."""
+
+    sent: tuple[Integers, ...]
+    heard: tuple[Integers, ...]
+    own: tuple[Floats, ...]
+    others: tuple[Floats, ...]
+
+
+def of_crowds(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Characteristic, Places]:
+    """Return the characteristic function of different peers on complete graphs.
+
+    Parameters
+    ----------
+    listed
+        All peers.
+    exchange
+        The links, all of them complete.
+    """
+    roles = [exchange.role(crowd.group) for crowd in listed]
+    sent_place: dict[tuple[int, Sent], int] = {}
+    heard_place: dict[tuple[int, Heard], int] = {}
+    for role, crowd in zip(roles, listed, strict=True):
+        for sent in crowd.schedule.sent:
+            sent_place.setdefault((role, sent), len(sent_place))
+        for heard in crowd.schedule.heard:
+            heard_place.setdefault((role, heard), len(heard_place))
+    group_of = {role: crowd.group for role, crowd in reversed(list(zip(roles, listed, strict=True)))}
+
+    def on_the_way(way: Way, sender: int, receiver: int) -> bool:
+        return exchange.delay(way.link, group_of[sender], group_of[receiver]) == way.delay
+
+    others = heard_weights(listed, exchange)
+    places = Places(
+        sent=tuple(
+            np.array([sent_place[role, one] for one in crowd.schedule.sent], np.int64)
+            for role, crowd in zip(roles, listed, strict=True)
+        ),
+        heard=tuple(
+            np.array([heard_place[role, one] for one in crowd.schedule.heard], np.int64)
+            for role, crowd in zip(roles, listed, strict=True)
+        ),
+        own=tuple(
+            -weight * np.array([float(on_the_way(one.way, role, role)) for one in crowd.schedule.heard])
+            for role, crowd, weight in zip(roles, listed, others, strict=True)
+        ),
+        others=tuple(others),
+    )
+    transfers = []
+    for g, crowd in enumerate(listed):
+        k = len(crowd.parameters)
+        own, weight = (np.tile(row, (k, 1)) for row in (places.own[g], places.others[g]))
+        space = hear_themselves(crowd.lifted, crowd.schedule, own, weight)
+        placed = _placed(space, places.sent[g], places.heard[g], len(sent_place), len(heard_place))
+        transfers.append(build_transfer(placed, crowd.counts))
+    lags = sorted({heard.lag for _, heard in heard_place})
+    weights = np.zeros((len(lags), len(heard_place), len(sent_place)))
+    for (receiver, heard), line in heard_place.items():
+        for (sender, sent), row in sent_place.items():
+            if sent == heard.sent and on_the_way(heard.way, sender, receiver):
+                weights[lags.index(heard.lag), line, row] = 1.0
+    return Characteristic(tuple(transfers), tuple(lags), weights, np.zeros_like(weights)), places
+
+
+def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]) -> Characteristic:
+    """Return the characteristic function of a few sites that hear each other, delays of any length.
+
+    Parameters
+    ----------
+    sites
+        The K sites.
+    coupling
+        What each hears of each, W (K, K) by way.
+    doubts
+        By how much each entry of a way's W may be off, where it isn't exact.
+    """
+    sent_starts = np.cumsum([0, *(len(group.schedule.sent) for group in sites)])
+    heard_starts = np.cumsum([0, *(len(group.schedule.heard) for group in sites)])
+    n_s, n_r = int(sent_starts[-1]), int(heard_starts[-1])
+    transfers = []
+    for g, group in enumerate(sites):
+        one = group.lifted
+        blocks = (one.p, one.q, one.s, one.d, one.p_error, one.q_error, one.s_error, one.d_error)
+        rows = np.arange(sent_starts[g], sent_starts[g + 1])
+        lines = np.arange(heard_starts[g], heard_starts[g + 1])
+        space = _placed(StateSpace(*(block[None] for block in blocks)), rows, lines, n_s, n_r)
+        transfers.append(build_transfer(space, np.ones(1)))
+    lags = sorted({heard.lag for group in sites for heard in group.schedule.heard})
+    weights, errors = np.zeros((len(lags), n_r, n_s)), np.zeros((len(lags), n_r, n_s))
+    for g, group in enumerate(sites):
+        for line, heard in enumerate(group.schedule.heard):
+            layer = lags.index(heard.lag)
+            for h, sender in enumerate(sites):
+                weight = coupling[heard.way][g][h]
+                if heard.sent in sender.schedule.sent:
+                    row = sent_starts[h] + sender.schedule.sent.index(heard.sent)
+                    weights[layer, heard_starts[g] + line, row] = float(weight)
+                    errors[layer, heard_starts[g] + line, row] = float(abs(weight)) * UNIT + doubts.get(
+                        heard.way, 0.0
+                    )
+    return Characteristic(tuple(transfers), tuple(lags), weights, errors)
+
+
+def _placed(space: StateSpace, rows: Integers, lines: Integers, n_s: int, n_r: int) -> StateSpace:
+    """Return sites among all that is sent and heard: `rows` of s and `lines` of r are theirs."""
+
+    def wide(block: Floats) -> Floats:
+        found = np.zeros((*block.shape[:2], n_r))
+        found[:, :, lines] = block
+        return found
+
+    def tall(block: Floats) -> Floats:
+        found = np.zeros((len(block), n_s, block.shape[2]))
+        found[:, rows] = block
+        return found
+
+    return StateSpace(
+        m=space.m,
+        b=wide(space.b),
+        s=tall(space.s),
+        d=tall(wide(space.d)),
+        m_error=space.m_error,
+        b_error=wide(space.b_error),
+        s_error=tall(space.s_error),
+        d_error=tall(wide(space.d_error)),
+    )

@@ -1,0 +1,359 @@
+"""The spectrum of a population by its characteristic function: bounds, verdict, the largest modes.
+
+Takes: loops with long delays, or crowds of different peers on complete graphs.
+Gives: `solve_loops`, `solve_crowds`.
+Guarantees: as `zeros`: the radius is bounded from both sides, and nothing beyond it is missed; a verdict
+nearer to the boundary than its bound says so. Rigid modes are known from the equations.
+Does not: list more than the largest modes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.modes import Loop
+from apc.runtime.eigen.rigid import find_rigid_modes
+from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation, turned_along
+from apc.runtime.frame.exchange import Exchange
+from apc.runtime.frame.lift import LiftedSite
+from apc.runtime.large.characteristic import Characteristic, null_vectors, weights_at
+from apc.runtime.large.crowds import Crowd, hear_themselves, lift_one, lines_of, some_rows
+from apc.runtime.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
+from apc.runtime.large.transfer import CHUNK, differentiate
+from apc.runtime.large.zeros import Zero, Zeros, find_zeros, near_poles
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# Modes listed of each system; of many peers fewer, as the shares of all peers are worked out for each.
+LISTED, LISTED_OF_MANY, MANY = 5, 1, 20_000
+
+# Poles of a crowd's sites that zeros are looked for close to.
+NEAR_POLES = 6
+
+# Peers of a crowd whose copies, all equal, tell where its common zeros may be.
+SAMPLES = 2
+
+# Smaller eigenvalues of these decide nothing, and those this near to 1 are rigid.
+LEAST_START, SAME_START = 0.5, 1e-9
+
+# Zeros of a loop that Newton's method starts from, the largest by their estimate.
+STARTS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """One system: what its zeros say, and its modes."""
+
+    zeros: Zeros
+    rigid: int
+    drifts: int
+    modes: tuple[Mode, ...]
+
+
+def solve_loops(loops: Sequence[Loop]) -> Spectrum:
+    """Compute the spectrum of a whole system given as independent loops, delays of any length.
+
+    Parameters
+    ----------
+    loops
+        The loops, each counted as often as its multiplicity says.
+    """
+    return _spectrum([_solve_loop(loop) for loop in loops], [loop.multiplicity for loop in loops])
+
+
+def solve_crowds(listed: Sequence[Crowd], exchange: Exchange, *, rigid: int) -> Spectrum:
+    """Compute the spectrum of different peers on complete graphs.
+
+    Parameters
+    ----------
+    listed
+        All peers.
+    exchange
+        The links, all of them complete.
+    rigid
+        How many common translations there are, from the equations (see `translation`).
+    """
+    function, places = of_crowds(listed, exchange)
+    peers = int(sum(len(crowd.parameters) for crowd in listed))
+    zeros = find_zeros(
+        function,
+        _common_starts(listed, exchange),
+        rigid=rigid,
+        listed=LISTED_OF_MANY if peers > MANY else LISTED,
+        near=NEAR_POLES,
+    )
+    modes = _with_conjugates(_crowd_mode(function, places, listed, zero) for zero in zeros.found)
+    return _spectrum([_Solved(zeros, rigid, 0, modes)], [1])
+
+
+def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spectrum:
+    """Put the answers of independent systems together."""
+    modes = sorted(
+        (mode for one in solved for mode in one.modes),
+        key=lambda mode: (-mode.magnitude, mode.shape, mode.eigenvalue.real, -mode.eigenvalue.imag),
+    )
+    low = max(one.zeros.low for one in solved)
+    high = max(one.zeros.high for one in solved)
+    radius = modes[0].magnitude if modes else 0.0
+    rigid = sum(one.rigid * many for one, many in zip(solved, multiplicities, strict=True))
+    drifts = sum(one.drifts * many for one, many in zip(solved, multiplicities, strict=True))
+    inside = [False if one.zeros.low > 1 else True if one.zeros.high < 1 else None for one in solved]
+    verdict, stable = judge(inside, rigid, drifts)
+    notes = ["the largest modes only; that none is larger was counted by the argument principle"]
+    if not all(one.zeros.counted for one in solved):
+        notes = ["the largest modes found; the count that none is larger was had farther out only"]
+    error = max(high - radius, radius - low, 0.0)
+    return Spectrum(tuple(modes), radius, error, rigid, drifts, verdict, stable, "", tuple(notes))
+
+
+def _solve_loop(loop: Loop) -> _Solved:
+    """Find the largest modes of a loop."""
+    function = of_loop(loop.sites, loop.coupling, loop.doubts)
+    prompt = _without_packets(loop)
+    rigid, drifts = find_rigid_modes(prompt, with_drifts=False).directions.shape[1], 0
+    starts = _delay_starts(function)
+    zeros = find_zeros(function, starts, rigid=rigid, listed=LISTED, near=0)
+    if rigid and not zeros.rigid_counted and (drifts := find_rigid_modes(prompt).drifts):
+        zeros = find_zeros(function, starts, rigid=rigid + drifts, listed=LISTED, near=0)
+    modes = _with_conjugates(_loop_mode(function, loop, zero) for zero in zeros.found)
+    return _Solved(zeros, rigid, drifts, modes)
+
+
+def _without_packets(loop: Loop) -> Loop:
+    """Return the loop with no packet in its state: how many motions are rigid does not depend on delays."""
+    sites = tuple(
+        replace(group, schedule=replace(group.schedule, depths=(0,) * len(group.schedule.depths)))
+        for group in loop.sites
+    )
+    return replace(loop, sites=sites)
+
+
+def _delay_starts(function: Characteristic) -> Complexes:
+    """Return where the zeros of a loop with a long delay d are about.
+
+    Where k is an eigenvalue of T(ζ) W(ζ) ζ^d, f has a zero if ζ^d = k(ζ): near the unit circle ζ is
+    |k|^(1/d) times a d-th root of 1, turned by what k is turned.
+    """
+    delay = max(*function.lags, 1)
+    turns = np.arange(delay // 2 + 1)
+    on_circle = np.exp(2j * np.pi * turns / delay) * (1 + 1e-9)
+    value, _ = differentiate(function.transfers, on_circle)
+    gain = np.linalg.eigvals(value @ weights_at(function, on_circle)) * (on_circle**delay)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithm = (np.log(gain) + 2j * np.pi * turns[:, None]) / delay
+    starts = np.exp(logarithm).ravel()
+    largest = np.sort(np.abs(starts[np.isfinite(starts)]))[-STARTS:] if len(starts) else starts
+    starts = starts[np.abs(starts) >= largest.min(initial=np.inf)]
+    poles = near_poles(function, NEAR_POLES)
+    return np.concatenate([starts, poles * (1 + 1e-3), poles * (1 - 1e-3)])
+
+
+def _common_starts(listed: Sequence[Crowd], exchange: Exchange) -> Complexes:
+    """Return the eigenvalues of populations of copies of one peer, for some peers: all moving alike."""
+    found = [np.zeros(0, np.complex128)]
+    weights = zip(heard_weights(listed, exchange), senders_of(listed, exchange), strict=True)
+    for crowd, (weight, senders) in zip(listed, weights, strict=True):
+        few = np.unique(np.linspace(0, len(crowd.parameters) - 1, SAMPLES).astype(np.int64))
+        own = np.tile(weight * senders, (len(few), 1))
+        alike = hear_themselves(some_rows(crowd.lifted, few), crowd.schedule, own, 0 * own)
+        values = np.linalg.eigvals(alike.m).astype(np.complex128).ravel()
+        kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
+        found.append(values[kept])
+    return np.concatenate(found)
+
+
+def _loop_mode(function: Characteristic, loop: Loop, zero: Zero) -> Mode:
+    """Describe a zero of a loop; the packets of a channel on their way count together."""
+    value = zero.value
+    sent, weight = null_vectors(function, value)
+    heard = weights_at(function, np.array([value]))[0] @ sent
+    motions, felt = [], []
+    s_start = r_start = 0
+    for group in loop.sites:
+        one = group.lifted
+        rows = slice(s_start, s_start + len(one.s))
+        lines = slice(r_start, r_start + one.q.shape[1])
+        s_start, r_start = rows.stop, lines.stop
+        blocks = (one.p[None], one.q[None], one.s[None], one.d[None])
+        motions.append(_move(blocks, value, heard[None, lines], weight[rows]))
+        felt.append(motions[-1].felt[0])
+    waiting = _waiting(function, value, np.concatenate(felt), max(function.lags))
+    lags = np.arange(1, len(waiting) + 1)[:, None]
+    on_the_way = np.abs(waiting * sent * value ** -lags.astype(np.float64))
+    shares: dict[str, float] = {}
+    place = 0
+    for group, motion in zip(loop.sites, motions, strict=True):
+        prefix = f"{group.name}." if len(loop.sites) > 1 else ""
+        for name, share in zip(group.lifted.z_names, np.abs(motion.w[0] * motion.z[0]), strict=True):
+            shares[prefix + name] = float(share)
+        for name, depth in zip(group.schedule.sent_names, group.schedule.depths, strict=True):
+            share = float(on_the_way[:depth, place].sum())
+            shares[prefix + name] = shares.get(prefix + name, 0.0) + share
+            place += 1
+    dominant = max(range(len(motions)), key=lambda g: float(np.abs(motions[g].w * motions[g].z).max()))
+    lifted = loop.sites[dominant].lifted
+    state = np.concatenate([motions[dominant].z[0], motions[dominant].r[0]])
+    return _mode(zero, lifted, state, motions[dominant].w[0], shares, loop.name, loop.multiplicity)
+
+
+def _crowd_mode(function: Characteristic, places: Places, listed: Sequence[Crowd], zero: Zero) -> Mode:
+    """Describe a zero of a population of crowds; the shares of a crowd's peers are added up."""
+    if zero.site:
+        return _own_mode(listed[zero.site[0]], places, zero, zero.site)
+    value = zero.value
+    sent, weight = null_vectors(function, value)
+    heard = weights_at(function, np.array([value]))[0] @ sent
+    motions = [
+        _move_crowd(
+            crowd, places.own[g], places.others[g], value, heard[places.heard[g]], weight[places.sent[g]]
+        )
+        for g, crowd in enumerate(listed)
+    ]
+    felt = np.zeros(len(heard), np.complex128)
+    for g, (crowd, motion) in enumerate(zip(listed, motions, strict=True)):
+        felt[places.heard[g]] += crowd.counts @ motion.felt
+    waiting = _waiting(function, value, felt, max(function.lags))
+    shares: dict[str, float] = {}
+    most, dominant = -1.0, (0, 0)
+    for g, (crowd, motion) in enumerate(zip(listed, motions, strict=True)):
+        n_z = len(crowd.lifted.z_names)
+        covector = motion.w.copy()
+        names, place = list(crowd.lifted.z_names), n_z
+        for row, depth in enumerate(crowd.schedule.depths):
+            covector[:, place : place + depth] += waiting[:depth, places.sent[g][row]]
+            names += [crowd.schedule.sent_names[row]] * depth
+            place += depth
+        own = np.abs(covector * motion.z)
+        for name, share in zip(names, crowd.counts @ own, strict=True):
+            name = f"{crowd.name}.{name}" if len(listed) > 1 else name
+            shares[name] = shares.get(name, 0.0) + float(share)
+        peer = int(np.argmax(own.sum(axis=1)))
+        if float(own[peer].sum()) > most:
+            most, dominant = float(own[peer].sum()), (g, peer)
+    g, peer = dominant
+    lifted = lift_one(listed[g], peer)
+    n_z = len(lifted.z_names)
+    state = np.concatenate([motions[g].z[peer, :n_z], motions[g].r[peer]])
+    return _mode(zero, lifted, state, motions[g].w[peer], shares, "different peers", zero.multiplicity)
+
+
+def _own_mode(crowd: Crowd, places: Places, zero: Zero, site: tuple[int, int]) -> Mode:
+    """Describe an eigenvalue of one peer by itself: of equal peers moving apart, or of one nobody hears."""
+    g, row = site
+    some = some_rows(crowd.lifted, slice(row, row + 1))
+    own, others = places.own[g], places.others[g]
+    space = hear_themselves(some, crowd.schedule, own[None], others[None])
+    values, vectors = np.linalg.eig(space.m[0])
+    z = vectors[:, int(np.argmin(np.abs(values - zero.value)))]
+    found, covectors = np.linalg.eig(space.m[0].T)
+    w = covectors[:, int(np.argmin(np.abs(found - zero.value)))]
+    now, before, _ = lines_of(crowd.schedule)
+    n_z = some.p.shape[-1]
+    received = own * (now @ (space.s[0] @ z) + before @ z[n_z:])
+    waiting = zip(crowd.schedule.sent_names, crowd.schedule.depths, strict=True)
+    names = [*some.z_names, *(name for name, depth in waiting for _ in range(depth))]
+    shares: dict[str, float] = {}
+    for name, share in zip(names, np.abs(w * z).tolist(), strict=True):
+        shares[name] = shares.get(name, 0.0) + share
+    lifted = lift_one(crowd, row)
+    state = np.concatenate([z[:n_z], received])
+    return _mode(zero, lifted, state, w, shares, f"{crowd.name} by itself", zero.multiplicity)
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """Sites in a mode: their states z (k, n), what weighs these, w (k, n), and what they hear, r (k, n_r).
+
+    `felt` (k, n_r) weighs what comes from outside.
+    """
+
+    z: Complexes
+    w: Complexes
+    r: Complexes
+    felt: Complexes
+
+
+def _move(
+    blocks: tuple[Floats, Floats, Floats, Floats], value: complex, heard: Complexes, weight: Complexes
+) -> _Motion:
+    """Return how sites move at ζ, hearing r (k, n_r) from outside, with what they send weighed by χ (n_s,).
+
+    (ζ − M) z = B r and w (ζ − M) = χ S; w B + χ D weighs r.
+    """
+    m, b, s, d = blocks
+    shifted = value * np.eye(m.shape[-1]) - m
+    z: Complexes = np.linalg.solve(shifted, b @ heard[..., None])[..., 0].astype(np.complex128)
+    covector = (weight @ s)[..., None]
+    w: Complexes = np.linalg.solve(shifted.swapaxes(1, 2), covector)[..., 0].astype(np.complex128)
+    return _Motion(z, w, heard, (w[:, None, :] @ b)[:, 0] + weight @ d)
+
+
+def _move_crowd(
+    crowd: Crowd, own: Floats, others: Floats, value: complex, heard: Complexes, weight: Complexes
+) -> _Motion:
+    """Return how the peers of a crowd move, each hearing itself by `own` (n_r,), a chunk at a time."""
+    parts = []
+    now, before, _ = lines_of(crowd.schedule)
+    for start in range(0, len(crowd.parameters), CHUNK):
+        some = some_rows(crowd.lifted, slice(start, start + CHUNK))
+        k = len(some.p)
+        space = hear_themselves(some, crowd.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
+        moved = _move((space.m, space.b, space.s, space.d), value, np.tile(heard, (k, 1)), weight)
+        sent = (space.s @ moved.z[..., None] + space.d @ moved.r[..., None])[..., 0]
+        packets = moved.z[:, some.p.shape[-1] :]
+        received = others * heard + own * (sent @ now.T + packets @ before.T)
+        parts.append(replace(moved, r=received))
+    return _Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in _Motion.__slots__))
+
+
+def _waiting(function: Characteristic, value: complex, felt: Complexes, depth: int) -> Complexes:
+    """Return what weighs a packet l = 1 … depth frames old, (depth, n_s): all who still hear it."""
+    found = np.zeros((depth, function.weights.shape[2]), np.complex128)
+    for lag, weight in zip(function.lags, function.weights, strict=True):
+        ages = np.arange(1, lag + 1)
+        found[:lag] += (value ** (ages - lag - 1).astype(np.float64))[:, None] * (felt @ weight)
+    return found
+
+
+def _mode(
+    zero: Zero,
+    lifted: LiftedSite,
+    state: Complexes,
+    covector: Complexes,
+    shares: dict[str, float],
+    shape: str,
+    multiplicity: int,
+) -> Mode:
+    """Put a mode together; its frequency counts whole turns on the continuous state that takes most part."""
+    frequency, damping = 0.0, 1.0
+    moving = lifted.continuous
+    if moving:
+        dominant = int(np.argmax(np.abs(covector[:moving] * state[:moving])))
+        angle = turned_along(lifted.inside[:, dominant] @ state, zero.value)
+        frequency, damping = oscillation(abs(zero.value), angle, lifted.frame_s)
+    total = sum(shares.values()) or 1.0
+    return Mode(
+        eigenvalue=zero.value,
+        magnitude=abs(zero.value),
+        multiplicity=multiplicity,
+        frequency_hz=float(frequency),
+        damping_ratio=float(damping),
+        shape=shape,
+        participation=tuple((name, share / total) for name, share in shares.items()),
+        error=zero.error,
+    )
+
+
+def _with_conjugates(modes: Iterable[Mode]) -> tuple[Mode, ...]:
+    """Return modes with the conjugate of each that is complex."""
+    found = []
+    for mode in modes:
+        found.append(mode)
+        if mode.eigenvalue.imag:
+            found.append(replace(mode, eigenvalue=mode.eigenvalue.conjugate()))
+    return tuple(found)

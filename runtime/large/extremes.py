@@ -1,0 +1,205 @@
+"""Equal peers on a large graph: which of its many eigenvalues decide, without solving a system for each.
+
+Takes: one group of equal peers, what it weighs its neighbours by, and the eigenvalues of their graph.
+Gives: `Extremes`, `find_extremes`.
+Guarantees: every system that is left out has all its eigenvalues within `below`: whole intervals of graph
+eigenvalues are shown to be so from their middles, rounding included.
+Does not: compute the graph's eigenvalues (see `exchange`), or solve the systems that decide (see `spectrum`).
+
+A site that hears μ times what it sent moves by a matrix M(μ) = M₀ + μ M₁. At the middle c of an interval,
+X⁻¹ M(c) X is diagonal but for a block of what dies out at once, and X⁻¹ M(μ) X differs from it by (μ − c) G,
+G = X⁻¹ M₁ X. For |ζ| ≥ bound there is no eigenvalue if in each row of blocks ζ less the diagonal outweighs
+all the rest (Feingold and Varga, Block diagonally dominant matrices, Pacific J. Math. 1962).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.eigen.pseudospectrum import balance
+from apc.runtime.eigen.rigid import relative_coordinates
+from apc.runtime.frame.discretize import UNIT
+from apc.runtime.large.crowds import hear_themselves, rows_of
+from apc.runtime.large.diagonal import block_diagonal, block_norms, block_resolvent
+from apc.runtime.large.transfer import INNER
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# Intervals of no more graph eigenvalues than this are looked at one by one.
+LEAF = 8
+
+# Graph eigenvalues looked at to begin with, to have a bound to compare with.
+FIRST = 64
+
+# Systems whose radius is within this of the largest, relatively, are all solved.
+ALIKE = 1e-9
+
+# How much the leading eigenvalue's row is made to outweigh, against the others', in turn.
+EMPHASES = (1.0, 30.0, 1000.0)
+
+# Roundings charged to a graph's eigenvalue: those of a cosine's argument, up to π, twice, and its own.
+GRAPH_ROUNDINGS = 32
+
+# Systems that are solved, the largest by estimate; matrices looked at together.
+MOST_SOLVED, TOGETHER = 64, 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Extremes:
+    """The places of the graph eigenvalues that decide, and a bound for the radii of all others.
+
+    `proved` is False when too many are as large as each other, or hear within the frame, for a proof: then
+    `below` is an estimate.
+    """
+
+    places: Integers
+    below: float
+    proved: bool
+
+
+def find_extremes(group: PeerGroup, weights: Floats, values: Floats, rigid: Floats) -> Extremes:
+    """Find the graph eigenvalues with the largest spectral radii.
+
+    Parameters
+    ----------
+    group
+        The peers, all equal.
+    weights
+        What each line of r weighs a neighbour's packet by, in units of the graph's W (n_r,).
+    values
+        The graph's real eigenvalues (m,), the common one left out.
+    rigid
+        Motions (n, d) that are rigid whatever the graph's eigenvalue is.
+    """
+    family = _Family(group, weights, rigid, float(np.abs(values).max(initial=0.0)))
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    if not family.affine:
+        radii = family.radii(ordered)
+        best = float(radii.max())
+        chosen = np.argsort(-radii, kind="stable")[:MOST_SOLVED]
+        return Extremes(order[chosen], best, False)
+    first = np.unique(np.linspace(0, len(values) - 1, FIRST).astype(np.int64))
+    best = float(family.radii(ordered[first]).max())
+    starts, ends = np.array([0]), np.array([len(values)])
+    alone = [first]
+    while len(starts):
+        open_ = ~family.below(ordered[starts], ordered[ends - 1], best * (1 - ALIKE))
+        starts, ends = starts[open_], ends[open_]
+        few = ends - starts <= LEAF
+        leaves = [np.arange(a, b) for a, b in zip(starts[few], ends[few], strict=True)]
+        if leaves:
+            alone += leaves
+            best = max(best, float(family.radii(ordered[np.concatenate(leaves)]).max()))
+        starts, ends = starts[~few], ends[~few]
+        middle = np.searchsorted(ordered, (ordered[starts] + ordered[ends - 1]) / 2)
+        middle = np.clip(middle, starts + 1, ends - 1)  # equal eigenvalues are cut anywhere
+        starts, ends = np.concatenate([starts, middle]), np.concatenate([middle, ends])
+    places = np.unique(np.concatenate(alone))
+    places = places[~family.below(ordered[places], ordered[places], best * (1 - ALIKE))]
+    if len(places) > MOST_SOLVED:
+        radii = family.radii(ordered[places])
+        places = places[np.argsort(-radii, kind="stable")[:MOST_SOLVED]]
+        return Extremes(np.sort(order[places]), best * (1 + ALIKE), False)
+    return Extremes(np.sort(order[places]), best * (1 - ALIKE), True)
+
+
+class _Family:
+    """M(μ) of a site, the rigid motions taken out: relative coordinates x_r − W x_p move by M_rr − W M_pr."""
+
+    def __init__(self, group: PeerGroup, weights: Floats, rigid: Floats, largest: float) -> None:
+        self.group, self.weights = group, weights
+        self.held, self.rest, self.mixing = relative_coordinates(rigid)
+        delayed = all(one.lag for one in group.schedule.heard)
+        self.affine = delayed or not group.lifted.d.any()
+        ends, error = self._matrices(np.array([0.0, largest]))
+        scale = balance(np.abs(ends).max(axis=0) + error.max(axis=0))
+        self.scale = scale
+        self.still = _scaled(ends[0], scale)
+        self.slope = _scaled(ends[1] - ends[0], scale) / (largest or 1.0)
+        rounding = 8 * UNIT * np.abs(ends).max(axis=0)
+        self.error = _scaled(2 * error.max(axis=0) + rounding, scale)
+
+    def _matrices(self, values: Floats) -> tuple[Floats, Floats]:
+        """Return M(μ) (k, n, n), relative coordinates, and bounds on their errors."""
+        own = values[:, None] * self.weights
+        space = hear_themselves(rows_of(self.group.lifted, len(values)), self.group.schedule, own, 0 * own)
+        m, e, w = space.m, space.m_error, self.mixing
+        reduced = m[:, self.rest][:, :, self.rest] - w @ m[:, self.held][:, :, self.rest]
+        error = e[:, self.rest][:, :, self.rest] + np.abs(w) @ (
+            e[:, self.held][:, :, self.rest] + 8 * UNIT * np.abs(m[:, self.held][:, :, self.rest])
+        )
+        return reduced, error
+
+    def radii(self, values: Floats) -> Floats:
+        """Return estimates of the spectral radii at some graph eigenvalues."""
+        found = []
+        for start in range(0, len(values), TOGETHER):
+            some = values[start : start + TOGETHER]
+            matrices = (
+                self.still + some[:, None, None] * self.slope if self.affine else self._matrices(some)[0]
+            )
+            found.append(np.abs(np.linalg.eigvals(matrices)).max(axis=1, initial=0.0))
+        return np.concatenate(found) if found else np.zeros(0)
+
+    def below(self, low: Floats, high: Floats, bound: float) -> NDArray[np.bool_]:
+        """Say of intervals of graph eigenvalues whether all radii in them are proved below a bound."""
+        # The values themselves are rounded, a cosine of an angle up to π a few times.
+        rounding = GRAPH_ROUNDINGS * UNIT * np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)
+        middle, half = (low + high) / 2, (high - low) / 2 + rounding
+        matrices = self.still + middle[:, None, None] * self.slope
+        values, vectors = (part.astype(np.complex128) for part in np.linalg.eig(matrices))
+        order = np.argsort(-np.abs(values), axis=1, kind="stable")
+        values = np.take_along_axis(values, order, axis=1)
+        vectors = np.take_along_axis(vectors, order[:, None, :], axis=2)
+        large = (np.abs(values) > INNER * bound).sum(axis=1)
+        proved = np.zeros(len(middle), dtype=bool)
+        for count in np.unique(large).tolist():
+            place = np.flatnonzero(large == count)
+            error = np.broadcast_to(self.error, (len(place), *self.error.shape))
+            found = block_diagonal(matrices[place], error, values[place], vectors[place], count)
+            turned = found.dual @ self.slope @ found.basis
+            proved[place] = _dominates(
+                values[place, :count],
+                turned,
+                found.change + half[place, None, None] * (found.grown - 1) * np.abs(turned),
+                block_resolvent(found.small, bound),
+                half[place],
+                bound,
+            )
+        return proved
+
+
+def _dominates(
+    values: NDArray[np.complex128],
+    turned: NDArray[np.complex128],
+    change: Floats,
+    block: Floats,
+    half: Floats,
+    bound: float,
+) -> NDArray[np.bool_]:
+    """Say whether ζ − diag(p, T₂) outweighs t G + Δ for all |t| ≤ half and |ζ| ≥ bound, row by row."""
+    large = values.shape[1]
+    own = np.arange(large)
+    sizes = half[:, None, None] * block_norms(np.abs(turned), large) + block_norms(change, large)
+    moved = half[:, None] * turned[:, own, own]
+    reach = np.maximum(np.abs(values + moved), np.abs(values - moved))
+    leading = np.abs(values) >= (1 - 1e-6) * np.abs(values).max(axis=1, keepdims=True, initial=0.0)
+    passed = np.zeros(len(values), dtype=bool)
+    for emphasis in EMPHASES:
+        scale = np.concatenate([np.where(leading, emphasis, 1.0), np.ones((len(values), 1))], axis=1)
+        rows = sizes * scale[:, None, :] / scale[:, :, None]
+        beside = rows.sum(axis=2)
+        beside[:, :large] -= half[:, None] * np.abs(turned[:, own, own])  # in `reach`
+        good = np.all(reach + np.maximum(beside[:, :large], 0.0) * (1 + 1e-9) < bound, axis=1)
+        passed |= good & (block * beside[:, large] < 1)
+    return passed
+
+
+def _scaled(matrix: Floats, scale: Floats) -> Floats:
+    return matrix / scale[:, None] * scale

@@ -1,0 +1,392 @@
+"""The largest eigenvalues of a sparse frame map, and a count of those that are larger.
+
+Takes: crowds of different peers on any graphs, and the exchange between them.
+Gives: `solve_sparse`.
+Guarantees: rigid motions are taken out by their exact directions before any eigenvalue is computed. Errors
+are estimates to first order, from residuals and the errors of the matrix, and so is the radius they bound;
+that nothing lies beyond it is counted by the argument principle on samples of the determinant. The notes say
+so.
+Does not: list more than the largest modes.
+
+Arnoldi's method (ARPACK) finds the eigenvalues nearest to a few shifts, where copies of some peers, all
+alike, would have their largest ones. The count goes around
+
+    g(ζ) = det(I − R/ζ) / Π_k (1 − p_k/ζ),
+
+R the whole and p_k the eigenvalues of peers by themselves, hearing nothing, and those of R that are known: it
+goes to 1 as ζ goes to infinity, and its argument moves far less than that of the determinant.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation, turned_along
+from apc.runtime.frame.discretize import UNIT
+from apc.runtime.frame.exchange import Exchange
+from apc.runtime.large.crowds import Crowd, hear_themselves, lift_one, some_rows
+from apc.runtime.large.sparse_system import RelativeMatrix, SparseSystem, relative_matrix, sparse_system
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# Peers whose copies tell where to look, no more than so many, and by which share of what they hear these
+# move: from all alike to each opposite to its neighbours.
+SAMPLES, SHARES = 2000, (1.0, 0.5, 0.0, -0.5, -1.0)
+
+# Shifts tried, how far apart, and a little off, as a shift must not be an eigenvalue.
+SHIFTS, APART, ASIDE = 6, 0.02, 1.0 + 3e-5
+
+# Eigenvalues sought near each shift; if a count says that some were missed, more, and a little farther out.
+NEAREST, FURTHER = (6, 24, 60), 1.002
+
+# What Arnoldi's method is asked for, relatively, before each value is refined by itself, and its restarts.
+FOUND, RESTARTS = 1e-9, 60
+
+# Modes listed.
+LISTED = 4
+
+# Steps of inverse iteration for a left vector, from a shift this far aside of the eigenvalue.
+STEPS, NEAR = 3, 1e-11
+
+# The circle of the count is so many errors outside of the largest eigenvalue, and at least this far.
+OUTSIDE, FARTHEST = 20.0, 1e-9
+
+# Arcs of the half circle to begin with; eigenvalues this near to the circle, relatively, are not divided by,
+# but looked at, so many of them.
+ARCS, NEAR_CIRCLE, LOOKED_AT = 16, 0.02, 9
+
+# The argument's rate of change is measured over this angle; an arc is settled when two rules for its integral
+# differ by less than that (radians); no arc is narrower, and after so many factorizations it is given up.
+ANGLE, SETTLED, NARROWEST, MOST_FACTORS = 1e-8, 0.5, 1e-12, 1200
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """An eigenvalue with its right and left vector and an estimate of its error."""
+
+    value: complex
+    right: Complexes
+    left: Complexes
+    error: float
+
+
+def solve_sparse(listed: Sequence[Crowd], exchange: Exchange, motions: Sequence[Floats] | None) -> Spectrum:
+    """Compute the largest eigenvalues of different peers on any graphs.
+
+    Parameters
+    ----------
+    listed
+        All peers, one crowd a group of the scene.
+    exchange
+        The links.
+    motions
+        What nothing holds back of all peers together, see `translation.common_translation`.
+    """
+    system = sparse_system(listed, exchange)
+    rigid = _rigid_directions(system, exchange, motions)
+    whole = relative_matrix(system, rigid)
+    pairs: list[_Pair] = []
+    shifts = _shifts(system, listed)
+    for nearest in NEAREST:
+        pairs = _largest(whole, shifts, pairs, nearest)
+        radius, off = abs(pairs[0].value), pairs[0].error
+        beyond = radius + max(OUTSIDE * off, FARTHEST)
+        if beyond >= 1 > radius + off:
+            beyond = (1 + radius) / 2
+        # The rigid motions left in: without them, a column for each is full.
+        known = np.array([pair.value for pair in pairs] + [1.0] * rigid.shape[1])
+        count = count_beyond(system.matrix, _alone(listed), known, beyond)
+        count -= rigid.shape[1] if beyond < 1 and count >= 0 else 0
+        if count <= 0:
+            break
+        shifts = [pair.value * FURTHER for pair in pairs[:2]] + shifts[:2]
+    inside = False if radius - off > 1 else True if count == 0 and beyond < 1 else None
+    radius_error = max(beyond - radius, off) if count == 0 else max(1.0, radius)
+    verdict, stable = judge([inside], rigid.shape[1], 0)
+    notes = ["the largest modes only, by Arnoldi's method; their errors are estimates, not bounds"]
+    notes.append(
+        "that no eigenvalue is larger was counted by the argument principle on samples"
+        if not count
+        else "how many eigenvalues are larger could not be counted: the verdict is left open"
+        if count < 0
+        else f"{count} larger eigenvalues were counted but not found"
+    )
+    modes = tuple(_mode(system, listed, rigid, whole.places, pair) for pair in pairs)
+    return Spectrum(modes, radius, radius_error, rigid.shape[1], 0, verdict, stable, "", tuple(notes))
+
+
+def _rigid_directions(system: SparseSystem, exchange: Exchange, motions: Sequence[Floats] | None) -> Floats:
+    """Return V (n, d): the common motions, of each part of the graph that hears nothing of the others."""
+    import scipy.sparse
+
+    n = len(system.starts) - 1
+    if motions is None or not motions[0].shape[1]:
+        return np.zeros((int(system.starts[-1]), 0))
+    pairs = np.concatenate([exchange.arcs(link)[0] for link in exchange.links])
+    graph = scipy.sparse.csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    parts, part_of = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    whole = np.concatenate([motions[g] for g in system.crowd_of])
+    peer_of = np.repeat(np.arange(n), np.diff(system.starts))
+    member = part_of[peer_of][:, None] == np.arange(parts)
+    return np.concatenate([member * whole[:, [d]] for d in range(whole.shape[1])], axis=1)
+
+
+def _shifts(system: SparseSystem, listed: Sequence[Crowd]) -> list[complex]:
+    """Return where the largest eigenvalues may be: those of populations of copies of one peer."""
+    found = []
+    heard = np.asarray(sum(abs(one) for one in system.hearing).sum(axis=1)).ravel()
+    lines = np.array([len(crowd.schedule.heard) for crowd in listed])[system.crowd_of]
+    starts = np.concatenate([[0], np.cumsum(lines)[:-1]])
+    for g, crowd in enumerate(listed):
+        few = np.unique(np.linspace(0, len(crowd.parameters) - 1, SAMPLES).astype(np.int64))
+        some = some_rows(crowd.lifted, few)
+        peers = np.flatnonzero(system.crowd_of == g)
+        most = heard[starts[peers][:, None] + np.arange(len(crowd.schedule.heard))].max(axis=0)
+        for share in SHARES:
+            own = np.tile(share * most, (len(few), 1))
+            found.append(np.linalg.eigvals(hear_themselves(some, crowd.schedule, own, 0 * own).m).ravel())
+    values = np.concatenate(found).astype(np.complex128)
+    values = values[(values.imag >= 0)]
+    values = values[np.argsort(-np.abs(values), kind="stable")]
+    kept: list[complex] = []
+    for value in values.tolist():
+        if all(abs(value - one) > APART for one in kept):
+            kept.append(value)
+        if len(kept) == SHIFTS:
+            break
+    return [value * ASIDE for value in kept]
+
+
+def _largest(
+    whole: RelativeMatrix, shifts: Sequence[complex], found: Sequence[_Pair], nearest: int
+) -> list[_Pair]:
+    """Return the largest eigenvalues near some shifts, or found before, each once, conjugates left out."""
+    import scipy.sparse.linalg
+
+    n = whole.matrix.shape[0]
+    start = np.ones(n) + np.linspace(0.0, 1.0, n)
+    values = [np.array([pair.value for pair in found], np.complex128)]
+    vectors = [np.stack([pair.right for pair in found], axis=1) if found else np.zeros((n, 0), np.complex128)]
+    for shift in shifts:
+        factors = whole.factor(shift)
+        inverse = scipy.sparse.linalg.LinearOperator(
+            (n, n), lambda right, factors=factors: _solved(factors, right), dtype=np.complex128
+        )
+        sought = min(nearest, n - 2)
+        try:
+            near, right = scipy.sparse.linalg.eigs(
+                inverse, k=sought, v0=start, ncv=min(n, 4 * sought), tol=FOUND, maxiter=RESTARTS
+            )
+        except scipy.sparse.linalg.ArpackNoConvergence as partial:
+            near, right = partial.eigenvalues, partial.eigenvectors
+        values.append(shift + 1 / near)
+        vectors.append(right)
+    value, vector = np.concatenate(values), np.concatenate(vectors, axis=1)
+    pairs: list[_Pair] = []
+    for place in np.argsort(-np.abs(value), kind="stable"):
+        one = complex(value[place])
+        known = [pair.value for pair in pairs]
+        if any(min(abs(one - other), abs(one.conjugate() - other)) <= 10 * FOUND for other in known):
+            continue
+        pairs.append(_paired(whole, one, vector[:, place]))
+        if len(pairs) == LISTED:
+            break
+    return sorted(pairs, key=lambda pair: -abs(pair.value))
+
+
+def _solved(factors: Any, right: Complexes, trans: str = "N") -> Complexes:
+    """Solve with R − shift or its transpose by the factors of what is bordered."""
+    whole = np.zeros(factors.shape[0], np.complex128)
+    whole[: len(right)] = right
+    return np.asarray(factors.solve(whole, trans=trans)[: len(right)])
+
+
+def _paired(whole: RelativeMatrix, value: complex, right: Complexes) -> _Pair:
+    """Refine an eigenvalue with its left vector: Rayleigh's quotient is right to the vectors' square."""
+    factors = whole.factor(value * (1 + NEAR))
+    left = right.conj()
+    for _ in range(STEPS):
+        left = _solved(factors, left, "T")
+        left /= np.linalg.norm(left)
+        right = _solved(factors, right)
+        right /= np.linalg.norm(right)
+    scale = abs(left @ right)
+    moved = whole.matrix @ right
+    value = complex((left @ moved) / (left @ right))
+    residual = np.abs(left) @ np.abs(moved - value * right)
+    off = np.abs(left) @ (whole.error @ np.abs(right)) + residual
+    if abs(value.imag) <= off / scale:
+        value = complex(value.real)
+    return _Pair(value, right, left, float(off / scale) + 8 * UNIT * abs(value))
+
+
+def _alone(listed: Sequence[Crowd]) -> tuple[Complexes, Floats]:
+    """Return the eigenvalues of all peers when they hear nothing, and how often each is there."""
+    values = [np.linalg.eigvals(crowd.lifted.p).astype(np.complex128).ravel() for crowd in listed]
+    counts = [np.repeat(crowd.counts, crowd.lifted.p.shape[-1]) for crowd in listed]
+    return np.concatenate(values), np.concatenate(counts)
+
+
+def count_beyond(matrix: Any, alone: tuple[Complexes, Floats], known: Complexes, radius: float) -> int:
+    """Return how many eigenvalues are larger than a radius, −1 if it can't be told.
+
+    Parameters
+    ----------
+    matrix
+        R.
+    alone
+        The eigenvalues of the peers by themselves and how often each is there.
+    known
+        Eigenvalues of R, conjugates left out.
+    radius
+        The circle's.
+
+    Notes
+    -----
+    g is taken with what is far from the circle only, and with the eigenvalues that are known: what is near to
+    the circle turns it in an angle too small to be seen between samples. Its argument is followed around the
+    upper half; the change along an arc is known up to whole turns from its ends, and its rate tells the
+    turns: Simpson's rule, as far as the trapezoidal rule on half the arc agrees.
+    """
+    complex_matrix = matrix.astype(np.complex128)
+    values, counts = alone
+    near = np.abs(np.abs(values) - radius) <= NEAR_CIRCLE * radius
+    pairs = np.concatenate([known, known[known.imag != 0].conj()])
+    divided = np.concatenate([values[~near], pairs]), np.concatenate([counts[~near], np.ones(len(pairs))])
+    samples: dict[float, tuple[float, float]] = {}
+
+    def sample(angle: float) -> tuple[float, float]:
+        if angle not in samples:
+            here, there = (
+                _argument(complex_matrix, divided, radius * np.exp(1j * one))
+                for one in (angle, angle + ANGLE)
+            )
+            samples[angle] = here, _wrapped(there - here) / ANGLE
+        return samples[angle]
+
+    # The eigenvalues that were missed are most likely near those of peers by themselves.
+    there = np.angle(values[near & (values.imag >= 0)])
+    likely = np.quantile(there, np.linspace(0, 1, LOOKED_AT)) if len(there) else there
+    edges = np.unique(
+        np.concatenate([np.linspace(0.0, np.pi, ARCS + 1), likely, np.angle(known[known.imag > 0])])
+    )
+    pending = list(itertools.pairwise(edges.tolist()))
+    turned = 0.0
+    while pending:
+        if 2 * len(samples) > MOST_FACTORS:
+            return -1
+        a, b = pending.pop()
+        middle = (a + b) / 2
+        (at_a, rate_a), (_, rate_m), (at_b, rate_b) = sample(a), sample(middle), sample(b)
+        simpson = (b - a) / 6 * (rate_a + 4 * rate_m + rate_b)
+        halves = (b - a) / 4 * (rate_a + 2 * rate_m + rate_b)
+        exact = simpson + _wrapped(at_b - at_a - simpson)
+        if abs(simpson - halves) < SETTLED and abs(exact - simpson) < SETTLED:
+            turned += exact
+        elif b - a < NARROWEST:
+            return -1
+        else:
+            pending += [(a, middle), (middle, b)]
+    outside = float(divided[1][np.abs(divided[0]) > radius].sum())
+    turns = 2 * turned / (2 * np.pi)  # the lower half mirrors the upper
+    return round(outside - turns) if abs(turns - round(turns)) < 0.1 else -1
+
+
+def _argument(matrix: Any, divided: tuple[Complexes, Floats], point: complex) -> float:
+    """Return the argument of g at a point."""
+    import scipy.sparse
+    import scipy.sparse.linalg
+
+    n = matrix.shape[0]
+    factors = scipy.sparse.linalg.splu((scipy.sparse.identity(n) - matrix / point).tocsc())
+    total = float(np.angle(factors.U.diagonal()).sum())
+    total += np.pi * (_odd(factors.perm_r) ^ _odd(factors.perm_c))
+    values, counts = divided
+    return _wrapped(total - float(counts @ np.angle(1 - values / point)))
+
+
+def _odd(permutation: NDArray[np.int32]) -> bool:
+    """Say whether a permutation is odd: n less its cycles."""
+    import scipy.sparse
+
+    n = len(permutation)
+    graph = scipy.sparse.csr_matrix((np.ones(n), (np.arange(n), permutation)), shape=(n, n))
+    cycles = scipy.sparse.csgraph.connected_components(graph, directed=False)[0]
+    return bool((n - cycles) % 2)
+
+
+def _wrapped(angle: float) -> float:
+    """Return an angle in (−π, π]."""
+    return float(np.pi - (np.pi - angle) % (2 * np.pi))
+
+
+def _mode(
+    system: SparseSystem, listed: Sequence[Crowd], rigid: Floats, rest: NDArray[np.int64], pair: _Pair
+) -> Mode:
+    """Describe an eigenvalue over the whole state; the shares of all peers of a crowd are added up."""
+    n = len(rigid)
+    held = np.setdiff1d(np.arange(n), rest)
+    vector, covector = np.zeros(n, np.complex128), np.zeros(n, np.complex128)
+    vector[rest], covector[rest] = pair.right, pair.left
+    if len(held):
+        count = rigid.shape[1]
+        order = np.argmax(np.abs(rigid), axis=0)
+        weights = rigid[rest] / rigid[order, np.arange(count)]
+        matrix = system.matrix.tocsr()
+        corner = matrix[order][:, order].toarray() + matrix[order][:, rest] @ weights
+        driven = matrix[order][:, rest] @ pair.right
+        moved = np.linalg.lstsq(pair.value * np.eye(count) - corner, driven, rcond=None)[0]
+        vector[order] = moved
+        vector[rest] += weights @ moved
+        covector[order] = -(pair.left @ weights)
+    own = np.abs(vector * covector)
+    shares: dict[str, float] = {}
+    for g, crowd in enumerate(listed):
+        waiting = zip(crowd.schedule.sent_names, crowd.schedule.depths, strict=True)
+        names = [*crowd.lifted.z_names, *(name for name, depth in waiting for _ in range(depth))]
+        starts = system.starts[:-1][system.crowd_of == g]
+        for place, name in enumerate(names):
+            name = f"{crowd.name}.{name}" if len(listed) > 1 else name
+            shares[name] = shares.get(name, 0.0) + float(own[starts + place].sum())
+    total = sum(shares.values()) or 1.0
+    peer = int(np.argmax(np.add.reduceat(own, system.starts[:-1])))
+    frequency, damping = _frequency(system, listed, peer, vector, covector, pair.value)
+    return Mode(
+        eigenvalue=pair.value,
+        magnitude=abs(pair.value),
+        multiplicity=1,
+        frequency_hz=frequency,
+        damping_ratio=damping,
+        shape="different peers",
+        participation=tuple((name, share / total) for name, share in shares.items()),
+        error=pair.error,
+    )
+
+
+def _frequency(
+    system: SparseSystem,
+    listed: Sequence[Crowd],
+    peer: int,
+    vector: Complexes,
+    covector: Complexes,
+    value: complex,
+) -> tuple[float, float]:
+    """Return frequency and damping, whole turns counted on the state of a peer that takes most part."""
+    crowd = listed[system.crowd_of[peer]]
+    lifted = lift_one(crowd, int(system.row_of[peer]))
+    n_z = len(lifted.z_names)
+    own = slice(int(system.starts[peer]), int(system.starts[peer]) + n_z)
+    if not lifted.continuous:
+        return 0.0, 1.0
+    moving = np.abs(vector[own] * covector[own])[: lifted.continuous]
+    # What the peer hears is what its memory of it says: P z + Q r = ζ z.
+    heard = np.linalg.lstsq(lifted.q, value * vector[own] - lifted.p @ vector[own], rcond=None)[0]
+    course = lifted.inside[:, int(np.argmax(moving))] @ np.concatenate([vector[own], heard])
+    return oscillation(abs(value), turned_along(course, value), lifted.frame_s)

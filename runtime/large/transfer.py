@@ -1,0 +1,410 @@
+"""What many sites together answer at a frequency, by their poles, with a bound on its error.
+
+Takes: the matrices of x⁺ = M x + B r, s = S x + D r of many sites, what these may be off by, and how often
+each site counts.
+Gives: `StateSpace`, `Transfer`, `build_transfer`; `respond`, `differentiate`.
+Guarantees: a response holds in a disc about each point, not only at it, within the bound it comes with:
+rounding, the errors of the matrices and the way across the disc included.
+Does not: answer nearer to zero than twice `Transfer.inner`.
+
+    T(ζ) = Σ_i n_i (D_i + S_i (ζ − M_i)⁻¹ B_i)
+
+Each M_i is split, X⁻¹ M X = diag(p_1, …, p_K, T₂): the eigenvalues beyond `inner` one by one, and all that
+is smaller, queues running empty and the like, as one block that may be defective. The block's part is a
+short power series of 1/ζ, added up over all sites before any ζ is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance
+from apc.runtime.frame.discretize import UNIT
+from apc.runtime.large.diagonal import block_diagonal, block_norms, block_norms_along, block_resolvent
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# Eigenvalues within this share of the largest go into the block; at twice that distance from zero its series
+# gains a bit a term, (inner/|ζ|)^k < 2^−k.
+INNER = 0.3
+
+# Terms of the block's power series: at twice `inner`, 2^−60 of the first is left. It is cut where what is
+# left is this share of a rounding.
+SERIES, CUT = 60, 2.0**-7
+
+# A pole nearer than the inverse of this is looked at by itself.
+CLOSE = 300.0
+
+# Sites answering together, and answers computed together: they stay in the cache of a processor.
+CHUNK = 1024
+ANSWERS = 65_536
+
+
+@dataclass(frozen=True, slots=True)
+class StateSpace:
+    """k sites x⁺ = M x + B r, s = S x + D r; `*_error` bounds the error, entry by entry."""
+
+    m: Floats  # (k, n, n)
+    b: Floats  # (k, n, n_r)
+    s: Floats  # (k, n_s, n)
+    d: Floats  # (k, n_s, n_r)
+    m_error: Floats
+    b_error: Floats
+    s_error: Floats
+    d_error: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """Sites of one structure by their poles, k sites of at most K poles beyond `inner`.
+
+    `eigenvalues` (k, n) are all of each site, `eigenvalue_errors` what they may be off by; `counts` (k,) how
+    often each site is there. The rest is what `respond` adds up, multiplicities included: a place beyond a
+    site's poles has the pole 0 and nothing on it.
+    """
+
+    inner: float
+    counts: Floats
+    eigenvalues: Complexes  # (k, n), the K largest first
+    eigenvalue_errors: Floats
+    poles: Complexes  # (K, k)
+    residues: Complexes  # (K, k, n_s · n_r)
+    residue_sizes: Floats
+    residue_error: Floats  # (k,): what they may be off by, relative to their sizes
+    block: Floats  # (k,): a bound on ‖(ζ − T₂)⁻¹‖ from twice `inner` on
+    loop: Floats  # (k, K + 1): u w, see `build_transfer`; the block last
+    left: Floats  # (k, K + 1, n_s): |S X| u
+    right: Floats  # (k, K + 1, n_r): w |Y B|
+    together: Floats  # (k, n_s · n_r): what an error of M does where every |ζ − p_k| = 1
+    loops: Floats  # (k,): Σ u w
+    series: Floats  # (up to 1 + SERIES, n_s, n_r): D, then ζ⁻¹, ζ⁻², …
+    series_sizes: Floats
+    series_errors: Floats
+
+
+def build_transfer(space: StateSpace, counts: Floats) -> Transfer:
+    """Split every site into its poles and a block of what dies out at once.
+
+    Parameters
+    ----------
+    space
+        The k sites.
+    counts
+        How often each is there (k,).
+
+    Notes
+    -----
+    With computed X and Y ≈ X⁻¹, M + E = X (Λ + Δ) X⁻¹ holds for some |Δ| ≤ |X⁻¹| (|M X − X Λ| + |E| |X|). A
+    majorant of rank one, Δ_kl ≤ u_k w_l, makes the Neumann series of (ζ − Λ − Δ)⁻¹ a geometric one: what it
+    changes is at most (Σ_k |S X|_k u_k/|ζ − p_k|) (Σ_l w_l |Y B|_l/|ζ − p_l|) / (1 − Σ_k u_k w_k/|ζ − p_k|).
+    """
+    sites, n = space.m.shape[:2]
+    scale = balance(np.max(np.abs(space.m) + space.m_error, axis=0))
+    values, vectors = np.empty((sites, n), np.complex128), np.empty((sites, n, n), np.complex128)
+    for place in _chunks(np.arange(sites)):
+        own, right = np.linalg.eig(space.m[place] / scale[:, None] * scale)
+        order = np.argsort(-np.abs(own), axis=1, kind="stable")
+        values[place] = np.take_along_axis(own, order, axis=1)
+        vectors[place] = np.take_along_axis(right, order[:, None, :], axis=2)
+    inner = INNER * min(1.0, float(np.abs(values).max(initial=0.0))) or INNER
+    return _gathered(space, scale, counts, values, vectors, inner)
+
+
+def _gathered(
+    space: StateSpace, scale: Floats, counts: Floats, values: Complexes, vectors: Complexes, inner: float
+) -> Transfer:
+    """Split the sites, those of equally many poles together, and put the parts side by side."""
+    sites, n = values.shape
+    n_s, n_r = space.d.shape[1:]
+    large = (np.abs(values) > inner).sum(axis=1)
+    most = int(large.max(initial=0))
+    errors = np.full((sites, n), np.inf)
+    poles = np.zeros((most, sites), np.complex128)
+    residues = np.zeros((most, sites, n_s * n_r), np.complex128)
+    doubt, block = np.zeros(sites), np.zeros(sites)
+    loop = np.zeros((sites, most + 1))
+    left, right = np.zeros((sites, most + 1, n_s)), np.zeros((sites, most + 1, n_r))
+    series = np.zeros((3, 1 + SERIES, n_s, n_r))
+    series[0, 0] += np.tensordot(counts, space.d, 1)
+    series[1, 0] += np.tensordot(counts, np.abs(space.d), 1)
+    series[2, 0] += np.tensordot(counts, space.d_error, 1)
+    for count in np.unique(large).tolist():
+        for place in _chunks(np.flatnonzero(large == count)):
+            own = _balanced(space, place, scale)
+            part = _split(own, values[place], vectors[place], count, inner)
+            poles[:count, place] = values[place, :count].T
+            residues[:count, place] = (counts[place, None, None] * part.residues).swapaxes(0, 1)
+            kept = [*range(count), most]  # the block comes last
+            left[np.ix_(place, kept)] = counts[place, None, None] * part.left
+            right[np.ix_(place, kept)], loop[np.ix_(place, kept)] = part.right, part.loop
+            doubt[place], block[place] = part.doubt, part.block
+            errors[place] = part.errors
+            series += np.einsum("i,pijsr->pjsr", counts[place], part.series)
+    used = max(1, 1 + int(np.flatnonzero(series.any(axis=(0, 2, 3))).max(initial=0)))
+    series = series[:, :used]
+    return Transfer(
+        inner=inner,
+        counts=counts,
+        eigenvalues=values,
+        eigenvalue_errors=errors,
+        poles=poles,
+        residues=residues,
+        residue_sizes=np.abs(residues),
+        residue_error=doubt,
+        block=block,
+        loop=loop,
+        left=left,
+        right=right,
+        together=(left.sum(axis=1)[:, :, None] * right.sum(axis=1)[:, None, :]).reshape(sites, -1),
+        loops=loop.sum(axis=1),
+        series=series[0],
+        series_sizes=series[1],
+        series_errors=series[2],
+    )
+
+
+def _balanced(space: StateSpace, place: NDArray[np.intp], scale: Floats) -> StateSpace:
+    """Return some sites over states in other units, powers of two so that nothing is rounded."""
+    inverse = (1.0 / scale)[:, None]
+    return StateSpace(
+        m=space.m[place] * inverse * scale,
+        b=space.b[place] * inverse,
+        s=space.s[place] * scale,
+        d=space.d[place],
+        m_error=space.m_error[place] * inverse * scale,
+        b_error=space.b_error[place] * inverse,
+        s_error=space.s_error[place] * scale,
+        d_error=space.d_error[place],
+    )
+
+
+def _chunks(places: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+    """Cut places into chunks."""
+    for start in range(0, len(places), CHUNK):
+        yield places[start : start + CHUNK]
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """A chunk of sites of equally many poles; the fields as in `Transfer`, each site counted once."""
+
+    residues: Complexes
+    doubt: Floats
+    block: Floats
+    loop: Floats
+    left: Floats
+    right: Floats
+    errors: Floats
+    series: Floats  # (3, k, 1 + SERIES, n_s, n_r)
+
+
+def _split(space: StateSpace, values: Complexes, vectors: Complexes, large: int, inner: float) -> _Parts:
+    """Split sites that all have `large` poles beyond `inner`."""
+    sites, n = values.shape
+    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    found = block_diagonal(space.m, space.m_error, values, vectors, large)
+    basis, dual, small, change, grown = found.basis, found.dual, found.small, found.change, found.grown
+    weight, size = np.abs(dual), np.abs(basis)
+
+    a, b = space.s @ basis, dual @ space.b
+    a_doubt = (space.s_error + charge * np.abs(space.s)) @ size
+    b_doubt = weight @ (space.b_error * grown + charge * np.abs(space.b))
+    b_doubt += (grown - 1) * np.abs(b).max(axis=1, keepdims=True)
+    a_size, b_size = np.abs(a), np.abs(b)
+    residues = a[:, :, :large].swapaxes(1, 2)[..., None] * b[:, :large, None, :]
+    product = (a_size + a_doubt).swapaxes(1, 2)[:, :large, :, None] * (b_size + b_doubt)[:, :large, None, :]
+    exact = np.abs(residues)
+    off = np.maximum(product - exact, 0.0) + 8 * UNIT * product
+    # Relative to each residue; one that should be nothing is off by something all the same.
+    floor = UNIT * product.max(axis=(1, 2, 3), initial=0.0)[:, None, None, None]
+    doubt = (off / np.maximum(exact, floor + np.finfo(np.float64).tiny)).max(axis=(1, 2, 3), initial=0.0)
+
+    u, w = _rank_one(block_norms(change, large))
+    left = block_norms_along(a_size + a_doubt, large) * u[:, None, :]
+    right = block_norms_along((b_size + b_doubt).swapaxes(1, 2), large) * w[:, None, :]
+    errors = np.repeat(u[:, -1:] * w[:, -1:], n, axis=1)
+    errors[:, :large] = _disc_radii(values[:, :large], u * w, inner)
+    block = block_resolvent(small, 2 * inner)
+    return _Parts(
+        residues=residues.reshape(sites, large, -1),
+        doubt=doubt,
+        block=block,
+        loop=u * w,
+        left=left.swapaxes(1, 2),
+        right=right.swapaxes(1, 2),
+        errors=errors,
+        series=_block_series(a, b, a_doubt, b_doubt, small, large, charge, block, 2 * inner),
+    )
+
+
+def _rank_one(sizes: Floats) -> tuple[Floats, Floats]:
+    """Return u and w with u_k w_l ≥ sizes_kl."""
+    floor = np.finfo(np.float64).tiny
+    u = np.maximum(sizes.max(axis=2), floor)
+    w = np.maximum((sizes / u[:, :, None]).max(axis=1), floor)
+    u = np.maximum((sizes / w[:, None, :]).max(axis=2), floor)
+    return u, w
+
+
+def _disc_radii(values: Complexes, loop: Floats, inner: float) -> Floats:
+    """Return how far the large eigenvalues can be off: where Σ_k u_k w_k/|z − p_k| < 1 there is none.
+
+    Twice all their shares together is far enough from each; its own share is, where the others, at half
+    their distance, leave it room.
+    """
+    own, total = loop[:, :-1], loop[:, :-1].sum(axis=1, keepdims=True)
+    gaps = np.abs(values[:, :, None] - values[:, None, :]) / 2
+    gaps[:, range(gaps.shape[1]), range(gaps.shape[1])] = np.inf
+    with np.errstate(divide="ignore"):
+        others = (own[:, None, :] / gaps).sum(axis=2) + loop[:, -1:] / inner
+    alone = np.where(others < 0.5, own / (1 - np.minimum(others, 0.5)), np.inf)
+    alone = np.where(alone < gaps.min(axis=2, initial=np.inf), alone, np.inf)
+    together = np.where(loop[:, -1:] / inner < 0.5, 2 * total, np.inf)
+    return np.minimum(alone, together)
+
+
+def _block_series(
+    a: Complexes,
+    b: Complexes,
+    a_doubt: Floats,
+    b_doubt: Floats,
+    small: Complexes,
+    large: int,
+    charge: float,
+    block: Floats,
+    radius: float,
+) -> Floats:
+    """Return the terms S X₂ T₂^j Y₂ B of ζ^(−j−1), their sizes, and what they may be off by.
+
+    What is left of the series when it is cut, at |ζ| = radius, is charged to the constant term.
+    """
+    sites, n_s = a.shape[:2]
+    terms = np.zeros((3, sites, 1 + SERIES, n_s, b.shape[2]))
+    column, size, doubt = b[:, large:], np.abs(b[:, large:]), b_doubt[:, large:]
+    row, row_doubt, weight = a[:, :, large:], a_doubt[:, :, large:], np.abs(small)
+    row_size = np.abs(row)
+    first = np.linalg.norm(row_size, axis=2)[:, :, None] * np.linalg.norm(size, axis=1)[:, None, :]
+    for term in range(SERIES):
+        left = np.linalg.norm(row_size, axis=2)[:, :, None] * np.linalg.norm(size, axis=1)[:, None, :]
+        left *= (block * radius**-term)[:, None, None]
+        if np.all(left <= CUT * UNIT * first):
+            terms[2, :, 0] += left
+            break
+        value = row @ column
+        terms[0, :, term + 1] = value.real
+        terms[1, :, term + 1] = np.abs(value)
+        terms[2, :, term + 1] = row_size @ doubt + row_doubt @ (size + doubt) + charge * (row_size @ size)
+        terms[2, :, term + 1] += np.abs(value.imag)
+        column, doubt = small @ column, weight @ (doubt + charge * size)
+        size = np.abs(column)
+    else:
+        terms[2, :, 0] += left
+    return terms
+
+
+def respond(transfers: Sequence[Transfer], points: Complexes, reach: Floats) -> tuple[Complexes, Floats]:
+    """Add up what all sites answer at some points, and bound it in discs about them.
+
+    Parameters
+    ----------
+    transfers
+        The sites, those of a structure together.
+    points
+        ζ (z,), the centres.
+    reach
+        The discs' radii (z,).
+
+    Returns
+    -------
+    T (z, n_s, n_r) at the centres, and a bound on how far the true T is from it anywhere in the discs.
+    """
+    shape = (len(points), *transfers[0].series.shape[1:])
+    value, doubt = np.zeros(shape, np.complex128), np.zeros(shape)
+    # Each chunk's sum rounds once a pole, the sum of the chunks once a chunk.
+    chunks = sum(1 + one.poles.shape[1] // CHUNK for one in transfers)
+    most = max((len(one.poles) * min(CHUNK, one.poles.shape[1]) for one in transfers), default=0)
+    rounding = (most + chunks + 16) * 2 * UNIT
+    for one in transfers:
+        _add_series(one, points, reach, value, doubt)
+        for chunk, places in _pieces(one, points):
+            at, radius = points[places], reach[places, None, None]
+            residues = one.residues[:, chunk].reshape(-1, shape[1] * shape[2])
+            sizes = one.residue_sizes[:, chunk].reshape(residues.shape)
+            inverse = 1.0 / (at[:, None, None] - one.poles[:, chunk])
+            far, flat = np.abs(inverse), (len(at), -1)
+            value[places] += (inverse.reshape(flat) @ residues).reshape(len(at), *shape[1:])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                near = far / (1 - radius * far)  # 1/(|ζ − p| − reach)
+                moved = near * (radius * far + (one.residue_error[chunk] + rounding))
+                # Negative where a pole is in the disc: nothing is known there.
+                lost = near.min(axis=(1, 2), initial=0.0) < 0
+                bound = (moved.reshape(flat) @ sizes).reshape(len(at), *shape[1:]) + _reaction(
+                    one, chunk, near
+                )
+            bound[lost] = np.nan
+            doubt[places] += bound
+    return value, doubt
+
+
+def _reaction(one: Transfer, chunk: slice, near: Floats) -> Floats:
+    """Return what the errors of a chunk's M do at most (z, n_s, n_r), see `build_transfer`.
+
+    Sites whose poles are all far count all their poles as the nearest; only for the others it matters which.
+    """
+    nearest = np.maximum(near.max(axis=1, initial=0.0), one.block[chunk])
+    close = ~(nearest <= CLOSE)
+    nearest[close] = 0.0
+    reach = nearest * one.loops[chunk]
+    total = (nearest * nearest / np.where(reach < 1, 1 - reach, 0.0)) @ one.together[chunk]
+    left, right = one.left[chunk], one.right[chunk]
+    total = total.reshape(len(near), left.shape[2], right.shape[2])
+    place, site = np.nonzero(close)
+    if len(place):
+        wide = np.concatenate([near[place, :, site], one.block[chunk][site, None]], axis=1)[:, None, :]
+        circle = (wide[:, 0] * one.loop[chunk][site]).sum(axis=1)
+        sent = (wide @ left[site])[:, 0] / np.where(circle < 1, 1 - circle, 0.0)[:, None]
+        np.add.at(total, place, sent[:, :, None] * (wide @ right[site])[:, 0][:, None, :])
+    return np.asarray(total)
+
+
+def differentiate(transfers: Sequence[Transfer], points: Complexes) -> tuple[Complexes, Complexes]:
+    """Return T (z, n_s, n_r) at some points (z,), and dT/dζ."""
+    shape = (len(points), *transfers[0].series.shape[1:])
+    value, slope = np.zeros(shape, np.complex128), np.zeros(shape, np.complex128)
+    for one in transfers:
+        exponents = np.arange(len(one.series))
+        power = points[:, None] ** -exponents
+        value += np.einsum("zj,jsr->zsr", power, one.series)
+        slope -= np.einsum("zj,jsr->zsr", power * exponents / points[:, None], one.series)
+        for chunk, places in _pieces(one, points):
+            at = points[places]
+            inverse = (1.0 / (at[:, None, None] - one.poles[:, chunk])).reshape(len(at), -1)
+            residues = one.residues[:, chunk].reshape(-1, shape[1] * shape[2])
+            value[places] += (inverse @ residues).reshape(len(at), *shape[1:])
+            slope[places] -= ((inverse * inverse) @ residues).reshape(len(at), *shape[1:])
+    return value, slope
+
+
+def _pieces(one: Transfer, points: Complexes) -> Iterator[tuple[slice, slice]]:
+    """Yield which sites answer at which points together."""
+    count, sites = one.poles.shape
+    most = max(1, ANSWERS // max(1, min(sites, CHUNK) * count))
+    for start in range(0, sites, CHUNK):
+        for place in range(0, len(points), most):
+            yield slice(start, start + CHUNK), slice(place, place + most)
+
+
+def _add_series(one: Transfer, points: Complexes, reach: Floats, value: Complexes, doubt: Floats) -> None:
+    """Add D and what dies out at once, and their bounds."""
+    exponents = np.arange(len(one.series))
+    value += np.einsum("zj,jsr->zsr", points[:, None] ** -exponents, one.series)
+    nearest = np.abs(points) - reach
+    nearest = np.where(nearest >= 2 * one.inner, nearest, np.nan)  # too near to zero: nothing is known
+    sizes = nearest[:, None] ** -exponents
+    doubt += np.einsum("zj,jsr->zsr", sizes, one.series_errors + 64 * UNIT * one.series_sizes)
+    doubt += np.einsum("zj,jsr->zsr", sizes * exponents * (reach / nearest)[:, None], one.series_sizes)

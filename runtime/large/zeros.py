@@ -1,0 +1,323 @@
+"""How large the largest eigenvalue is, from a characteristic function: found by Newton, proved by counting.
+
+Takes: a `Characteristic`, and where its zeros may be.
+Gives: `Zeros`, `find_zeros`.
+Guarantees: `low` and `high` bound the spectral radius, rigid modes left out: within a small circle about the
+largest zero there is one, and beyond a circle just outside of it there is none, both counted by the argument
+principle. Where a count can't be had, the bounds are wide instead.
+Does not: find every zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.large.characteristic import Characteristic, characteristic_ball, count_around, refine
+from apc.runtime.large.counting import FIRST_ARCS, MOST_POINTS
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# The smallest circle about a zero that is tried, relative to it, and what the next ones are larger by.
+FIRST_RADIUS, WIDER = 4e-15, 8.0
+
+# A circle about a zero that has to be wider than this shows nothing.
+WIDEST = 1e-3
+
+# The circle just outside of the largest zero is so many times farther from it than its error; if a pole or
+# another zero is in the way, wider ones are tried, so many.
+OUTSIDE, TRIES = 8.0, 10
+
+# A circle about a zero is so many times larger than what the zero is known to: then few arcs do.
+CLEAR = 6.0
+
+# How far aside of a zero, relatively, its slope is looked at, and how much nearer the next time.
+ASIDE, NEARER = 1e-7, 30.0
+
+# Arcs about a zero to begin with, and evaluations after which the circle is too small to tell.
+SMALL_ARCS, SMALL_POINTS = 12, 300
+
+# Zeros nearer to one another than this, relatively, are one that was found twice.
+SAME = 1e-11
+
+# Poles that are eigenvalues themselves, looked at of each structure.
+MOST_HELD = 64
+
+# Poles taken out of f, of each structure, where zeros are looked for: those that crowd about the zeros.
+TAKEN_OUT = 128
+
+# Points on a ring, and poles, to look for missed zeros from.
+RING = 48
+
+# How often zeros that a count has missed are looked for.
+SEARCHES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Zero:
+    """An eigenvalue (or a pair, with its conjugate) and what it may be off by; held `multiplicity` times.
+
+    `site`, if it is that of sites by themselves, says which: (transfer, place in it).
+    """
+
+    value: complex
+    error: float
+    multiplicity: int
+    site: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Zeros:
+    """Bounds on the spectral radius, and the largest eigenvalues found, the largest first.
+
+    `counted` says that a count proves that nothing lies beyond `high`; `rigid_counted`, that one proves that
+    there are as many eigenvalues at 1 as was said.
+    """
+
+    low: float
+    high: float
+    found: tuple[Zero, ...]
+    counted: bool
+    rigid_counted: bool
+
+
+def find_zeros(
+    function: Characteristic,
+    starts: Complexes,
+    *,
+    rigid: int,
+    listed: int,
+    near: int,
+) -> Zeros:
+    """Find the largest eigenvalues and prove that there is none beyond.
+
+    Parameters
+    ----------
+    function
+        f.
+    starts
+        Where zeros may be (z,).
+    rigid
+        How many eigenvalues are exactly 1 for a known reason.
+    listed
+        How many of the largest eigenvalues to report.
+    near
+        How many of the largest poles, of each structure, zeros are looked for close to.
+    """
+    rigid_radius = _rigid_radius(function, rigid)
+    exact = [one for one in _held_poles(function) if abs(one.value - 1) > rigid_radius]
+    poles = near_poles(function, TAKEN_OUT)
+    close = near_poles(function, near) * (1 + 1e-7)
+    zeros = _distinct(refine(function, np.concatenate([starts, close]), poles=poles), rigid_radius)
+    if not len(zeros) and not exact:
+        zeros = _search(function, float(np.abs(poles).max(initial=1.0)), zeros, poles, rigid_radius)
+    rigid_radius = _widened(function, zeros, rigid, rigid_radius)
+    zeros = _distinct(zeros, rigid_radius)
+    error_of = cache(partial(_zero_error, function))
+    largest, high, beyond = 0.0, 0.0, -1
+    for _ in range(SEARCHES):
+        largest, error = _largest(zeros, exact, error_of)
+        high, beyond = _outside(function, largest, error, rigid, rigid_radius)
+        if beyond <= 0:
+            break
+        more = _search(function, high, zeros, poles, rigid_radius)
+        grown = _distinct(np.concatenate([zeros, more]), rigid_radius)
+        if len(grown) == len(zeros):
+            break
+        zeros = grown
+    found = [Zero(zero, error_of(zero), 1) for zero in zeros[:listed].tolist()]
+    known = [one for one in (*found, *exact) if np.isfinite(one.error)]
+    every = sorted(known, key=lambda one: -abs(one.value))[:listed]
+    low = max([0.0, *(abs(one.value) - one.error for one in every)])
+    if beyond:
+        high = _enclosing(function, max(high, largest), rigid, rigid_radius)
+    return Zeros(low, high, tuple(every), not beyond, rigid_radius < WIDEST)
+
+
+def _largest(
+    zeros: Complexes, exact: Sequence[Zero], error_of: Callable[[complex], float]
+) -> tuple[float, float]:
+    """Return the magnitude of the largest eigenvalue so far, and its error."""
+    largest = max(exact, key=lambda one: abs(one.value), default=None)
+    if len(zeros) and (largest is None or abs(zeros[0]) >= abs(largest.value)):
+        return float(abs(zeros[0])), error_of(complex(zeros[0]))
+    return (abs(largest.value), largest.error) if largest else (0.0, 0.0)
+
+
+def _rigid_radius(function: Characteristic, rigid: int) -> float:
+    """Return the radius of a circle about 1 within which all zeros are the rigid ones, 0 without any."""
+    if not rigid:
+        return 0.0
+    ball = characteristic_ball(function, np.array([1 + 1e-7]), np.zeros(1))
+    radius = max(CLEAR * float(ball.change[0]) * 1e-7, FIRST_RADIUS)
+    while radius < WIDEST:
+        inside = count_around(function, 1.0, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
+        poles = _poles_within(function, 1.0, radius)
+        if inside is not None and poles is not None and inside + poles == rigid:
+            return radius
+        radius *= WIDER
+    return WIDEST
+
+
+def _widened(function: Characteristic, zeros: Complexes, rigid: int, radius: float) -> float:
+    """Return a circle about 1 that holds the rigid zeros as Newton's method found them, and no others.
+
+    Where several are one, it arrives at the root of its rounding only.
+    """
+    distances = np.abs(zeros - 1)
+    for distance in np.sort(distances[(distances > radius) & (distances < WIDEST)])[::-1]:
+        wider = 2 * float(distance)
+        inside = count_around(function, 1.0, wider, arcs=SMALL_ARCS, most=SMALL_POINTS)
+        poles = _poles_within(function, 1.0, wider)
+        if rigid and inside is not None and poles is not None and inside + poles == rigid:
+            return wider
+    return radius
+
+
+def _held_poles(function: Characteristic) -> list[Zero]:
+    """Return the poles that are eigenvalues themselves: of sites that are alike, or that nobody hears.
+
+    Of each structure the largest few.
+    """
+    found = []
+    for which, one in enumerate(function.transfers):
+        unheard = ~one.residues.any(axis=2)
+        times = np.where(unheard, one.counts, one.counts - 1)
+        times = np.where((np.abs(one.poles) > 0) & (one.poles.imag >= 0), times, 0)
+        places, sites = np.nonzero(times)
+        order = np.argsort(-np.abs(one.poles[places, sites]), kind="stable")[:MOST_HELD]
+        for place, site in zip(places[order].tolist(), sites[order].tolist(), strict=True):
+            error = float(one.eigenvalue_errors[site, place])
+            many = int(times[place, site])
+            found.append(Zero(complex(one.poles[place, site]), error, many, (which, site)))
+    return found
+
+
+def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
+    """Return zeros in the upper half plane, the largest first, each once and the rigid ones left out."""
+    zeros = zeros[np.isfinite(zeros)]
+    zeros = np.where(zeros.imag < 0, zeros.conj(), zeros)
+    zeros = np.where(np.abs(zeros.imag) <= SAME * np.abs(zeros), zeros.real, zeros)
+    zeros = zeros[np.abs(zeros - 1) > rigid_radius] if rigid_radius else zeros
+    zeros = zeros[np.argsort(-np.abs(zeros), kind="stable")]
+    kept: list[complex] = []
+    for zero in zeros.tolist():
+        near = (one for one in reversed(kept[-16:]) if abs(one - zero) <= SAME * abs(zero))
+        if next(near, None) is None:
+            kept.append(zero)
+    return np.array(kept, dtype=np.complex128)
+
+
+def _zero_error(function: Characteristic, zero: complex) -> float:
+    """Return the radius of a circle about an estimate that has a zero in it, inf if none is shown.
+
+    Nearby, at ζ + h, |f| ≈ |f′| h is known to a share c of it: the zero is known to about c h.
+    """
+    aside = ASIDE * abs(zero)
+    for _ in range(SEARCHES):
+        ball = characteristic_ball(function, np.array([zero + aside]), np.zeros(1))
+        radius = max(CLEAR * float(ball.change[0]) * aside, FIRST_RADIUS * abs(zero))
+        for _ in range(SEARCHES):
+            if not radius < WIDEST * abs(zero):
+                break
+            inside = count_around(function, zero, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
+            poles = _poles_within(function, zero, radius)
+            if inside is not None and poles is not None and inside + poles > 0:
+                return radius
+            radius *= WIDER
+        aside /= NEARER  # a pole or another zero may be that close
+    return float(np.inf)
+
+
+def _poles_within(function: Characteristic, centre: complex, radius: float) -> int | None:
+    """Return how many poles are within a circle, each as often as f has it; None: no telling."""
+    total = 0
+    for one in function.transfers:
+        distance = np.abs(one.eigenvalues - centre)
+        if np.any(np.abs(distance - radius) <= one.eigenvalue_errors):
+            return None
+        total += int((distance < radius).sum())
+    return total
+
+
+def _poles_beyond(function: Characteristic, radius: float) -> int | None:
+    """Return how many of the sites' eigenvalues are larger, multiplicities counted; None: no telling."""
+    total = 0
+    for one in function.transfers:
+        size = np.abs(one.eigenvalues)
+        if np.any(np.abs(size - radius) <= one.eigenvalue_errors):
+            return None
+        total += int(((size > radius).sum(axis=1) * one.counts).sum())
+    return total
+
+
+def _beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
+    """Return how many eigenvalues lie beyond a circle about zero, the rigid ones left out, or None."""
+    poles = _poles_beyond(function, radius)
+    turns = (
+        None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function), most=MOST_POINTS)
+    )
+    if poles is None or turns is None:
+        return None
+    return poles - turns - (rigid if radius < 1 else 0)
+
+
+def _arcs(function: Characteristic) -> int:
+    """Return how many arcs to begin with: f turns as often as its longest delay has frames."""
+    return max(FIRST_ARCS, 2 * max(function.lags, default=0))
+
+
+def _outside(
+    function: Characteristic, largest: float, error: float, rigid: int, rigid_radius: float
+) -> tuple[float, int]:
+    """Return a circle just outside of the largest zero, and how many eigenvalues are beyond, or −1."""
+    width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
+    for _ in range(TRIES):
+        radius = max(largest + width, function.innermost * (1 + 1e-9))
+        if (
+            rigid and abs(radius - 1) <= rigid_radius
+        ):  # between the largest zero and the rigid ones, or beyond
+            radius = 1 + 2 * rigid_radius
+        beyond = _beyond(function, radius, rigid)
+        if beyond is not None:
+            return radius, beyond
+        width *= WIDER
+    return largest + width, -1
+
+
+def _enclosing(function: Characteristic, radius: float, rigid: int, rigid_radius: float) -> float:
+    """Return the radius of some circle beyond which there is no eigenvalue, inf if none is found."""
+    width = max(radius * 1e-6, 1e-9)
+    while radius < 1e3:
+        radius += width
+        if not (rigid and abs(radius - 1) <= rigid_radius) and _beyond(function, radius, rigid) == 0:
+            return radius
+        width *= WIDER
+    return float(np.inf)
+
+
+def _search(
+    function: Characteristic, radius: float, zeros: Complexes, poles: Complexes, rigid_radius: float
+) -> Complexes:
+    """Return zeros that were missed, from all over a wider ring and from the largest poles."""
+    angles = np.linspace(0.0, np.pi, RING)
+    rings = [scale * radius * np.exp(1j * angles) for scale in (1.0, 1.03, 1.3)]
+    starts = np.concatenate([*rings, near_poles(function, RING) * (1 + 1e-3)])
+    known = np.append(zeros, 1.0) if rigid_radius else zeros
+    found = refine(function, starts, poles=poles, found=known)
+    return _distinct(refine(function, found, poles=poles), rigid_radius)
+
+
+def near_poles(function: Characteristic, most: int) -> Complexes:
+    """Return the largest poles of f in the upper half plane (z,), no more than `most` of each structure."""
+    found = [np.zeros(0, np.complex128)]
+    for one in function.transfers:
+        heard = one.residues.any(axis=2) & (one.poles.imag >= 0) & (np.abs(one.poles) > 0)
+        part = one.poles[heard]
+        found.append(part[np.argsort(-np.abs(part), kind="stable")[:most]])
+    return np.concatenate(found)

@@ -1,0 +1,327 @@
+"""A scene made ready to be played in time: one function for a stretch of frames of all peers.
+
+Takes: a `CompiledSystem`, the duration, the signals wanted, the method. Gives: `Simulation`, `prepare`.
+Guarantees: time is counted in whole quanta; what would not fit the memory is refused before it is built.
+Does not: play it (see `blocks`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.frame.exchange import Exchange, build_exchange
+from apc.runtime.frame.gathering import Gate, build_gates, kept_links
+from apc.runtime.frame.linearize import SiteJacobians, jacobians
+from apc.runtime.frame.parameters import Numbers, resolve
+from apc.runtime.frame.schedule import Propagate, Schedule, build_schedules
+from apc.runtime.frame.timetable import routes_of
+from apc.runtime.simulate.flow import Flow, Tolerance, flow_of, rows_to_move
+from apc.runtime.simulate.forcing import SiteForcing, forcing_of, site_forcing
+from apc.runtime.simulate.methods import CVODES, DEFAULT, EXACT, WHERE_NEEDED, Method, check_step
+from apc.runtime.simulate.native import native
+from apc.runtime.simulate.pairs import count_pairs
+from apc.runtime.simulate.population import (
+    Member,
+    Population,
+    build_member,
+    build_population,
+    exchanges_within,
+    refuse_unheard_of,
+)
+from apc.runtime.simulate.program import LocalSignal, Program, build_program, local_signals
+from apc.runtime.simulate.propagate import Transitions, rates, shaken, transitions
+from apc.runtime.simulate.scales import state_scales
+from apc.runtime.simulate.signals import Choice, Signal, choose, signals_of
+from apc.runtime.trouble import finite_equations
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# Numbers that one call of the chunked function gives out, at most, if a frame gives fewer: 4 MiB stay in the
+# machine's caches, and CasADi builds the function in a tenth of a second.
+CHUNK = 2**19
+ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
+# Numbers that come into one call, at most: 64 MiB. Of an unreliable link they are one a way and tick, and the
+# packets of many frames are drawn at less cost than those of a few.
+TOLD = 2**23
+MOST_FRAMES = 2000  # of one chunk: the function of a chunk is built in a time that grows with it
+NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
+# Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
+MOST_NUMBERS = 2**26
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """A scene ready to be played.
+
+    `signals` are the columns of what comes out; `marks` the instants of a frame's rows, in quanta, of which
+    those not in `ticks` make a row at time 0 only; `forces` are those that change with time, of each group's
+    different sites. `chunk` is the frame of all peers, `length` times in a row;
+    `compiled` says that it runs in machine code. `gates` are the unreliable links, `seed` is what their luck
+    begins from. `tolerances` are of the states that CVODES moves.
+    """
+
+    system: CompiledSystem
+    population: Population
+    choices: tuple[Choice, ...]
+    signals: tuple[Signal, ...]
+    forces: tuple[tuple[SiteForcing, ...], ...]
+    gates: tuple[Gate, ...]
+    seed: int
+    method: Method
+    tolerances: tuple[Tolerance, ...]
+    duration: Fraction
+    quantum: Fraction
+    frame: int
+    marks: tuple[int, ...]
+    ticks: frozenset[int]
+    compiled: bool
+    length: int
+    chunk: Any  # casadi.Function
+
+    @property
+    def how(self) -> str:
+        """The method in words of a command line; what is exact throughout is called so."""
+        if self.method.name != WHERE_NEEDED:
+            return str(self.method)
+        return f"{self.method}, {CVODES}:{self.method.tolerance:g} elsewhere" if self.tolerances else EXACT
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts whose work is added up."""
+        listed = (part for member in self.population.members for part in member.program.layout.parts)
+        return tuple(dict.fromkeys(listed))
+
+
+def prepare(
+    system: CompiledSystem,
+    duration: Fraction,
+    *,
+    signals: Sequence[str] = (),
+    jit: bool = True,
+    seed: int | None = None,
+    method: Method = DEFAULT,
+) -> Simulation:
+    """Do what comes before the first instant.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    duration
+        In seconds; the last row is that of the last tick until then.
+    signals
+        Patterns of the signals to record, all if there is none; see `signals.choose`.
+    jit
+        Whether to compile to machine code where there is a C compiler.
+    seed
+        Of what is random; the experiment's if not given.
+    method
+        How the continuous states move between events.
+
+    Raises
+    ------
+    ApcError
+        E870 a continuous equation is not linear and the method is exact, E873 a pattern fits nothing, E874
+        the peers are too many, E893 a peer has nothing of its own to stand in for a missing packet, E913 a
+        step that does not fit; and those of `build_schedules`, `build_population` and `routes_of`.
+    """
+    refuse_unheard_of(system)
+    numbers = resolve(system)
+    with finite_equations(system.name):
+        sites = [jacobians(kind) for kind in system.kinds]
+        flows = [_flow(system, numbers, place, site, method) for place, site in enumerate(sites)]
+        patterns = [site.pattern for site in sites]
+        exchange = build_exchange(system, numbers.timings)
+        routes = routes_of(system, numbers.timings, exchange)
+        schedules = build_schedules(system, numbers.timings, patterns)
+        kept = kept_links(routes, schedules[0].frame_s)
+        if kept:
+            schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
+        if not system.clocks:  # then there is one interval, of any length
+            schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
+        available = [
+            local_signals(system.kinds[one.kind], s) for one, s in zip(system.groups, schedules, strict=True)
+        ]
+        _check_size(system, exchange, schedules)
+        _check_step(system, numbers, schedules, method)
+        choices = choose(system, available, signals)
+        _check_size(system, exchange, schedules, choices)
+        members = _members(system, numbers, exchange, schedules, choices, sites, flows, method)
+        compiled: list[bool] = []
+
+        def kernels(functions: Sequence[Any]) -> Sequence[Any]:
+            ready = native(functions) if jit else functions
+            compiled.append(any(new is not old for new, old in zip(ready, functions, strict=True)))
+            return ready
+
+        gates = build_gates(routes, kept, exchange, schedules, members)
+        population = build_population(system, exchange, members, kernels, gates)
+    marks = schedules[0].marks[:-1]
+    length = _chunk_length(population.frame, duration, schedules[0].frame_s)
+    return Simulation(
+        system=system,
+        population=population,
+        choices=choices,
+        signals=signals_of(system, choices),
+        forces=tuple(_forces(member) for member in members),
+        gates=gates,
+        seed=system.experiment.seed if seed is None else seed,
+        method=method,
+        tolerances=_tolerances(system, flows),
+        duration=duration,
+        quantum=schedules[0].quantum,
+        frame=schedules[0].frame,
+        marks=marks,
+        ticks=frozenset(marks if _ticks_at_zero(system, numbers) else marks[1:]),
+        compiled=compiled[0],
+        length=length,
+        chunk=population.frame.mapaccum("chunk", length, len(population.start)),
+    )
+
+
+def _members(
+    system: CompiledSystem,
+    numbers: Numbers,
+    exchange: Exchange,
+    schedules: Sequence[Schedule],
+    choices: Sequence[Choice],
+    sites: Sequence[SiteJacobians],
+    flows: Sequence[Flow | None],
+    method: Method,
+) -> list[Member]:
+    """Return the groups as members of a population, those peers that are recorded apart from the others."""
+    linear = [rates(kind, flow.rows if flow else ()) for kind, flow in zip(system.kinds, flows, strict=True)]
+    cuts = exchanges_within(schedules)
+    programs: dict[Any, Program] = {}
+    members = []
+    for group, (one, schedule, choice) in enumerate(zip(system.groups, schedules, choices, strict=True)):
+        rows, vectors = numbers.rows[group], numbers.parameters[group]
+        for peers, recorded in _recorded_and_not(choice):
+            key = (one.kind, id(schedule), recorded)
+            if key not in programs:
+                programs[key] = build_program(linear[one.kind], schedule, recorded, cuts, flows[one.kind])
+            moves = _transitions(programs[key], vectors, method)
+            numbered, site = exchange.starts[group] + peers, sites[one.kind]
+            members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
+    return members
+
+
+def _chunk_length(frame: Any, duration: Fraction, frame_s: Fraction) -> int:
+    """Return how many frames to play at once: equal chunks, none larger than need be."""
+    frames = int(duration / frame_s) + 1
+    told = int(frame.nnz_in())
+    most = max(1, min(MOST_FRAMES, CHUNK // max(1, int(frame.nnz_out())), TOLD // max(1, told), frames))
+    return -(-frames // -(-frames // most))
+
+
+def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
+    """Say whether the fastest clock ticks at time 0."""
+    if not system.clocks:
+        return True
+    fastest = min(system.clocks, key=lambda clock: numbers.timings[clock.period])
+    return numbers.timings[fastest.phase] == 0
+
+
+def _check_size(
+    system: CompiledSystem, exchange: Exchange, schedules: Sequence[Schedule], choices: Sequence[Choice] = ()
+) -> None:
+    """Refuse so many peers, or so many of them recorded, that one frame of them would not fit the memory."""
+    total = sum(
+        int(choice.wanted.any(axis=1).sum()) * len(choice.locals) * len(schedule.marks)
+        for choice, schedule in zip(choices, schedules, strict=bool(choices))
+    )
+    for group, schedule in zip(system.groups, schedules, strict=True):
+        kind = system.kinds[group.kind]
+        lengths = 2  # of intervals, mostly
+        own = len(kind.parameters) + lengths * len(kind.states) * (len(kind.states) + len(kind.holds) + 1)
+        total += group.count * (own + sum(schedule.depths))
+    total += NUMBERS_A_PAIR * count_pairs(system, exchange)
+    if total > MOST_NUMBERS:
+        what = (
+            f"{system.peers} peers hold {total} numbers in a frame; at most {MOST_NUMBERS} can be "
+            "simulated at once"
+        )
+        raise ApcError(Mistake("E874", Place(system.name), what, hint="fewer peers, or fewer --signals"))
+
+
+def _recorded_and_not(choice: Choice) -> list[tuple[Integers, tuple[LocalSignal, ...]]]:
+    """Split a group into the peers that are recorded and the others, neither empty."""
+    recorded = choice.wanted.any(axis=1)
+    split = [(np.flatnonzero(recorded), choice.locals), (np.flatnonzero(~recorded), ())]
+    return [(peers, signals) for peers, signals in split if len(peers)]
+
+
+def _flow(
+    system: CompiledSystem, numbers: Numbers, place: int, site: SiteJacobians, method: Method
+) -> Flow | None:
+    """Return what the method moves of a kind, None if that is nothing."""
+    kind = system.kinds[place]
+    rows = rows_to_move(kind, method)
+    if not rows:
+        return None
+    vectors = [
+        vector
+        for group, own in zip(system.groups, numbers.parameters, strict=True)
+        if group.kind == place
+        for vector in own
+    ]
+    return flow_of(kind, method, rows, state_scales(system, kind, site, vectors))
+
+
+def _tolerances(system: CompiledSystem, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
+    """Return the tolerances of all states, each state of several kinds once, with the smallest."""
+    found: dict[str, Tolerance] = {}
+    for kind, flow in zip(system.kinds, flows, strict=True):
+        for one in flow.tolerances(kind) if flow else ():
+            if one.state not in found or one.absolute < found[one.state].absolute:
+                found[one.state] = one
+    return tuple(found.values())
+
+
+def _check_step(
+    system: CompiledSystem, numbers: Numbers, schedules: Sequence[Schedule], method: Method
+) -> None:
+    fastest = min((numbers.timings[one.period] for one in system.clocks), default=ROW)
+    lengths = [
+        event.duration * one.quantum
+        for one in schedules
+        for event in one.events
+        if isinstance(event, Propagate)
+    ]
+    check_step(system, method, fastest, max(lengths, default=fastest))
+
+
+def _transitions(program: Program, vectors: Floats, method: Method) -> list[Transitions]:
+    """Return what each different site of a group does over every interval; equal ones are one object."""
+    seconds = [length * program.schedule.quantum for length in program.durations]
+    known: dict[bytes, Transitions] = {}
+    found = []
+    for vector in vectors:
+        # Sites that differ in nothing the continuous equations read share a transition.
+        key = np.asarray(program.rates.matrices(vector)).tobytes()
+        if key not in known:
+            known[key] = transitions(program.rates, vector, seconds)
+            if method.shaken:
+                known[key] = shaken(known[key], len(known))
+        found.append(known[key])
+    return found
+
+
+def _forces(member: Member) -> tuple[SiteForcing, ...]:
+    """Return the forces that change with time on each different site of a group; none if none does."""
+    program = member.program
+    if not program.impulse_rows:
+        return ()
+    seconds = [length * program.schedule.quantum for length in program.durations]
+    forcing = forcing_of(program.rates)
+    pairs = zip(member.parameters, member.transitions, strict=True)
+    return tuple(site_forcing(forcing, vector, own.a, seconds) for vector, own in pairs)

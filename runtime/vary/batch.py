@@ -1,0 +1,405 @@
+"""The frame matrices of a system for many values of its parameters at once, with their derivatives.
+
+Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
+Gives: `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`.
+Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
+derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
+its neighbours, comes out as NaN, never as a wrong number.
+Does not: choose the groups (see `evaluator`), or compute eigenvalues.
+
+Derivatives go by the complex step, M′ = Im M(p + i h p′)/h, which cancels nothing however small h (Squire and
+Trapp, SIAM Review 40, 1998), through the composition of the frame; CasADi differentiates the coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.eigen.modes import ClosedSystem, Loop, close_loop, split
+from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows
+from apc.runtime.frame.discretize import UNIT
+from apc.runtime.frame.exchange import Exchange
+from apc.runtime.frame.lift import lift
+from apc.runtime.frame.linearize import (
+    LinearSite,
+    SiteJacobians,
+    linearize_exact,
+    linearize_rows,
+    site_of_row,
+    sites_of_rows,
+)
+from apc.runtime.frame.parameters import Free, free_rows, parameter_of
+from apc.runtime.frame.schedule import Propagate
+from apc.runtime.vary.wiring import (
+    Lifted,
+    Wiring,
+    are_rigid,
+    closed_loop,
+    reduced,
+    relative_weights,
+    site_key,
+    wire,
+)
+
+Floats = NDArray[np.float64]
+Matrices = NDArray[Any]  # float64 or complex128
+
+# The complex step: its square vanishes beside 1, whatever the parameter's size.
+STEP = 1e-60
+
+# Where it is looked whether a free parameter moves an entry: at a value of no meaning, a derivative that
+# vanishes does so everywhere.
+GENERIC_POINT = 0.7390851332151607
+
+# A step shorter than this share of the delays it is the difference of is none.
+VANISHING = 1e-14
+
+# Rates beyond this, in 1/s or what stands for it, are not exponentiated: of a mass of 0, or next to it.
+LARGEST = 1e15
+
+
+class Evaluator(Protocol):
+    """Frame matrices of closed systems over values of some parameters."""
+
+    @property
+    def free(self) -> tuple[Free, ...]:
+        """The m parameters that vary, in the order of the columns of values."""
+
+    def matrices(self, values: Floats) -> tuple[Floats, ...]:
+        """Return each system's reduced frame matrices (k, n, n) at values (k, m)."""
+
+    def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
+        """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
+
+    def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
+        """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BatchEvaluator:
+    """An `Evaluator` of a scene whose matrices follow from its parameters in closed form.
+
+    `durations` are the seconds of each step by its quanta, as (constant, slope), the slope over the only free
+    value where that is a time; then the parameters stay. `tangents` are the coefficients of each kind with
+    their derivatives; `fixed` the exponentials of the groups where nothing free reaches them.
+    """
+
+    system: CompiledSystem
+    free: tuple[Free, ...]
+    exchange: Exchange
+    groups: tuple[PeerGroup, ...]
+    wirings: tuple[Wiring, ...]
+    durations: Mapping[int, tuple[float, float]]
+    tangents: Mapping[str, Any]  # casadi.Function by the kind's name
+    fixed: Mapping[tuple[int, int], Mapping[int, Matrices]]  # exponentials that nothing free reaches
+
+    @property
+    def closed(self) -> tuple[ClosedSystem, ...]:
+        """The closed systems at a point that stands for all."""
+        return tuple(wiring.system for wiring in self.wirings)
+
+    @property
+    def timed(self) -> bool:
+        """Whether it is a time that varies."""
+        return any(slope for _, slope in self.durations.values())
+
+    def matrices(self, values: Floats) -> tuple[Floats, ...]:
+        """Return each system's reduced frame matrices (k, n, n) at values (k, m)."""
+        lifted = self.lifted(values)
+        return tuple(reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
+
+    def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
+        """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
+        lifted = self.lifted(values + (STEP * 1j) * along)
+        found = (reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
+        return tuple((one.real.copy(), one.imag / STEP) for one in found)
+
+    def vectors(self, group: PeerGroup, values: Matrices) -> Matrices:
+        """Return the parameter vectors (k, n_p) of a group, or (1, n_p) when no value reaches it."""
+        if self.timed:
+            return group.parameters[None]
+        first = int(group.peers[0])
+        place = int(np.searchsorted(self.exchange.starts, first, side="right")) - 1
+        peer = first - int(self.exchange.starts[place])
+        listed = {free: values[:, column] for column, free in enumerate(self.free)}
+        return free_rows(self.system, self.system.groups[place], peer, listed)
+
+    def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
+        """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
+        return tuple(self.system_at(value, place) for place in range(len(self.wirings)))
+
+    def system_at(self, value: Sequence[float], place: int) -> ClosedSystem:
+        """Return one closed system at one point (m,), as an analysis has it: with error bounds."""
+        assert not self.timed, "another time is another schedule"
+        system = self.wirings[place].system
+        used = {site_key(group) for group in system.sites}
+        moved = {
+            site_key(group): _moved(group, vector)
+            for group, vector in self._points(value)
+            if site_key(group) in used
+        }
+        sites = [
+            replace(one, parameters=new.parameters, site=new.site, lifted=new.lifted)
+            for one in system.sites
+            if (new := moved[site_key(one)])
+        ]
+        return close_loop(
+            Loop(
+                system.name,
+                system.multiplicity,
+                tuple(sites),
+                system.coupling,
+                system.doubts,
+                system.surds,
+            )
+        )
+
+    def exact_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
+        """Return the closed systems with the sites of one point (m,), for exact arithmetic.
+
+        Their matrices in floats are still those of the point that stands for all.
+        """
+        assert not self.timed, "another time is another schedule"
+        vector_of = {site_key(group): vector for group, vector in self._points(value)}
+        return tuple(
+            replace(
+                system, sites=tuple(replace(one, parameters=vector_of[site_key(one)]) for one in system.sites)
+            )
+            for system in self.closed
+        )
+
+    def _points(self, value: Sequence[float]) -> list[tuple[PeerGroup, Floats]]:
+        point = np.array([value], dtype=np.float64)
+        return [(group, self.vectors(group, point)[0]) for group in self.groups]
+
+    def lifted(self, values: Matrices) -> dict[tuple[int, int], Lifted]:
+        """Return the maps of all groups, each once, by the identity of site and schedule."""
+        found: dict[tuple[int, int], Lifted] = {}
+        for group in self.groups:
+            if site_key(group) not in found:
+                found[site_key(group)] = self._lift(group, values)
+        return found
+
+    def _lift(self, group: PeerGroup, values: Matrices) -> Lifted:
+        built, schedule = group.jacobians, group.schedule
+        rows = self.rows(built, self.vectors(group, values))
+        site = sites_of_rows(built, rows)
+        beyond = _beyond(site.a, site.b)
+        steps = self.fixed.get(site_key(group))
+        if steps is None:
+            site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
+            steps = self.steps(site, values)
+        count = max(len(rows), *(len(step) for step in steps.values()), 1)
+        kind_of_number = np.result_type(rows, *steps.values())
+        if count > len(rows) or kind_of_number != rows.dtype:
+            rows = np.broadcast_to(rows, (count, rows.shape[1])).astype(kind_of_number)
+            site = sites_of_rows(built, rows)
+        with np.errstate(all="ignore"):
+            z, s = compose_rows(site, schedule, steps)
+        z[beyond if len(beyond) == len(z) else slice(0, len(z) if beyond.any() else 0)] = np.nan
+        n_z = z.shape[1]
+        return Lifted(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
+
+    def steps(self, site: LinearSite, values: Matrices) -> dict[int, Matrices]:
+        """Return the exponentials of every step, one for all points where A, B and the time stay."""
+        a, b = _shared(site.a, site.b)
+        steps = {}
+        for quanta, (constant, slope) in self.durations.items():
+            seconds = np.full((1, 1, 1), constant)
+            if slope:
+                seconds = constant + slope * values[:, 0, None, None]
+                # What is left of a step that vanishes is rounding, which would upset the eigenvectors.
+                gone = np.abs(seconds) < VANISHING * abs(constant)
+                seconds = np.where(gone, seconds - seconds.real, seconds)
+            with np.errstate(all="ignore"):
+                steps[quanta] = exponential_rows(a * seconds, b * seconds, 1.0)[0]
+        return steps
+
+    def rows(self, built: SiteJacobians, vectors: Matrices) -> Matrices:
+        """Return the coefficients (k, …) of many sites; those of a complex step with their derivative."""
+        if not np.iscomplexobj(vectors):
+            return linearize_rows(built, vectors)
+        both = self.tangents[built.kind.name](vectors.real.T, vectors.imag.T / STEP)
+        value, slope = (np.asarray(one, dtype=np.float64).reshape(-1, len(vectors)).T for one in both)
+        return value + (STEP * 1j) * slope
+
+
+def batch_evaluator(
+    system: CompiledSystem,
+    free: Sequence[Free],
+    groups: Sequence[PeerGroup],
+    exchange: Exchange,
+    *,
+    durations: Mapping[int, tuple[float, float]] | None = None,
+) -> BatchEvaluator:
+    """Prepare groups of peers for many values of some parameters.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    free
+        The parameters that vary.
+    groups, exchange
+        The scene's peers at a point that stands for all, from `analysis.lifted_groups`.
+    durations
+        Where a time varies: the seconds of each step by its quanta, as constant and slope.
+    """
+    systems = split(groups, exchange).systems
+    timed = durations is not None
+    if durations is None:
+        durations = {
+            event.duration: (float(event.duration * group.schedule.quantum), 0.0)
+            for group in groups
+            for event in group.schedule.events
+            if isinstance(event, Propagate)
+        }
+    # A time moves no coefficient.
+    tangents = {} if timed else {one.jacobians.kind.name: _tangent(one.jacobians) for one in groups}
+    found = BatchEvaluator(
+        system=system,
+        free=tuple(free),
+        exchange=exchange,
+        groups=tuple(groups),
+        wirings=tuple(wire(one) for one in systems),
+        durations=durations,
+        tangents=tangents,
+        fixed={},
+    )
+    found = replace(found, fixed=_fixed(found))
+    return found if timed else replace(found, wirings=_told_apart(found))
+
+
+def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
+    """Return the wirings, those marked whose rigid directions are not the same at another point."""
+    if not any(wiring.rigid.names for wiring in evaluator.wirings):
+        return evaluator.wirings
+    base = [parameter_of(evaluator.system, one).value for one in evaluator.free]
+    lifted = evaluator.lifted(np.array([[value * (1 + GENERIC_POINT) + 1e-3 for value in base]]))
+    found = []
+    for wiring in evaluator.wirings:
+        matrix = closed_loop(wiring, lifted)
+        moving = bool(np.isfinite(matrix).all() and not are_rigid(wiring, matrix).all())
+        found.append(replace(wiring, moving=moving and not wiring.rigid.drifts))
+    return tuple(found)
+
+
+def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Matrices]]:
+    """Return the exponentials of the groups whose A and B no free parameter moves, at a meaningless point."""
+    if evaluator.timed:
+        return {}
+    found: dict[tuple[int, int], Mapping[int, Matrices]] = {}
+    point = np.full((1, len(evaluator.free)), GENERIC_POINT)
+    for group in evaluator.groups:
+        if site_key(group) in found:
+            continue
+        vectors = evaluator.vectors(group, point + (STEP * 1j) * np.ones_like(point))
+        site = sites_of_rows(group.jacobians, evaluator.rows(group.jacobians, vectors))
+        if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
+            found[site_key(group)] = evaluator.steps(site, point)
+    return found
+
+
+def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ...]:
+    """Return bounds (k, n, n) on the rounding errors of each system's reduced matrices, entry by entry.
+
+    Parameters
+    ----------
+    evaluator
+        The evaluator; no time varies in it.
+    values
+        The points (k, m).
+
+    Notes
+    -----
+    The composition of magnitudes and that of magnitudes with their errors differ by a bound on the error to
+    all orders, as in `modes.close_loop`; the roundings of closing are added to it.
+    """
+    assert not evaluator.timed, "the errors of a step belong to its time"
+    plain = evaluator.lifted(values)
+    large: dict[tuple[int, int], Lifted] = {}
+    wide: dict[tuple[int, int], Lifted] = {}
+    for group in evaluator.groups:
+        rows = linearize_rows(group.jacobians, evaluator.vectors(group, values))
+        one = lift_rows(group.jacobians, group.schedule, rows)
+        sizes = [np.abs(block) for block in (one.p, one.q, one.s, one.d)]
+        errors = (one.p_error, one.q_error, one.s_error, one.d_error)
+        large[site_key(group)] = Lifted(*sizes)
+        wide[site_key(group)] = Lifted(*(a + b for a, b in zip(sizes, errors, strict=True)))
+    found = []
+    for wiring in evaluator.wirings:
+        positive = replace(
+            wiring,
+            now=tuple(map(np.abs, wiring.now)),
+            before=tuple(map(np.abs, wiring.before)),
+        )
+        bound, upper = closed_loop(positive, large), closed_loop(positive, wide)
+        terms = max(len(group.lifted.z_names) for group in wiring.system.sites)
+        terms += sum(now.shape[0] + now.shape[1] for now in wiring.now)
+        error = (upper - bound) + 4 * (terms + 2) * (1 + len(wiring.now[0])) * UNIT * upper
+        rest, held = wiring.rest, wiring.held
+        own = error[:, rest[:, None], rest]
+        if len(held):
+            weights, off = _relative_errors(wiring, closed_loop(wiring, plain), error)
+            below, wide_below = error[:, held[:, None], rest], upper[:, held[:, None], rest]
+            own = own + np.abs(weights) @ (below + 8 * (len(held) + 2) * UNIT * wide_below) + off @ wide_below
+        found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
+    return tuple(found)
+
+
+def _relative_errors(wiring: Wiring, matrix: Floats, error: Floats) -> tuple[Floats, Floats]:
+    """Return W at each point and a bound on its error, to first order where the directions follow.
+
+    (1 − M_rr) W = M_rp: W is off by (1 − M_rr)⁻¹ times what the errors of M leave, and the solution's own.
+    """
+    weights, _ = relative_weights(wiring, matrix)
+    if not wiring.moving:
+        return weights, 8 * (len(wiring.held) + 2) * UNIT * np.abs(weights)[None]
+    rest, held = wiring.rest, wiring.held
+    system = np.eye(len(rest)) - matrix[:, rest[:, None], rest]
+    size = np.abs(np.linalg.inv(system))
+    left = error[:, rest[:, None], held] + error[:, rest[:, None], rest] @ np.abs(weights)
+    left = left + 8 * (len(rest) + 2) * UNIT * (np.abs(system) @ np.abs(weights))
+    return weights, size @ left
+
+
+def _moved(group: PeerGroup, vector: Floats) -> PeerGroup:
+    """Return the group with other parameters, linearized and lifted anew."""
+    built = group.jacobians
+    site = site_of_row(built, linearize_rows(built, vector[None])[0])
+    lifted = lift(site, group.schedule, exact=linearize_exact(built, vector))
+    return replace(group, parameters=vector, site=site, lifted=lifted)
+
+
+def _beyond(a: Matrices, b: Matrices) -> NDArray[np.bool_]:
+    """Say of each A and B whether they are too large, or not finite, for an exponential in floats."""
+    size = np.abs(a).sum(axis=(1, 2)) + np.abs(b).sum(axis=(1, 2))
+    beyond: NDArray[np.bool_] = ~(size < LARGEST)
+    return beyond
+
+
+def _shared(a: Matrices, b: Matrices) -> tuple[Matrices, Matrices]:
+    """Return A and B as one point's where they are the same at all, and real where they don't move."""
+    if len(a) > 1 and (a == a[:1]).all() and (b == b[:1]).all():
+        a, b = a[:1], b[:1]
+    if np.iscomplexobj(a) and not (a.imag.any() or b.imag.any()):
+        a, b = a.real.copy(), b.real.copy()
+    return a, b
+
+
+def _tangent(built: SiteJacobians) -> Any:
+    """Return the coefficients and their derivative along a direction, as a function of (p, dp)."""
+    arguments = built.function.sx_in()
+    along = casadi.SX.sym("along", arguments[4].numel())
+    zeros = [casadi.SX.zeros(one.numel()) for one in arguments]
+    (flat,) = built.function.call([*zeros[:4], arguments[4], zeros[5]])
+    slope = casadi.jtimes(flat, arguments[4], along)
+    return casadi.Function("tangent", [arguments[4], along], [casadi.densify(flat), casadi.densify(slope)])

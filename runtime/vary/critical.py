@@ -1,0 +1,196 @@
+"""The values of one parameter at which a scene becomes stable or unstable.
+
+Takes: a `CompiledSystem` and the name of a parameter or delay.
+Gives: `Critical`, `critical`.
+Guarantees: every crossing comes with a bound on its error, proved by ball arithmetic wherever the equations
+can be had exactly; what was scanned, and how finely, is part of the answer.
+Does not: find two crossings nearer to each other than the cell size (see `crossings.CELL`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import with_unit
+from apc.runtime.analysis.analysis import Prepared, prepare
+from apc.runtime.frame.parameters import Free, find, parameter_of, unit_of
+from apc.runtime.threads import single_threaded
+from apc.runtime.trouble import finite_equations
+from apc.runtime.vary.crossings import CELL
+from apc.runtime.vary.delays import delay_now
+from apc.runtime.vary.evaluator import reaches_time
+from apc.runtime.vary.search import Crossing, Search, search, search_delay
+
+_PLACE = Place("critical value")
+
+
+@dataclass(frozen=True, slots=True)
+class Critical:
+    """Where a scene's verdict changes with one parameter, all else as it is.
+
+    `crossings` are all that were found from `scanned[0]` to `scanned[1]`, in order. `value` is the one that
+    matters: with the present value stable, the first crossing above it or else the first below it; with the
+    present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
+    there is no crossing; `verdict` then says whether all that was scanned is stable.
+    """
+
+    topology: str
+    parameter: str
+    unit: str
+    present: float
+    value: float | None
+    error: float | None
+    stable_side: str | None
+    crossings: tuple[Crossing, ...]
+    scanned: tuple[float, float]
+    cell: float
+    whole: bool
+    verdict: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the answer as plain data, ready for JSON."""
+        return {
+            "topology": self.topology,
+            "parameter": self.parameter,
+            "unit": self.unit,
+            "present": self.present,
+            "value": self.value,
+            "error": self.error,
+            "stable_side": self.stable_side,
+            "crossings": [one.to_dict() for one in self.crossings],
+            "scanned": list(self.scanned),
+            "cell": self.cell,
+            "whole": self.whole,
+            "verdict": self.verdict,
+        }
+
+    def __str__(self) -> str:
+        """Return the answer in words."""
+        low, high = (with_unit(f"{one:.6g}", self.unit) for one in self.scanned)
+        present = with_unit(f"{self.present:.6g}", self.unit)
+        lines = [f"{self.topology}: {self.parameter} is {present}", ""]
+        if self.value is None:
+            lines.append(f"  {self.verdict}")
+        for one in self.crossings:
+            mark = "→" if one.value == self.value else " "
+            error = f" ± {one.error:.0e}" if one.error else ", exact"
+            lines.append(f"{mark} {with_unit(f'{one.value:.15g}', self.unit)}{error}")
+            kind = "jump, " if one.kind == "jump" else ""
+            lines.append(f"    {kind}stable {one.stable_side} it, {one.frequency_hz:.4g} Hz, {one.proof}")
+        lines += ["", f"  scanned from {low} to {high}"]
+        lines.append(f"  two crossings nearer than {self.cell:.0e} of the value could hide")
+        if not self.whole:
+            lines.append("  an eigenvalue keeps near to the boundary: more of them could")
+        return "\n".join(lines)
+
+
+def critical(
+    system: CompiledSystem, name: str, *, lower: str | None = None, upper: str | None = None
+) -> Critical:
+    """Find every value of a parameter at which a scene becomes stable or unstable.
+
+    Parameters
+    ----------
+    system
+        The compiled scene; all other parameters keep its values.
+    name
+        The parameter or delay, of one group or of all (see `parameters.find`).
+    lower, upper
+        Quantities between which to look, such as "5000 N/m". Without `lower`, from the least value allowed,
+        or 0; without `upper`, up to `SPAN` times the present value (of a delay, over `PIECES` pieces).
+
+    Raises
+    ------
+    ApcError
+        E622 no such parameter, E623 the number of peers, E842 a range that is none, E843 a limit out of the
+        parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear; and those of
+        `units.quantity`.
+    """
+    known, group = find(system, name, _PLACE)
+    free = Free(known, group)
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        timed = reaches_time(system, free)
+        unit = unit_of(system, known)
+        present = float(delay_now(system, free)) if timed else parameter_of(system, free).value
+        limits = [_limit(text, free, unit) for text in (lower, upper)]
+        _check_limits(system, free, limits, timed=timed)
+        prepared = prepare(system)
+        if timed:
+            _refuse_moving_start(system, prepared)
+            found = search_delay(system, free, limits[0] or 0.0, limits[1], prepared)
+        else:
+            found = search(system, free, limits[0], limits[1], prepared)
+    chosen = _chosen(found, present)
+    every = set(found.stable)
+    words = "stable" if every == {True} else "unstable"
+    verdict = f"{words} at every value scanned" if found.stable else "undecided at every value scanned"
+    return Critical(
+        topology=system.name,
+        parameter=free.label,
+        unit=unit,
+        present=present,
+        value=chosen.value if chosen else None,
+        error=chosen.error if chosen else None,
+        stable_side=chosen.stable_side if chosen else None,
+        crossings=found.edges,
+        scanned=found.scanned,
+        cell=CELL,
+        whole=found.whole,
+        verdict="" if chosen else verdict,
+    )
+
+
+def _refuse_moving_start(system: CompiledSystem, prepared: Prepared) -> None:
+    """Refuse a delay of a scene whose matrices don't follow from its parameters in closed form."""
+    used = [prepared.jacobians[group.kind] for group in system.groups]
+    if not all(site.affine and not site.edges for site in used):
+        what = "the scene is linearized at its start: the critical value of a delay can't be searched"
+        raise ApcError(
+            Mistake("E845", Place(system.name), what, hint="apc critical of a stiffness or damping")
+        )
+
+
+def _limit(text: str | None, free: Free, unit: str) -> float | None:
+    """Read a limit."""
+    if text is None:
+        return None
+    from apc.compiler.units import quantity  # it brings in pint
+
+    return float(quantity(text, Place("limit", 1, 1, text), what=free.name, unit=unit).value)
+
+
+def _check_limits(system: CompiledSystem, free: Free, limits: Sequence[float | None], *, timed: bool) -> None:
+    """Refuse limits that leave nothing to look at."""
+    low, high = limits
+    least = 0.0 if timed else parameter_of(system, free).minimum
+    most = None if timed else parameter_of(system, free).maximum
+    unit = "s" if timed else parameter_of(system, free).unit
+    for value in (low, high):
+        if value is not None and (
+            (least is not None and value < least) or (most is not None and value > most)
+        ):
+            expected = f"at least {least:g}" if least is not None and value < least else f"at most {most:g}"
+            what, got = f"a limit of {free.name}", with_unit(f"{value:g}", unit)
+            raise ApcError(Mistake("E843", _PLACE, what, with_unit(expected, unit), got))
+    bottom = low if low is not None else (least or 0.0)
+    if high is not None and not high > bottom:
+        what, got = f"the range of {free.name}", with_unit(f"{bottom:g} to {high:g}", unit)
+        raise ApcError(Mistake("E842", _PLACE, what, "an upper limit above the lower", got))
+
+
+def _chosen(found: Search, present: float) -> Crossing | None:
+    """Return the crossing that matters, see `Critical`."""
+    if not found.edges:
+        return None
+    above = [one for one in found.edges if one.value > present]
+    below = [one for one in found.edges if one.value <= present]
+    if found.stable[len(below)]:
+        return above[0] if above else below[-1]
+    lost = [one for one in found.edges if one.stable_side == "below"]
+    return lost[0] if lost else found.edges[0]

@@ -1,0 +1,185 @@
+"""A system's frame matrices as a delay varies: piece by piece, as far as the order of events stays the same.
+
+Takes: a `CompiledSystem` and a parameter or timing that reaches its delays.
+Gives: `Piece`, `delay_pieces`, `system_with_delay`, `delay_now`.
+Guarantees: pieces join on without a gap; events coincide at the values between them and nowhere else.
+Does not: vary periods or phases: another period is another frame.
+
+Within a piece the schedule stays and its steps' durations are linear in the delay; a packet is read at ticks
+only, so that over a link nothing changes within a piece at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.analysis.analysis import Prepared, lifted_groups
+from apc.runtime.frame.parameters import Free, Override, apply, resolve
+from apc.runtime.frame.schedule import Propagate, Schedule, build_schedules, common_divisor
+from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
+
+# Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal
+# there by accident.
+INSIDE = (Fraction(3, 11), Fraction(7, 13))
+
+# A schedule as it is up to the length of its steps.
+_Form = tuple[object, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Delays between `low` and `high` seconds; the ends are limits from within.
+
+    `constant` says that nothing depends on the delay within the piece.
+    """
+
+    low: Fraction
+    high: Fraction
+    evaluator: BatchEvaluator
+    constant: bool
+
+
+def system_with_delay(system: CompiledSystem, free: Free, value: Fraction) -> CompiledSystem:
+    """Return the system with another value of what reaches its delays."""
+    return apply(system, [Override(free.name, free.group, value)])
+
+
+def delay_now(system: CompiledSystem, free: Free) -> Fraction:
+    """Return the present value of a timing, or of a parameter that reaches one, exactly."""
+    for timing in system.timings:
+        if timing.name == free.name:
+            return timing.value
+    value = next(one.value for one in system.parameters if one.name == free.name)
+    return Fraction(repr(float(value)))
+
+
+def delay_pieces(
+    system: CompiledSystem,
+    free: Free,
+    low: Fraction,
+    prepared: Prepared,
+    *,
+    place: Place,
+    high: Fraction | None = None,
+) -> Iterator[Piece]:
+    """Yield the pieces from a value on upwards, for ever where there is no limit.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    free
+        The timing, or the parameter that reaches timings.
+    low
+        Where to begin.
+    prepared
+        From `analysis.prepare`.
+    place
+        Where the name was given, for messages.
+    high
+        The last piece is the one this lies in, or ends with.
+
+    Raises
+    ------
+    ApcError
+        E844 a period or phase, or what is not linear in the parameter.
+    """
+    grid = _grid(system, free, place)
+    known: dict[tuple[object, ...], BatchEvaluator] = {}
+    while high is None or low < high:
+        following = grid(low)
+        yield _piece(system, free, low, following, prepared, known)
+        low = following
+
+
+def _grid(system: CompiledSystem, free: Free, place: Place) -> Callable[[Fraction], Fraction]:
+    """Return what gives the next value at which events may coincide that don't at the values before it."""
+    now = delay_now(system, free)
+    step = Fraction(1, 1009)
+    at = [resolve(system_with_delay(system, free, now + share * step)).timings for share in (0, 1, 2)]
+    reached = [name for name in at[0] if at[0][name] != at[1][name]]
+    fixed = {time for clock in system.clocks for time in (clock.period, clock.phase)}
+    if any(name in fixed for name in reached):
+        what = (
+            f"{free.name} sets the rhythm of a clock, and with it the frame: it can't be varied continuously"
+        )
+        raise ApcError(Mistake("E844", place, what, hint="apc analyze with --set, one value at a time"))
+    lines = []
+    for name in reached:
+        slope = (at[1][name] - at[0][name]) / step
+        if at[2][name] != at[0][name] + 2 * slope * step:
+            what = f"{name} is not linear in {free.name}: its critical value can't be searched"
+            raise ApcError(Mistake("E844", place, what))
+        lines.append((at[0][name] - slope * now, slope))
+    others = [value for name, value in at[0].items() if name not in reached]
+    unit = common_divisor(others)
+    pairs = [(a - c, b - d) for i, (a, b) in enumerate(lines) for c, d in lines[:i] if b != d]
+
+    def following(value: Fraction) -> Fraction:
+        """Return the least larger value at which constant + slope·value is a multiple of the unit."""
+        found = []
+        for constant, slope in (*lines, *pairs):
+            count = (constant + slope * value) / unit
+            number = math.floor(count) + 1 if slope > 0 else math.ceil(count) - 1
+            found.append((number * unit - constant) / slope)
+        return min(found)
+
+    return following
+
+
+def _piece(
+    system: CompiledSystem,
+    free: Free,
+    low: Fraction,
+    high: Fraction,
+    prepared: Prepared,
+    known: dict[tuple[object, ...], BatchEvaluator],
+) -> Piece:
+    """Build the evaluator of one piece from its schedules at two values inside."""
+    values = [low + share * (high - low) for share in INSIDE]
+    systems = [system_with_delay(system, free, value) for value in values]
+    schedules = [
+        build_schedules(
+            one, resolve(one).timings, [site.pattern for site in prepared.jacobians], order=prepared.order
+        )
+        for one in systems
+    ]
+    durations: dict[int, tuple[float, float]] = {}
+    constant = True
+    for here, there in zip(*schedules, strict=True):
+        assert _form(here) == _form(there), "the order of events changes within a piece"
+        for quanta, (first, second) in _steps(here, there).items():
+            slope = (second - first) / (values[1] - values[0])
+            constant = constant and not slope
+            durations[quanta] = (float(first - slope * values[0]), float(slope))
+    key = tuple((_form(one), tuple(sorted(_steps(one, one).values()))) for one in schedules[0])
+    if constant and key in known:
+        return Piece(low, high, known[key], constant)
+    shared = Prepared(prepared.jacobians, schedules[0], resolve(systems[0]).timings, prepared.order)
+    groups, exchange = lifted_groups(systems[0], prepared=shared)
+    found = batch_evaluator(systems[0], (free,), groups, exchange, durations=durations)
+    if constant:
+        known[key] = found
+    return Piece(low, high, found, constant)
+
+
+def _form(schedule: Schedule) -> _Form:
+    """Return all of a schedule but its times."""
+    events = tuple(Propagate(0) if isinstance(one, Propagate) else one for one in schedule.events)
+    heard = tuple((one.way.operator, one.way.link, one.sent, one.lag) for one in schedule.heard)
+    return (events, schedule.acting, schedule.carried, heard, schedule.sent, schedule.depths)
+
+
+def _steps(here: Schedule, there: Schedule) -> Mapping[int, tuple[Fraction, Fraction]]:
+    """Return the seconds of each step in both schedules, by its quanta in the first."""
+    found: dict[int, tuple[Fraction, Fraction]] = {}
+    for one, other in zip(here.events, there.events, strict=True):
+        if isinstance(one, Propagate) and isinstance(other, Propagate):
+            pair = (one.duration * here.quantum, other.duration * there.quantum)
+            assert found.setdefault(one.duration, pair) == pair, "two steps are equal by accident"
+    return found

@@ -1,0 +1,240 @@
+"""How much each coupler's stiffness and damping, and each delay, may grow before the boundary.
+
+Takes: a `CompiledSystem`.
+Gives: `Margin`, `Margins`, `margins`, `margins_report`.
+Guarantees: a margin is the next crossing above the present value, with its error; none is said together with
+how far was looked.
+Does not: look below the present value (see `critical`), or vary two at once (see `box`).
+
+What counts is told by structure: a stiffness or damping by its unit, in a part that has no motion of its own;
+a delay by a hold or link that waits for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.words import wrapped
+from apc.runtime.analysis.analysis import Prepared, prepare
+from apc.runtime.frame.parameters import Free, parameter_of
+from apc.runtime.threads import single_threaded
+from apc.runtime.trouble import finite_equations
+from apc.runtime.vary.batch import BatchEvaluator
+from apc.runtime.vary.crossings import scan
+from apc.runtime.vary.delays import delay_now
+from apc.runtime.vary.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size
+from apc.runtime.vary.search import Crossing, Line, proved_crossing, search_delay, spread
+
+Floats = NDArray[np.float64]
+
+# Units of a stiffness and of a damping, as components write them.
+UNITS = ("N/m", "kg/s^2", "N*s/m", "kg/s")
+
+# How many times the present value is looked at (or the change that would move an eigenvalue by 1).
+GROWTH = 1e3
+
+# How many pieces of a delay, each from one coincidence of events to the next, mostly a tick.
+PIECES = 4
+
+
+# Larger systems than this are left alone: hundreds of eigenproblems of theirs take more than a second.
+MOST_STATES = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Margin:
+    """How far a parameter may grow: to `value`, right to `error`, both in SI, `factor` times its present one.
+
+    `value` and `error` are None when no boundary was found up to `scanned`; `factor` is None then, and for a
+    present value of 0.
+    """
+
+    parameter: str
+    unit: str
+    present: float
+    value: float | None
+    error: float | None
+    factor: float | None
+    frequency_hz: float | None
+    kind: str
+    scanned: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the margin as plain data, ready for JSON."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """The margins that were found; `note` says why there are none."""
+
+    rows: tuple[Margin, ...]
+    note: str
+
+    def __str__(self) -> str:
+        """Return the table of the margins."""
+        return margins_report(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the margins as plain data, ready for JSON."""
+        return {"margins": [one.to_dict() for one in self.rows], "note": self.note}
+
+
+def margins(system: CompiledSystem, *, prepared: Prepared | None = None, pieces: int = PIECES) -> Margins:
+    """Find how much each stiffness, damping and delay may grow, all else as it is.
+
+    Parameters
+    ----------
+    system
+        The compiled scene. One that isn't stable has no margins.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
+    pieces
+        How many pieces of each delay are looked at, see `delays`.
+    """
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        prepared = prepared or prepare(system)
+        free = _coupler_parameters(system)
+        found = _parameter_margins(system, free, prepared)
+        if isinstance(found, str):
+            return Margins((), found)
+        used = [prepared.jacobians[group.kind] for group in system.groups]
+        if not all(site.affine and not site.edges for site in used):
+            return Margins(tuple(found), "delays were not varied: the scene is linearized at its start")
+        delays = [_delay_margin(system, one, prepared, pieces) for one in _delays(system)]
+        return Margins((*found, *delays), "")
+
+
+def _coupler_parameters(system: CompiledSystem) -> list[Free]:
+    """Return the stiffnesses and dampings of parts without motion of their own, and the named ones."""
+    moving = {state.name.rpartition(".")[0] for kind in system.kinds for state in kind.states}
+    return [
+        one
+        for one in free_parameters(system)
+        if parameter_of(system, one).unit in UNITS and one.name.rpartition(".")[0] not in moving
+    ]
+
+
+def _delays(system: CompiledSystem) -> list[Free]:
+    """Return the timings that a hold or link waits for, or the named time they all follow from."""
+    waited = [hold.delay for kind in system.kinds for hold in kind.holds]
+    for link in system.links:
+        waited += [link.delay, *(pair.delay for pair in link.delays)]
+    free = {timing.name for timing in system.timings if timing.expression is None}
+    return [Free(name) for name in dict.fromkeys(waited) if name in free]
+
+
+def _parameter_margins(
+    system: CompiledSystem, free: Sequence[Free], prepared: Prepared
+) -> list[Margin] | str:
+    """Return the margins of the parameters that matter, or why there are none."""
+    family = evaluator(system, free, prepared=prepared)
+    base = np.array([parameter_of(system, one).value for one in free])
+    here = family.matrices(base[None])
+    largest = max((one.shape[1] for one in here), default=0)
+    if largest > MOST_STATES:
+        return f"not looked for: {largest} states take too long (apc critical does)"
+    if not all(np.isfinite(one).all() for one in here):
+        return "not looked for: the present values have no frame matrix of their own"
+    lines = [Line(family, base, column) for column in range(len(free))]
+    if keeps_size(here) and not base.all():
+        family, lines = _apart(system, free, base, prepared)
+        here = family.matrices(base[None, base != 0])
+    if not _radius(here) < 1:
+        return "none: the scene is not stable as it is"
+    found = []
+    for one, line in zip(free, lines, strict=True):
+        present = float(line.base[line.column])
+        if all(not slope.any() for _, slope in line.course(np.array([present]))):
+            continue  # nothing depends on it
+        scale = line.scale()
+        top = GROWTH * scale
+        limit = parameter_of(system, one).maximum
+        if limit is not None:
+            top = min(top, limit)
+        if not top > present:
+            continue
+        scanned = scan(line.course, spread(present, top, scale), least=scale / GROWTH)
+        roots = [root for root in scanned.roots if root.rising and root.value > present]
+        crossing = proved_crossing(roots[0], line, scanned) if roots else None
+        reached = float(scanned.points[-1]) if len(scanned.points) else present
+        found.append(_margin(one.label, parameter_of(system, one).unit, present, crossing, reached))
+    return found
+
+
+def _apart(
+    system: CompiledSystem, free: Sequence[Free], base: Floats, prepared: Prepared
+) -> tuple[BatchEvaluator | PointEvaluator, list[Line]]:
+    """Return the evaluator of the parameters that aren't 0, and lines on which each that is varies alone.
+
+    What a stiffness of 0 leaves free is no relative motion of the scene as it is, but one of every scene in
+    which it varies.
+    """
+    some = [one for one, value in zip(free, base, strict=True) if value]
+    family = evaluator(system, some, prepared=prepared)
+    lines = []
+    for column, one in enumerate(free):
+        if base[column]:
+            lines.append(Line(family, base[base != 0], some.index(one)))
+        else:
+            lines.append(Line(evaluator(system, [one], prepared=prepared), np.zeros(1), 0))
+    return family, lines
+
+
+def _radius(matrices: Sequence[Floats]) -> float:
+    return max((float(np.abs(np.linalg.eigvals(one)).max(initial=0.0)) for one in matrices), default=0.0)
+
+
+def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, pieces: int) -> Margin:
+    """Return the margin of a delay."""
+    present = delay_now(system, free)
+    found = search_delay(
+        system, free, float(present), None, prepared, pieces=pieces, first_above=float(present)
+    )
+    above = [one for one in found.edges if one.value >= float(present)]
+    return _margin(free.name, "s", float(present), above[0] if above else None, found.scanned[1])
+
+
+def _margin(name: str, unit: str, present: float, crossing: Crossing | None, scanned: float) -> Margin:
+    if crossing is None:
+        return Margin(name, unit, present, None, None, None, None, "", scanned)
+    factor = crossing.value / present if present else None
+    return Margin(
+        name,
+        unit,
+        present,
+        crossing.value,
+        crossing.error,
+        factor,
+        crossing.frequency_hz,
+        crossing.kind,
+        scanned,
+    )
+
+
+def margins_report(found: Margins) -> str:
+    """Return the table of the margins, of at most 80 columns."""
+    if not found.rows:
+        text = f"margins {found.note or 'none: there is nothing to vary'}"
+        return "\n".join(wrapped(text, "  ", "    "))
+    width = max(len(one.parameter) for one in found.rows)
+    lines = [f"  {'may grow':<{width}}  from           to               times  at"]
+    for one in found.rows:
+        name, unit = f"  {one.parameter:<{width}}  ", one.unit
+        start = f"{one.present:.5g} {unit}"
+        if one.value is None:
+            lines.append(f"{name}{start:<14} no limit up to {one.scanned:.5g} {unit}")
+            continue
+        end = f"{one.value:.7g} {unit}"
+        times = f"{one.factor:.4g}" if one.factor is not None else "–"
+        jump = ", jump" if one.kind == "jump" else ""
+        lines.append(f"{name}{start:<14} {end:<16} {times:>5}  {one.frequency_hz:.4g} Hz{jump}")
+    if found.note:
+        lines += wrapped(found.note, "  ", "    ")
+    return "\n".join(lines)

@@ -1,0 +1,346 @@
+"""All crossings of the stability boundary along one parameter or delay, each proved where it can be.
+
+Takes: a `CompiledSystem` and what varies in it.
+Gives: `Crossing`, `Search`, `search`, `search_delay`; `Line`, `spread`, `proved_crossing` to search along a
+line through several parameters.
+Guarantees: every crossing has a bound on its error, proved by ball arithmetic wherever the equations can be
+had exactly, and said to be an estimate where not.
+Does not: choose which crossing matters (see `critical`).
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import Place
+from apc.runtime.analysis.analysis import Prepared, lifted_groups
+from apc.runtime.eigen.modes import ClosedSystem, split
+from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes
+from apc.runtime.eigen.spectrum import angle_in_frame
+from apc.runtime.frame.parameters import Free, parameter_of
+from apc.runtime.vary.batch import BatchEvaluator
+from apc.runtime.vary.bracket import Bracket, bracket
+from apc.runtime.vary.crossings import Root, Scan, eigenvalues, scan
+from apc.runtime.vary.delays import Piece, delay_pieces, system_with_delay
+from apc.runtime.vary.evaluator import PointEvaluator, evaluator
+
+Floats = NDArray[np.float64]
+
+# Without limits given, values from SPAN times smaller to SPAN times larger than the scale are scanned: the
+# present value or, where that is 0, the change that would move an eigenvalue by 1 if it went on as it starts.
+SPAN = 1e3
+# Samples in each factor of 10 to begin with: neighbours differ by half.
+SAMPLES = 6
+
+# How far the float search of a system without exact equations is trusted, relative to the value: the
+# rounding of an eigenvalue, UNIT times some hundreds, over how fast it moves.
+FLOAT_ROUNDINGS = 1e-12
+
+# Pieces of a delay that are scanned without a limit given, each from one coincidence of events to the next.
+PIECES = 64
+
+# Samples in a piece of a delay to begin with.
+PIECE_SAMPLES = 3
+
+_PLACE = Place("critical value")
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """A value at which the spectral radius crosses 1, right to `error`, both in SI.
+
+    `stable_side` is "below" or "above"; `frequency_hz` is that of the motion that neither grows nor dies out
+    there; `kind` is "crossing", or "jump" where a packet comes a tick later or events change places;
+    `proof` says how the value is known.
+    """
+
+    value: float
+    error: float
+    stable_side: str
+    frequency_hz: float
+    kind: str
+    proof: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the crossing as plain data, ready for JSON."""
+        return {
+            "value": self.value,
+            "error": self.error,
+            "stable_side": self.stable_side,
+            "frequency_hz": self.frequency_hz,
+            "kind": self.kind,
+            "proof": self.proof,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """All crossings of one parameter in an interval, with what lies between them.
+
+    `edges` are the crossings in order, and `stable` says of each stretch, one more than there are crossings,
+    whether it is stable; it is empty when no sample told.
+    """
+
+    edges: tuple[Crossing, ...]
+    stable: tuple[bool, ...]
+    scanned: tuple[float, float]
+    whole: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """The points at which one of an evaluator's free parameters varies and the others stay at `base` (m,)."""
+
+    family: BatchEvaluator | PointEvaluator
+    base: Floats
+    column: int
+
+    def points(self, values: Floats) -> Floats:
+        """Return the points (k, m) of values (k,)."""
+        found = np.repeat(self.base[None], len(values), axis=0)
+        found[:, self.column] = values
+        return found
+
+    def course(self, values: Floats) -> Sequence[tuple[Floats, Floats]]:
+        """Return each system's matrices and their derivatives at values (k,)."""
+        along = np.zeros((len(values), len(self.base)))
+        along[:, self.column] = 1.0
+        return self.family.slopes(self.points(values), along)
+
+    def scale(self) -> float:
+        """Return the present value or, where it is 0, the change that would move some eigenvalue by 1."""
+        present = abs(float(self.base[self.column]))
+        if present:
+            return present
+        rates = [np.abs(eigenvalues(*pair)[1]) for pair in self.course(np.zeros(1)) if pair[0].size]
+        fastest = max((float(one.max(initial=0.0)) for one in rates), default=0.0)
+        return 1 / fastest if fastest > 0 else 1.0
+
+
+def search(
+    system: CompiledSystem, free: Free, low: float | None, high: float | None, prepared: Prepared
+) -> Search:
+    """Find the crossings of a parameter that reaches no time.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    free
+        The parameter.
+    low, high
+        Between which values, None for those of `critical`.
+    prepared
+        From `analysis.prepare`.
+    """
+    parameter = parameter_of(system, free)
+    family = evaluator(system, [free], prepared=prepared)
+    line = Line(family, np.array([parameter.value]), 0)
+    scale = line.scale()
+    bottom = low if low is not None else (parameter.minimum or 0.0)
+    top = high if high is not None else max(SPAN * scale, bottom + scale)
+    if parameter.maximum is not None:
+        top = min(top, parameter.maximum)
+    found = scan(line.course, spread(bottom, top, scale), least=scale / SPAN)
+    edges = [proved_crossing(root, line, found) for root in found.roots]
+    return _search(edges, found, (bottom, top))
+
+
+def spread(bottom: float, top: float, scale: float) -> Floats:
+    """Return values from bottom to top, in even ratios on either side of 0."""
+
+    def ratios(low: float, high: float) -> Floats:
+        least = max(low, min(scale, high) / SPAN)
+        count = max(2, int(np.ceil(SAMPLES * np.log10(high / least))) + 1) if high > least else 1
+        return np.geomspace(least, high, count)
+
+    parts = [np.array([bottom])]
+    if bottom < 0:
+        parts.append(-ratios(max(-top, 0.0), -bottom)[::-1])
+    if bottom < 0 < top:
+        parts.append(np.zeros(1))
+    if top > 0:
+        parts.append(ratios(max(bottom, 0.0), top))
+    found = np.sort(np.concatenate([*parts, [top]]))
+    return np.asarray(found[np.append(True, np.diff(found) > 0)])
+
+
+def _search(edges: Sequence[Crossing], found: Scan, asked: tuple[float, float]) -> Search:
+    """Put the crossings together with the stretches between them."""
+    points, radius = found.points, found.radius
+    if not len(points):
+        return Search((), (), asked, whole=False)
+    ends = [-np.inf, *(one.value for one in edges), np.inf]
+    stable = tuple(
+        bool(radius[(points > low) & (points < high)][0] < 1) for low, high in itertools.pairwise(ends)
+    )
+    # A limit on which an eigenvalue lies on the circle, as a stiffness of exactly 0, is no sample itself.
+    scanned = (min(asked[0], float(points[0])), min(asked[1], float(points[-1])))
+    return Search(tuple(edges), stable, scanned, found.whole)
+
+
+def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
+    """Prove a crossing, if it can be proved, and describe it."""
+    place = int(np.searchsorted(found.points, root.value))
+    low, high = found.points[max(place - 1, 0)], found.points[min(place, len(found.points) - 1)]
+    family = line.family
+
+    def point(value: float) -> list[float]:
+        listed: list[float] = line.points(np.array([value]))[0].tolist()
+        return listed
+
+    if not isinstance(family, BatchEvaluator):
+        return _described(root, None, family.closed_at(point(root.value)))
+
+    def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
+        listed = zip(family.exact_at(point(value)), family.wirings, strict=True)
+        return [
+            (one, find_rigid_modes(one, with_drifts=False) if wiring.moving else wiring.rigid)
+            for one, wiring in listed
+        ]
+
+    proved = bracket(root, systems, low=float(low), high=float(high))
+    return _described(root, proved, [family.system_at(point(root.value), root.system)])
+
+
+def _described(root: Root, proved: Bracket | None, closed: Sequence[ClosedSystem]) -> Crossing:
+    """Return the crossing of a root; without a proof, with the error that floats are trusted with."""
+    if proved is None:
+        error = FLOAT_ROUNDINGS / abs(root.slope) if root.slope else root.high - root.low
+        proved = Bracket(root.value, max(error, abs(root.value) * FLOAT_ROUNDINGS), "estimated in floats")
+    return Crossing(
+        value=proved.value,
+        error=proved.error,
+        stable_side="below" if root.rising else "above",
+        frequency_hz=_frequency(root.eigenvalue, closed),
+        kind="crossing",
+        proof=proved.proof,
+    )
+
+
+def _frequency(value: complex, closed: Sequence[ClosedSystem]) -> float:
+    """Return the frequency of an eigenvalue of some of the systems, whole turns within a frame counted."""
+    best: tuple[float, float] = (np.inf, 0.0)
+    for system in closed:
+        values, right = np.linalg.eig(system.matrix)
+        place = int(np.argmin(np.abs(values - value)))
+        found, covectors = np.linalg.eig(system.matrix.T)
+        covector = covectors[:, int(np.argmin(np.abs(found - values[place])))]
+        shares = np.abs(right[:, place] * covector)
+        angle = angle_in_frame(system, complex(values[place]), right[:, place], shares)
+        best = min(best, (float(np.abs(values[place] - value)), abs(angle) / (2 * np.pi * system.frame_s)))
+    return best[1]
+
+
+def search_delay(
+    system: CompiledSystem,
+    free: Free,
+    low: float,
+    high: float | None,
+    prepared: Prepared,
+    *,
+    pieces: int = PIECES,
+    first_above: float | None = None,
+) -> Search:
+    """Find the crossings of a delay: within pieces as of any parameter, and jumps between them.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    free
+        The timing, or a parameter that reaches timings.
+    low, high
+        From which value to which; without `high` over so many `pieces`.
+    prepared
+        From `analysis.prepare`.
+    pieces
+        How many pieces of the delay are scanned where `high` is not given.
+    first_above
+        Stop at the first crossing above this value.
+
+    Notes
+    -----
+    Where events coincide, their order makes the value one with the piece before it or with the one after.
+    """
+    start = Fraction(repr(low))
+    end = None if high is None else Fraction(repr(high))
+    edges: list[Crossing] = []
+    stable: list[bool] = []
+    before: Piece | None = None
+    at, whole = start, True
+    every = delay_pieces(system, free, start, prepared, place=_PLACE, high=end)
+    for piece in itertools.islice(every, pieces if end is None else None):
+        at = piece.high if end is None else min(piece.high, end)
+        found = _piece_scan(piece, float(piece.low), float(at))
+        whole = whole and found.whole
+        if not len(found.points):
+            continue
+        first = bool(found.radius[0] < 1)
+        if stable and stable[-1] != first:
+            assert before is not None, "what came before was scanned"
+            edges.append(_jump(before, piece, stable_below=stable[-1]))
+        if not stable or stable[-1] != first:
+            stable.append(first)
+        for root in found.roots:
+            edges.append(_delay_crossing(system, free, root, prepared, piece))
+            stable.append(not stable[-1])
+        before = piece
+        if first_above is not None and edges and edges[-1].value > first_above:
+            break
+    return Search(tuple(edges), tuple(stable), (float(start), float(at)), whole)
+
+
+def _piece_scan(piece: Piece, low: float, high: float) -> Scan:
+    """Scan one piece, its ends as limits from within."""
+    family = piece.evaluator
+
+    def course(points: Floats) -> Sequence[tuple[Floats, Floats]]:
+        if family.timed:
+            return family.slopes(points[:, None], np.ones((len(points), 1)))
+        found = family.matrices(points[:, None])
+        return [(matrix, np.zeros_like(matrix)) for matrix in found]
+
+    points = np.array([low]) if piece.constant else np.linspace(low, high, PIECE_SAMPLES)
+    return scan(course, points, least=high - low)
+
+
+def _jump(before: Piece, after: Piece, *, stable_below: bool) -> Crossing:
+    """Describe a change of side between two pieces: the delay at which events coincide, exactly."""
+    family = (after if stable_below else before).evaluator  # the motion that grows is on that side
+    found = [np.linalg.eigvals(one[0]) for one in family.matrices(np.array([[float(after.low)]]))]
+    place = int(np.argmax([float(np.abs(one).max(initial=0.0)) for one in found]))
+    worst = complex(found[place][int(np.argmax(np.abs(found[place])))])
+    return Crossing(
+        value=float(after.low),
+        error=0.0,
+        stable_side="below" if stable_below else "above",
+        frequency_hz=_frequency(worst, [family.closed[place]]),
+        kind="jump",
+        proof="events coincide there",
+    )
+
+
+def _delay_crossing(
+    system: CompiledSystem, free: Free, root: Root, prepared: Prepared, piece: Piece
+) -> Crossing:
+    """Prove a crossing within a piece, whose systems are built anew for every value."""
+
+    @functools.cache
+    def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
+        moved = system_with_delay(system, free, Fraction(value))
+        listed = split(*lifted_groups(moved, prepared=prepared)).systems
+        return [(one, find_rigid_modes(one, with_drifts=False)) for one in listed]
+
+    proved = bracket(root, systems, low=float(piece.low), high=float(piece.high))
+    closed = [systems(root.value)[root.system][0]]
+    return _described(root, proved, closed)

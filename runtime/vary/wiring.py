@@ -1,0 +1,196 @@
+"""Closing the loop of one system for many points at once, and taking its rigid motions out.
+
+Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
+Gives: `Lifted`, `Wiring`, `wire`, `closed_loop`, `reduced`, `relative_weights`, `are_rigid`, `site_key`.
+Guarantees: the matrices are those of `modes.close_loop` in relative coordinates, to rounding; where the
+directions are not those of a rigid motion they are NaN.
+Does not: lift a site (see `batch`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.eigen.modes import ClosedSystem, Packet, packet_places
+from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+
+Floats = NDArray[np.float64]
+Matrices = NDArray[Any]  # float64 or complex128
+
+# M V = V is asked to hold to this, relative to |M| |V|: far above rounding, far below what a motion that is
+# not rigid leaves.
+RIGID = 1e-9
+
+# An eigenvalue nearer to 1 than this, the rigid directions taken out, may be the second of a Jordan pair
+# (rounding splits one by about the root of UNIT): then the exact search for drifts is worth its time.
+NEAR_ONE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Lifted:
+    """The one-frame maps of one group of peers at k points: z⁺ = P z + Q r, s = S z + D r."""
+
+    p: Matrices  # (k, n_z, n_z)
+    q: Matrices  # (k, n_z, n_r)
+    s: Matrices  # (k, n_s, n_z)
+    d: Matrices  # (k, n_s, n_r)
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """How a closed system's sites hear each other, and which of its coordinates are left.
+
+    `now` and `before` are what each site hears, over all packets sent this frame and over the state; `loop`
+    says that something is heard in the frame it is sent in. `rigid` are the rigid motions, `held` as many
+    places that are given up for them, `rest` all others, and `weights` W of the relative coordinates
+    x_rest − W x_held.
+    """
+
+    system: ClosedSystem
+    now: tuple[Floats, ...]  # (n_r, n_s of all sites), one a site
+    before: tuple[Floats, ...]  # (n_r, n), one a site
+    loop: bool
+    rigid: RigidModes
+    held: NDArray[np.intp]
+    rest: NDArray[np.intp]
+    weights: Floats  # (len(rest), len(held))
+    moving: bool  # the directions follow the free parameters, and W with them
+
+
+def site_key(group: PeerGroup) -> tuple[int, int]:
+    """Return what sites of the same one-frame map have in common: whose site and whose schedule it is."""
+    return id(group.site), id(group.schedule)
+
+
+def wire(system: ClosedSystem) -> Wiring:
+    """Take down who hears whom in a closed system, and its rigid motions."""
+    n = len(system.names)
+    place_of = packet_places(system.sites, system.packets, system.offsets)
+    row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
+    starts = np.cumsum([0] + [len(group.schedule.sent) for group in system.sites])
+    listed = []
+    for g, group in enumerate(system.sites):
+        now = np.zeros((len(group.schedule.heard), starts[-1]))
+        before = np.zeros((len(group.schedule.heard), n))
+        for line, one in enumerate(group.schedule.heard):
+            for h, weight in enumerate(system.coupling[one.way][g]):
+                if weight and one.lag:
+                    before[line, place_of[Packet(h, row_of[h][one.sent], one.lag)]] = float(weight)
+                elif weight:
+                    now[line, starts[h] + row_of[h][one.sent]] = float(weight)
+        listed.append((now, before))
+    rigid = find_rigid_modes(system, with_drifts=False)
+    wiring = _without(system, listed, rigid)
+    if rigid.names:
+        values = np.linalg.eigvals(reduced(wiring, system.matrix[None], 1)[0])
+        if np.any(np.abs(values - 1) < NEAR_ONE):
+            wiring = _without(system, listed, find_rigid_modes(system))
+    return wiring
+
+
+def _without(system: ClosedSystem, listed: Sequence[tuple[Floats, Floats]], rigid: RigidModes) -> Wiring:
+    held, rest, weights = relative_coordinates(rigid.basis)
+    return Wiring(
+        system=system,
+        now=tuple(now for now, _ in listed),
+        before=tuple(before for _, before in listed),
+        loop=any(now.any() for now, _ in listed),
+        rigid=rigid,
+        held=held,
+        rest=rest,
+        weights=weights,
+        moving=False,
+    )
+
+
+def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], Lifted]) -> Matrices:
+    """Close the loop of one system at all points: its matrices (k, n, n), see `modes.close_loop`."""
+    system = wiring.system
+    n = len(system.names)
+    own = [lifted[site_key(group)] for group in system.sites]
+    count = max(len(one.p) for one in own)
+    kind_of_number = np.result_type(*(one.p for one in own))
+    source = np.zeros((count, wiring.now[0].shape[1], n), dtype=kind_of_number)
+    row = 0
+    for one, before, offset in zip(own, wiring.before, system.offsets, strict=True):
+        rows = slice(row, row + one.s.shape[1])
+        source[:, rows, offset : offset + one.p.shape[1]] = one.s
+        source[:, rows] += one.d @ before
+        row = rows.stop
+    sent = source
+    if wiring.loop:
+        term = source
+        parts = [one.d @ now for one, now in zip(own, wiring.now, strict=True)]
+        back = np.concatenate([np.broadcast_to(part, (count, *part.shape[1:])) for part in parts], axis=1)
+        for _ in range(back.shape[1]):
+            term = back @ term
+            if not term.any():
+                break
+            sent = sent + term
+    matrix = np.zeros((count, n, n), dtype=kind_of_number)
+    for one, now, before, offset in zip(own, wiring.now, wiring.before, system.offsets, strict=True):
+        rows = slice(offset, offset + one.p.shape[1])
+        matrix[:, rows, rows] += one.p
+        matrix[:, rows] += one.q @ (now @ sent + before if wiring.loop else before)
+    place_of = packet_places(system.sites, system.packets, system.offsets)
+    starts = np.cumsum([0] + [one.s.shape[1] for one in own])
+    for packet, place in place_of.items():
+        if packet.lag == 1:
+            matrix[:, place] = sent[:, starts[packet.site] + packet.row]
+        else:
+            matrix[:, place, place_of[Packet(packet.site, packet.row, packet.lag - 1)]] = 1.0
+    return matrix
+
+
+def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
+    """Take the rigid motions out: M_rr − W M_pr, NaN where the directions are not rigid."""
+    rest, held = wiring.rest, wiring.held
+    within = matrix[:, rest[:, None], rest]
+    if len(held):
+        weights, sound = relative_weights(wiring, matrix)
+        within = within - weights @ matrix[:, held[:, None], rest]
+        within[~sound] = np.nan
+    within[~np.isfinite(within).all(axis=(1, 2))] = np.nan
+    return np.broadcast_to(within, (count, *within.shape[1:])).copy() if len(within) < count else within
+
+
+def relative_weights(wiring: Wiring, matrix: Matrices) -> tuple[Matrices, NDArray[np.bool_]]:
+    """Return W of the relative coordinates at each point, and whether it is of rigid motions.
+
+    Directions that follow the parameters, as where two forces hold each other, solve M V = V with V_p = 1:
+    (1 − M_rr) W = M_rp, and M_pp + M_pr W = 1.
+    """
+    rest, held = wiring.rest, wiring.held
+    if not wiring.moving:
+        return wiring.weights, are_rigid(wiring, matrix.real)
+    unit = np.eye(len(rest))
+    weights = np.full((len(matrix), len(rest), len(held)), np.nan, dtype=matrix.dtype)
+    for k, one in enumerate(matrix):
+        if np.isfinite(one).all():
+            with contextlib.suppress(np.linalg.LinAlgError):
+                weights[k] = np.linalg.solve(unit - one[np.ix_(rest, rest)], one[np.ix_(rest, held)])
+    own = matrix[:, held[:, None], held] + matrix[:, held[:, None], rest] @ weights
+    size = 1 + np.abs(matrix[:, held[:, None], rest].real) @ np.abs(weights.real)
+    still = np.abs(own.real - np.eye(len(held))) <= RIGID * size
+    return weights, np.asarray(still.all(axis=(1, 2)))
+
+
+def are_rigid(wiring: Wiring, matrix: Floats) -> NDArray[np.bool_]:
+    """Say of each matrix (k, n, n) whether the rigid motions V move by themselves, M V = V C, C_ii = 1."""
+    basis = wiring.rigid.basis
+    inverse = np.linalg.inv(basis[wiring.held])
+    moved, size = matrix @ basis, np.abs(matrix) @ np.abs(basis)
+    own = inverse @ moved[:, wiring.held]
+    own_size = np.abs(inverse) @ size[:, wiring.held]
+    span = np.abs(moved - basis @ own) <= RIGID * (1 + size + np.abs(basis) @ own_size)
+    still = np.abs(np.diagonal(own, axis1=1, axis2=2) - 1) <= RIGID * (
+        1 + np.diagonal(own_size, axis1=1, axis2=2)
+    )
+    return np.asarray(span.all(axis=(1, 2)) & still.all(axis=1))
