@@ -278,3 +278,17 @@ def grouped(system: CompiledSystem, *groups: tuple[str, int, dict[str, float]]) 
             for name, count, own in groups
         ),
     )
+
+
+def derived(system: CompiledSystem, **expressions: str) -> CompiledSystem:
+    """Add the parameters kt and wait, and expressions over them for parameters and timings."""
+    names = {key.replace("__", "."): text for key, text in expressions.items()}
+    return replace(
+        system,
+        parameters=(
+            Parameter("kt", "N/m", 500.0),
+            Parameter("wait", "s", 0.008),
+            *(replace(p, expression=names.get(p.name)) for p in system.parameters),
+        ),
+        timings=tuple(replace(t, expression=names.get(t.name)) for t in system.timings),
+    )

@@ -16,7 +16,7 @@ import pytest
 from apc.compiler.compiled import Timing
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import analyze, prepare
-from apc.runtime.frame.parameters import apply, parse_override
+from apc.runtime.frame.overrides import apply, parse_override
 from tests.sites import MS, alone, columned, edged, grouped, linked, paper
 
 

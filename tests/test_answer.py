@@ -13,7 +13,7 @@ from apc.compiler.pipeline import compile_topology
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.analysis.box import parse_range
 from apc.runtime.answers.answer import answer, judge
-from apc.runtime.frame.parameters import Override, apply, parse_override
+from apc.runtime.frame.overrides import Override, apply, parse_override
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
 FLIPS = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"

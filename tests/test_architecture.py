@@ -26,7 +26,9 @@ HOUSE = {
     """,
     "apc.runtime": "threads trouble",
     "apc.runtime.frame": """
-        exact parameters discretize exchange packets timetable guards linearize schedule gathering
+        exact names rows bounds overrides parameters
+        discretize exchange packets timetable guards site jacobians start linearize
+        schedule liveness hearing hyperperiod scheduling gathering
         lift batch_lift residues
     """,
     "apc.runtime.eigen": "peers modes rigid pseudospectrum enclosure balls certify ratios duals spectrum",

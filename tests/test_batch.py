@@ -11,7 +11,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import analyze, lifted_groups
 from apc.runtime.eigen.balls import frame_balls, precision
 from apc.runtime.eigen.modes import split
-from apc.runtime.frame.parameters import Free, Override, apply
+from apc.runtime.frame.names import Free
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
 from apc.runtime.vary.crossings import eigenvalues
 from apc.runtime.vary.evaluator import evaluator, reaches_time

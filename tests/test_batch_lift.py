@@ -11,7 +11,7 @@ from apc.runtime.frame.batch_lift import exponential_rows
 from apc.runtime.frame.discretize import UNIT, discretize
 from apc.runtime.frame.lift import lift
 from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of_row
-from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.frame.overrides import Override, apply
 from tests.populations import crowded, different
 from tests.sites import MS
 

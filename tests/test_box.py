@@ -13,7 +13,7 @@ from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.analysis.box import parse_range
 from apc.runtime.analysis.box_proof import BoxProof, prove_box
-from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.frame.overrides import Override, apply
 from tests.sites import columned, grouped, paper
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 

@@ -13,7 +13,7 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.critical import critical
 from apc.runtime.vary.crossings import scan
 from tests.bruteforce import Scene, frame_matrix

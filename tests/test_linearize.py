@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import Kind
-from apc.runtime.frame.linearize import jacobians, linearize, linearize_exact
+from apc.runtime.frame.jacobians import jacobians
+from apc.runtime.frame.linearize import linearize, linearize_exact
 from apc.runtime.frame.parameters import resolve
 from tests.sites import NAMES, edged, paper, user
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.margins import margins, margins_report
 from tests.topologies import AVERAGE, compiled, replaced
 

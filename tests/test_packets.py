@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.linearize import jacobians
+from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.packets import (
     PARETO_MOST,
     START,
@@ -25,7 +25,8 @@ from apc.runtime.frame.packets import (
     nominal_notes,
 )
 from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import Tick, build_schedules
+from apc.runtime.frame.schedule import Tick
+from apc.runtime.frame.scheduling import build_schedules
 from tests.sites import MS, paper
 from tests.topologies import AVERAGE, compiled, replaced
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.parameters import apply, parse_override
+from apc.runtime.frame.overrides import apply, parse_override
 from apc.runtime.sweep.quantities import QUANTITIES, faulty, find_quantity
 from apc.runtime.sweep.sweep import sweep
 from tests.sweeping import CHEAP

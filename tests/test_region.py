@@ -13,7 +13,7 @@ import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.region.axes import parse_axes
 from apc.runtime.region.boundary import relative_to
 from apc.runtime.region.curves import between

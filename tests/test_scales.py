@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apc.runtime.frame.linearize import jacobians
+from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.parameters import resolve
 from apc.runtime.simulate.scales import UNKNOWN, state_scales
 from tests.topologies import ONE_MASS, compiled, replaced

@@ -8,19 +8,10 @@ from typing import Any
 
 import pytest
 
-from apc.runtime.frame.linearize import jacobians
+from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import (
-    ORDER,
-    Act,
-    Heard,
-    Propagate,
-    Schedule,
-    Send,
-    Tick,
-    Value,
-    build_schedules,
-)
+from apc.runtime.frame.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, Tick, Value
+from apc.runtime.frame.scheduling import build_schedules
 from tests.sites import MS, grouped, linked, paper
 
 

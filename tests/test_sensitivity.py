@@ -9,7 +9,8 @@ import pytest
 
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.parameters import Free, Override, apply
+from apc.runtime.frame.names import Free
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.evaluator import evaluator
 from apc.runtime.vary.sensitivity import sensitivities, sensitivity_report

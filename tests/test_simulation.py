@@ -162,7 +162,7 @@ def test_what_is_remembered_starts_at_its_start_value_and_acts_as_zero_before_it
 )
 def test_graphs_groups_and_clocks_follow_the_frame_map(scene: str, shared: str) -> None:
     from apc.compiler.pipeline import compile_topology
-    from apc.runtime.frame.parameters import apply, parse_override
+    from apc.runtime.frame.overrides import apply, parse_override
 
     system = compile_topology(SCENES / f"{scene}.yaml")
     group = system.groups[0].name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apc.runtime.frame.parameters import Free
+from apc.runtime.frame.names import Free
 from apc.runtime.region.surrogate import ChebyshevFamily, DirectFamily, Rectangle, resolve_family
 from apc.runtime.vary.batch import matrix_errors
 from apc.runtime.vary.evaluator import evaluator

@@ -12,7 +12,9 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.analysis.switches import SwitchingPart, bind, find_switches, switching_parts
-from apc.runtime.frame.linearize import LinearSite, jacobians, linearize
+from apc.runtime.frame.jacobians import jacobians
+from apc.runtime.frame.linearize import linearize
+from apc.runtime.frame.site import LinearSite
 from tests.sites import alone
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 

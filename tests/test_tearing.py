@@ -19,7 +19,8 @@ from apc.compiler.flatten import FlatEquation
 from apc.compiler.functions import _Writer
 from apc.compiler.grammar import parse_equation
 from apc.compiler.symbolic import no_derivative, symbol, to_sympy
-from apc.runtime.frame.linearize import jacobians, linearize
+from apc.runtime.frame.jacobians import jacobians
+from apc.runtime.frame.linearize import linearize
 
 PLACE = Place("test.yaml", 1, 1)
 

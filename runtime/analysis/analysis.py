@@ -24,10 +24,11 @@ from apc.runtime.eigen.peers import PeerGroup, peer_groups, states_of
 from apc.runtime.eigen.spectrum import Mode, Spectrum, solve_spectrum
 from apc.runtime.frame.discretize import TOO_LARGE
 from apc.runtime.frame.exchange import Exchange, build_exchange
-from apc.runtime.frame.linearize import SiteJacobians, jacobians
+from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.packets import nominal_notes
 from apc.runtime.frame.parameters import Numbers, resolve
-from apc.runtime.frame.schedule import ORDER, Schedule, build_schedules
+from apc.runtime.frame.schedule import ORDER, Schedule
+from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.large.crowds import crowds
 from apc.runtime.large.determinant_spectrum import solve_crowds, solve_loops
 from apc.runtime.large.graph import deciding_loops, with_the_rest
@@ -139,7 +140,7 @@ def analyze(
     Parameters
     ----------
     system
-        The compiled scene, with the numbers to analyse (see `parameters.apply`).
+        The compiled scene, with the numbers to analyse (see `overrides.apply`).
     method
         One of `plan.METHODS`. "modes": a few small systems, where equal peers and the graph allow that;
         "dense": all peers as one matrix, the check on all else, at the cost of N³; "determinant": the

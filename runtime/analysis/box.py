@@ -26,8 +26,10 @@ from apc.runtime.eigen.modes import ClosedSystem, split
 from apc.runtime.eigen.peers import PeerGroup, Runs
 from apc.runtime.eigen.ratios import NotRational, Ratio, Ratios
 from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.linearize import LinearSite, site_of_row
-from apc.runtime.frame.parameters import Override, apply, find
+from apc.runtime.frame.linearize import site_of_row
+from apc.runtime.frame.names import find
+from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.frame.site import LinearSite
 
 _PLACE = Place("box")
 
@@ -77,7 +79,7 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
     system
         The compiled scene.
     text
-        As written; the name as in `parameters.find`.
+        As written; the name as in `names.find`.
     place
         Where it stands, for messages.
 
@@ -85,7 +87,7 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
     ------
     ApcError
         E830 not of that form, E831 a parameter that a box can't leave open, E833 limits that can't be; those
-        of `parameters.find` and `units.quantity`.
+        of `names.find` and `units.quantity`.
     """
     # Imported here: reading a unit brings in pint, which an analysis without a box never needs.
     from apc.compiler.units import quantity

@@ -43,7 +43,7 @@ from apc.runtime.eigen.pseudospectrum import balance
 from apc.runtime.eigen.ratios import Ratio
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid
 from apc.runtime.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
-from apc.runtime.frame.linearize import LinearSite, entrywise
+from apc.runtime.frame.site import LinearSite, entrywise
 from apc.runtime.threads import single_threaded
 
 Floats = NDArray[np.float64]

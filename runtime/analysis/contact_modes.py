@@ -24,7 +24,8 @@ from apc.compiler.words import wrapped
 from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.runtime.eigen.spectrum import UNSTABLE
-from apc.runtime.frame.linearize import SiteJacobians, linearize
+from apc.runtime.frame.jacobians import SiteJacobians
+from apc.runtime.frame.linearize import linearize
 from apc.runtime.frame.parameters import resolve
 
 EVERYONE = "on at every peer"

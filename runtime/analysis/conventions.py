@@ -26,8 +26,10 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.runtime.frame.linearize import LinearSite, SiteJacobians
-from apc.runtime.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value, build_schedules
+from apc.runtime.frame.jacobians import SiteJacobians
+from apc.runtime.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
+from apc.runtime.frame.scheduling import build_schedules
+from apc.runtime.frame.site import LinearSite
 
 # The pairs of events whose order at one instant can change the frame, and what each order other than the
 # default means. Sending and ticking read the same instant and write different things: their order can't.

@@ -17,7 +17,7 @@ from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import prepare
 from apc.runtime.analysis.plan import make_plan
 from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.linearize import edge_name
+from apc.runtime.frame.jacobians import edge_name
 from apc.runtime.frame.parameters import resolve
 from apc.runtime.trouble import finite_equations
 

@@ -24,7 +24,7 @@ from apc.runtime.eigen.peers import (
     used_ways,
 )
 from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.linearize import SiteJacobians
+from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.parameters import Numbers
 from apc.runtime.frame.schedule import Schedule
 from apc.runtime.large.graph import is_large_ring

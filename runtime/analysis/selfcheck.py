@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.discretize import TOO_LARGE, UNIT
+from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.lift import lift
-from apc.runtime.frame.linearize import SiteJacobians, jacobians, linearize
+from apc.runtime.frame.linearize import linearize
 from apc.runtime.frame.parameters import Numbers, resolve
-from apc.runtime.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value, build_schedules
+from apc.runtime.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
+from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 

@@ -86,7 +86,7 @@ def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> Compiled
     ApcError
         A name is unknown, a unit is wrong, or a value lies outside its bounds.
     """
-    from apc.runtime.frame.parameters import apply, parse_override
+    from apc.runtime.frame.overrides import apply, parse_override
 
     overrides = [parse_override(model, f"{name}={value}") for name, value in values.items()]
     return apply(model, overrides)

@@ -86,7 +86,7 @@ def bench_command(
         check_format(plot)
     system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
     if settings:
-        from apc.runtime.frame.parameters import apply, parse_override
+        from apc.runtime.frame.overrides import apply, parse_override
 
         system = apply(system, [parse_override(system, text) for text in settings])
     found = bench(system)

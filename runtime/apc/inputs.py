@@ -124,12 +124,12 @@ def open_scene(file: str | None, settings: Sequence[str]) -> CompiledSystem:
     Raises
     ------
     ApcError
-        As `find_input`, `load_or_compile`, `parameters.parse_override` and `parameters.apply`.
+        As `find_input`, `load_or_compile`, `overrides.parse_override` and `overrides.apply`.
     """
     system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
     if not settings:
         return system
-    from apc.runtime.frame.parameters import apply, parse_override
+    from apc.runtime.frame.overrides import apply, parse_override
 
     return apply(system, [parse_override(system, text) for text in settings])
 

@@ -27,8 +27,8 @@ from apc.runtime.frame.discretize import step_balls
 from apc.runtime.frame.exact import is_rational
 from apc.runtime.frame.exchange import Surd
 from apc.runtime.frame.lift import follow
-from apc.runtime.frame.linearize import LinearSite, entrywise
 from apc.runtime.frame.schedule import Propagate, Schedule, Way
+from apc.runtime.frame.site import LinearSite, entrywise
 
 Balls = NDArray[Any]  # of flint.arb, and the integers 0 and 1 where these are exact
 

@@ -23,22 +23,13 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.exchange import Exchange, check_mean
+from apc.runtime.frame.jacobians import SiteJacobians, edge_name
 from apc.runtime.frame.lift import LiftedSite, lift
-from apc.runtime.frame.linearize import (
-    LinearSite,
-    Listening,
-    SiteJacobians,
-    edge_name,
-    linearize,
-    linearize_exact,
-    linearize_rows,
-    rational_floats,
-    site_of_row,
-    start_sends,
-    start_values,
-)
+from apc.runtime.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
 from apc.runtime.frame.parameters import Numbers
 from apc.runtime.frame.schedule import Schedule, Way
+from apc.runtime.frame.site import LinearSite, rational_floats
+from apc.runtime.frame.start import Listening, start_sends, start_values
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from apc.runtime.eigen.modes import ClosedSystem, Loop
 from apc.runtime.eigen.peers import PeerGroup
 from apc.runtime.frame.exchange import QUICK_PRIME
-from apc.runtime.frame.linearize import LinearSite
 from apc.runtime.frame.schedule import Act, Propagate, Send, Tick, Value
+from apc.runtime.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 Takes: the matrices of dx/dt = A x + B u, exact. Gives: `Step`, `discretize`; `step_balls`.
 Guarantees: every entry is right to the last digit but one, proved by ball arithmetic, whether a mode dies
 out in a nanosecond or never.
-Does not: know when anything happens (see `schedule`).
+Does not: know when anything happens (see `scheduling`).
 
     x(t + T) = F x(t) + G u        [F G; 0 I] = exp([A B; 0 0] T)
 

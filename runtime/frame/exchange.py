@@ -5,7 +5,7 @@ Gives: `Exchange`, `build_exchange`, `arcs`, `check_mean`; `GraphMode`, `Surd`, 
 `ring_mode`, `ring_values`.
 Guarantees: a complete graph, a ring and a star cost no more than their arcs; an eigenvalue that equal row
 sums make exact is exact, any other comes with a bound on its error.
-Does not: know what is sent, or when (see `schedule`).
+Does not: know what is sent, or when (see `scheduling`).
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.frame.discretize import UNIT, discretize
-from apc.runtime.frame.linearize import LinearSite, magnitudes
 from apc.runtime.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
+from apc.runtime.frame.site import LinearSite, magnitudes
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]

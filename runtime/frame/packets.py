@@ -4,7 +4,7 @@ Takes: a link's `Channel` with its numbers, a seed, the two peers of a way.
 Gives: `ChannelLaw`, `channel_law`; `PacketSource`, its delays; `Listener`, what is heard; `nominal_notes`.
 Guarantees: equal seeds give equal packets, in any order of the ways, whoever else is there, however time is
 cut into pieces, with every version of NumPy; every way from peer to peer is independent of the others;
-without loss and jitter a tick sees the packet that `schedule` says.
+without loss and jitter a tick sees the packet that `scheduling` says.
 Does not: know what is in a packet, or move anything.
 
 Each packet of a way uses up `WORDS` random words, whatever the channel: the change of state after it, its
@@ -93,7 +93,7 @@ def channel_law(system: CompiledSystem, link: Link, delay: Fraction) -> ChannelL
     Parameters
     ----------
     system
-        The compiled scene, with the numbers to use (see `parameters.apply`).
+        The compiled scene, with the numbers to use (see `overrides.apply`).
     link
         A link of it that has a channel.
     delay

@@ -73,7 +73,7 @@ class Timetable:
         Parameters
         ----------
         system
-            The compiled scene, with the numbers to use (see `parameters.apply`).
+            The compiled scene, with the numbers to use (see `overrides.apply`).
         timings
             Seconds by the name of the timing.
         exchange

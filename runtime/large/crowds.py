@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.frame.batch_lift import CHUNK, LiftedRows, lift_rows
 from apc.runtime.frame.discretize import UNIT
+from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.lift import LiftedSite, lift
-from apc.runtime.frame.linearize import SiteJacobians, linearize_rows, site_of_row
+from apc.runtime.frame.linearize import linearize_rows, site_of_row
 from apc.runtime.frame.parameters import Numbers
 from apc.runtime.frame.schedule import Schedule
 from apc.runtime.large.transfer import StateSpace

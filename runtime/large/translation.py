@@ -25,9 +25,10 @@ from apc.runtime.eigen.peers import PeerGroup, group_of_row, states_of, used_way
 from apc.runtime.eigen.rigid import find_rigid_modes, stays_rigid
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.linearize import LinearSite, site_of_entries
+from apc.runtime.frame.linearize import site_of_entries
 from apc.runtime.frame.residues import PRIMES, Residues, residues_of
 from apc.runtime.frame.schedule import Way
+from apc.runtime.frame.site import LinearSite
 from apc.runtime.large.crowds import Crowd
 
 Floats = NDArray[np.float64]

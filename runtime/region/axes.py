@@ -14,7 +14,7 @@ from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.parameters import unit_of
+from apc.runtime.frame.names import unit_of
 from apc.runtime.sweep.grid import parse_axis
 
 PLACE = Place("region")

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.runtime.frame.parameters import Override, apply, find, unit_of
+from apc.runtime.frame.names import find, unit_of
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.region.passivity import CONDITIONS, MEANINGS, UNITS, PublishedCondition
 
 Floats = NDArray[np.float64]

@@ -19,8 +19,10 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.linearize import jacobians, linearize_rows, site_of_row
-from apc.runtime.frame.parameters import Override, apply, parse_override, resolve
+from apc.runtime.frame.jacobians import jacobians
+from apc.runtime.frame.linearize import linearize_rows, site_of_row
+from apc.runtime.frame.overrides import Override, apply, parse_override
+from apc.runtime.frame.parameters import resolve
 from apc.runtime.region.axes import PLACE, RegionAxis, parse_axes
 from apc.runtime.region.overlay import Overlay, overlay_points, parse_overlay
 from apc.runtime.region.region import CELLS, Floats, Region, region

@@ -23,7 +23,8 @@ from apc.compiler.errors import ApcError, Mistake
 from apc.runtime.analysis.analysis import Prepared, analyze, prepare
 from apc.runtime.eigen.rigid import find_rigid_modes, relative_coordinates
 from apc.runtime.eigen.spectrum import angle_in_frame
-from apc.runtime.frame.parameters import Free, Override, apply
+from apc.runtime.frame.names import Free
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.region.axes import PLACE, RegionAxis
 from apc.runtime.region.boundary import Arc, relative_to, trace
 from apc.runtime.region.cells import Survey, survey

@@ -5,7 +5,7 @@ Gives: `PairFunction`, `pair_function`, `Pairwise`; `Pairs`, their part of the f
 `count_pairs`.
 Guarantees: one evaluation a pair of peers that hear each other, by one function for all of them; a sender is
 heard by the packet that the schedule or the timetable says, as in a plain sum.
-Does not: say when anything is sent or heard (see `schedule`), or keep packets (see `population`).
+Does not: say when anything is sent or heard (see `scheduling`), or keep packets (see `population`).
 
     r_i = op_j e(x_i, u_i, m_i, s_ij, p_i, t)
 """
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.runtime.frame.exchange import Exchange, check_mean
 from apc.runtime.frame.gathering import Gathering, Listeners
-from apc.runtime.frame.linearize import edge_name
+from apc.runtime.frame.jacobians import edge_name
 from apc.runtime.frame.schedule import Heard
 
 Floats = NDArray[np.float64]

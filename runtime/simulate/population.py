@@ -28,8 +28,9 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import Exchange, check_mean
 from apc.runtime.frame.gathering import Gate, Gathering
-from apc.runtime.frame.linearize import SiteJacobians, start_sends, start_values
+from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.schedule import Heard, Propagate, Schedule, Sent, Tick
+from apc.runtime.frame.start import start_sends, start_values
 from apc.runtime.simulate.pairs import Pairs
 from apc.runtime.simulate.program import Program, Segment, seconds_at
 from apc.runtime.simulate.propagate import Transitions

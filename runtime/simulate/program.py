@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
-from apc.runtime.frame.linearize import edge_name
+from apc.runtime.frame.jacobians import edge_name
 from apc.runtime.frame.schedule import Act, Event, Propagate, Schedule, Send, Sent, Tick, Value
 from apc.runtime.simulate.flow import Flow
 from apc.runtime.simulate.pairs import PairFunction, Pairwise, pair_function

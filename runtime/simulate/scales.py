@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.runtime.frame.linearize import SiteJacobians, start_values
+from apc.runtime.frame.jacobians import SiteJacobians
+from apc.runtime.frame.start import start_values
 
 Floats = NDArray[np.float64]
 

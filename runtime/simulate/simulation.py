@@ -19,9 +19,10 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import Exchange, build_exchange
 from apc.runtime.frame.gathering import Gate, build_gates, kept_links
-from apc.runtime.frame.linearize import SiteJacobians, jacobians
+from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.parameters import Numbers, resolve
-from apc.runtime.frame.schedule import Propagate, Schedule, build_schedules
+from apc.runtime.frame.schedule import Propagate, Schedule
+from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.frame.timetable import routes_of
 from apc.runtime.simulate.flow import Flow, Tolerance, flow_of, rows_to_move
 from apc.runtime.simulate.forcing import SiteForcing, forcing_of, site_forcing

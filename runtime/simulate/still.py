@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.runtime.frame.guards import guards_of
-from apc.runtime.frame.linearize import jacobians, start_values
+from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.parameters import resolve
+from apc.runtime.frame.start import start_values
 from apc.runtime.simulate.figures import check_format, write_figure
 from apc.runtime.simulate.trajectory import need
 

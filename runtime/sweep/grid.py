@@ -17,7 +17,8 @@ from fractions import Fraction
 
 from apc.compiler.compiled import PEERS, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.parameters import Override, apply, find, unit_of
+from apc.runtime.frame.names import find, unit_of
+from apc.runtime.frame.overrides import Override, apply
 
 PLACE = Place("sweep")
 

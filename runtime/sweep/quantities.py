@@ -17,7 +17,7 @@ from typing import Literal
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.runtime.analysis.analysis import analyze, prepare
-from apc.runtime.frame.parameters import find, unit_of
+from apc.runtime.frame.names import find, unit_of
 
 PLACE = Place("sweep")
 

@@ -21,7 +21,7 @@ from apc.compiler import store
 from apc.compiler.cache import program_digest
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.parameters import apply
+from apc.runtime.frame.overrides import apply
 from apc.runtime.sweep.grid import Grid
 from apc.runtime.sweep.quantities import Quantity, Row, faulty, find_quantity
 from apc.runtime.threads import single_threaded

@@ -27,17 +27,13 @@ from apc.runtime.eigen.peers import PeerGroup
 from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
+from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.lift import lift
-from apc.runtime.frame.linearize import (
-    LinearSite,
-    SiteJacobians,
-    linearize_exact,
-    linearize_rows,
-    site_of_row,
-    sites_of_rows,
-)
-from apc.runtime.frame.parameters import Free, free_rows, parameter_of
+from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
+from apc.runtime.frame.names import Free, parameter_of
+from apc.runtime.frame.rows import free_rows
 from apc.runtime.frame.schedule import Propagate
+from apc.runtime.frame.site import LinearSite
 from apc.runtime.vary.wiring import (
     Lifted,
     Wiring,

@@ -19,7 +19,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
 from apc.runtime.analysis.analysis import Prepared, prepare
-from apc.runtime.frame.parameters import Free, find, parameter_of, unit_of
+from apc.runtime.frame.names import Free, find, parameter_of, unit_of
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.crossings import CELL
@@ -100,7 +100,7 @@ def critical(
     system
         The compiled scene; all other parameters keep its values.
     name
-        The parameter or delay, of one group or of all (see `parameters.find`).
+        The parameter or delay, of one group or of all (see `names.find`).
     lower, upper
         Quantities between which to look, such as "5000 N/m". Without `lower`, from the least value allowed,
         or 0; without `upper`, up to `SPAN` times the present value (of a delay, over `PIECES` pieces).

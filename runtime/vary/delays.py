@@ -19,8 +19,12 @@ from fractions import Fraction
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.analysis.analysis import Prepared, lifted_groups
-from apc.runtime.frame.parameters import Free, Override, apply, resolve
-from apc.runtime.frame.schedule import Propagate, Schedule, build_schedules, common_divisor
+from apc.runtime.frame.hyperperiod import common_divisor
+from apc.runtime.frame.names import Free
+from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.frame.parameters import resolve
+from apc.runtime.frame.schedule import Propagate, Schedule
+from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
 
 # Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal

@@ -20,7 +20,8 @@ from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.runtime.eigen.modes import ClosedSystem, split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
-from apc.runtime.frame.parameters import Free, Override, apply, parameter_of
+from apc.runtime.frame.names import Free, parameter_of
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
 
 Floats = NDArray[np.float64]

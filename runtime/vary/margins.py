@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
-from apc.runtime.frame.parameters import Free, parameter_of
+from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.batch import BatchEvaluator

@@ -26,7 +26,7 @@ from apc.runtime.analysis.analysis import Prepared, lifted_groups
 from apc.runtime.eigen.modes import ClosedSystem, split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes
 from apc.runtime.eigen.spectrum import angle_in_frame
-from apc.runtime.frame.parameters import Free, parameter_of
+from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.bracket import Bracket, bracket
 from apc.runtime.vary.crossings import Root, Scan, eigenvalues, scan

@@ -23,7 +23,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import with_unit, wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
 from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.parameters import Free, parameter_of
+from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.batch import BatchEvaluator, Evaluator, matrix_errors

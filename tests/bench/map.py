@@ -20,7 +20,7 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import Prepared, analyze, prepare
 from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.threads import single_threaded
 from tests.bruteforce import Scene, frame_matrix
 from tests.topologies import AVERAGE, MESH, compiled

@@ -23,7 +23,7 @@ from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Analysis, analyze
 from apc.runtime.bench.reference import RIGID, classes_of, eigenvalues, frame_matrices
 from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.parameters import Override, apply
+from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.threads import single_threaded
 from tests.topologies import compiled
 

@@ -15,7 +15,8 @@ from typing import TypeVar
 import numpy as np
 
 from apc.runtime.analysis.analysis import prepare
-from apc.runtime.frame.parameters import Free, apply, parse_override
+from apc.runtime.frame.names import Free
+from apc.runtime.frame.overrides import apply, parse_override
 from apc.runtime.region.axes import parse_axes
 from apc.runtime.region.boundary import relative_to
 from apc.runtime.region.curves import between

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.store import save
-from apc.runtime.frame.parameters import apply
+from apc.runtime.frame.overrides import apply
 from apc.runtime.sweep.grid import build_grid, parse_axis
 from apc.runtime.sweep.quantities import find_quantity
 from apc.runtime.sweep.sweep import PART_POINTS

@@ -1,0 +1,115 @@
+"""Exact time: the quantum that all times are multiples of, and the hyperperiod of the clocks, the frame.
+
+Takes: a `CompiledSystem`, its timings as exact rationals, what matters of its kinds.
+Gives: `Times`, `Grid`, `times_in_use`; `common_divisor`.
+Guarantees: every period, phase and delay in use is a whole number of quanta; what nobody uses takes no part.
+Does not: say what happens at an instant (see `scheduling`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from apc.compiler.compiled import Clock, CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.frame.hearing import Ears
+from apc.runtime.frame.liveness import live_holds
+from apc.runtime.frame.site import LinearSite
+
+MOST_TICKS = 20_000  # in a frame: each is a step of the lifting
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A clock in quanta: ticks at phase + k*period for every integer k, 0 <= phase < period."""
+
+    phase: int
+    period: int
+
+    def at(self, index: int) -> int:
+        return self.phase + index * self.period
+
+    def newest(self, limit: int, *, strictly: bool = False) -> int:
+        """Return the index of the last tick at or (strictly) before `limit`."""
+        index = (limit - self.phase) // self.period
+        return index - 1 if strictly and self.at(index) == limit else index
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """Every time of the system in quanta."""
+
+    quantum: Fraction
+    frame: int
+    clocks: Mapping[str, Grid]
+    delays: Mapping[str, int]
+
+
+def times_in_use(
+    system: CompiledSystem,
+    timings: Mapping[str, Fraction],
+    patterns: Sequence[LinearSite],
+    live: Sequence[frozenset[tuple[int, int]]],
+    ears: Sequence[Ears],
+) -> Times:
+    """Find the quantum of which every period, phase and delay in use is a multiple, and the frame."""
+    clock_of = {clock.name: clock for clock in system.clocks}
+    link_of = {link.name: link for link in system.links}
+    clocks: dict[str, Clock] = {}
+    delays: dict[str, Fraction] = {}
+    for pattern, outputs in zip(patterns, live, strict=True):
+        for partition, _ in outputs:
+            name = pattern.kind.clocks[partition].clock
+            clocks[name] = clock_of[name]
+        for hold, used in zip(pattern.kind.holds, live_holds(pattern, outputs), strict=True):
+            if used:
+                delays[hold.delay] = timings[hold.delay]
+    for way, _ in (pair for own in ears for partition in own for receive in partition for pair in receive):
+        clock = link_of[way.link].clock
+        clocks[clock] = clock_of[clock]
+        delays[way.delay] = timings[way.delay]
+    if not clocks:  # nothing is sampled: any frame will do
+        clocks = dict(clock_of) or {"": Clock("", "", "")}
+    period = {name: timings[clock.period] if name else Fraction(1) for name, clock in clocks.items()}
+    phase = {
+        name: timings[clock.phase] % period[name] if name else Fraction(0) for name, clock in clocks.items()
+    }
+    quantum = common_divisor([*period.values(), *phase.values(), *delays.values()])
+    count = {name: int(value / quantum) for name, value in period.items()}
+    frame = math.lcm(*count.values())
+    _check_frame_length(system, period, count, frame, quantum)
+    return Times(
+        quantum=quantum,
+        frame=frame,
+        clocks={name: Grid(int(phase[name] / quantum), count[name]) for name in clocks},
+        delays={name: int(value / quantum) for name, value in delays.items()},
+    )
+
+
+def _check_frame_length(
+    system: CompiledSystem,
+    period: Mapping[str, Fraction],
+    count: Mapping[str, int],
+    frame: int,
+    quantum: Fraction,
+) -> None:
+    """Refuse clocks that stand as before only after too many ticks to step through."""
+    ticks = sum(frame // number for number in count.values())
+    if ticks > MOST_TICKS:
+        clocks = ", ".join(f"{name} {float(value) * 1e3:.9g} ms" for name, value in period.items() if name)
+        what = (
+            f"all clocks stand as before only after {float(frame * quantum):.6g} s and {ticks} ticks "
+            f"({clocks}); at most {MOST_TICKS} can be analysed"
+        )
+        hint = "periods that are simple multiples of one another"
+        raise ApcError(Mistake("E805", Place(system.name), what, hint=hint))
+
+
+def common_divisor(times: Iterable[Fraction]) -> Fraction:
+    """Return the largest rational of which every time is a whole multiple."""
+    listed = list(times)
+    denominator = math.lcm(*(time.denominator for time in listed))
+    return Fraction(math.gcd(*(int(time * denominator) for time in listed)), denominator)

@@ -1,0 +1,188 @@
+"""The Jacobians of a kind, as one CasADi function of everything they may depend on.
+
+Takes: a kind of a `CompiledSystem`.
+Gives: `SiteJacobians` (built once a kind), `jacobians`; `Edge`, `edge_name`.
+Guarantees: structural patterns come from CasADi, whatever the numbers; a kind that is called affine has the
+same Jacobians everywhere.
+Does not: evaluate them (see `linearize`).
+
+A receive over an edge function, r = op_j e(x, u, m, s_j), is linear in what the site hears and in its own x,
+u and m: its own part, ∂r/∂x and so on, is part of the tick's X, U and M; ∂e/∂s weighs what it hears (see
+`modes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+
+from apc.compiler.compiled import ClockPartition, Kind, Receive
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.frame.guards import guards_of
+from apc.runtime.frame.site import LinearSite, Matrix, assemble, with_own_parts
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """What a receive does with one sender: its edge function with its slopes.
+
+    `function(x, u, m, s, p, t)` is a column: the value, then the slopes over x, u, m and s. `affine` says
+    that these hold everywhere.
+    """
+
+    function: Any  # casadi.Function
+    affine: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SiteJacobians:
+    """The Jacobians of a kind as one CasADi function of (x, u, m, r, p, t); m and r of all clocks in a row.
+
+    The function's one output is every matrix of a `LinearSite`, in order, column-major; `shapes` cuts it.
+    `edges` are those of its receives by (clock partition, receive).
+    """
+
+    kind: Kind
+    function: Any  # casadi.Function
+    shapes: tuple[tuple[int, int], ...]
+    pattern: LinearSite
+    affine: bool
+    edges: Mapping[tuple[int, int], Edge]
+
+    @property
+    def walkable(self) -> bool:
+        """Whether the function is a list of scalar operations; one with a Newton solver inside isn't."""
+        return bool(self.function.is_a("SXFunction"))
+
+
+def jacobians(kind: Kind) -> SiteJacobians:
+    """Build a kind's Jacobian functions; do it once and keep the result, `linearize` is then cheap.
+
+    Raises
+    ------
+    ApcError
+        E807 a nonlinear loop in a kind that also looks at each sender by itself.
+    """
+    _refuse_loop_with_edges(kind)
+    # A kind with a nonlinear loop has MX functions; their Jacobians come by the implicit function theorem.
+    plain = kind.derivative.is_a("SXFunction")
+    symbol: Any = casadi.SX.sym if plain else casadi.MX.sym
+    x, u = symbol("x", len(kind.states)), symbol("u", len(kind.holds))
+    p, t = symbol("p", len(kind.parameters)), symbol("t")
+    memories = [symbol("m", len(partition.memories)) for partition in kind.clocks]
+    heard = [symbol("r", len(partition.receives)) for partition in kind.clocks]
+
+    derivative = kind.derivative(x, u, p, t)
+    values = [derivative]
+    blocks = [casadi.jacobian(derivative, x), casadi.jacobian(derivative, u)]
+    for partition, m, r in zip(kind.clocks, memories, heard, strict=True):
+        outputs = partition.tick(x, u, m, r, p, t)
+        values.append(outputs)
+        blocks += [casadi.jacobian(outputs, of) for of in (x, u, m, r)]
+    for sending in kind.sends:
+        sent = sending.send(x, u, p, t)
+        values.append(sent)
+        blocks += [casadi.jacobian(sent, of) for of in (x, u)]
+
+    m_all, r_all = casadi.vertcat(*memories), casadi.vertcat(*heard)
+    flat = casadi.vertcat(*(casadi.vec(casadi.densify(block)) for block in blocks))
+    moving = casadi.vertcat(x, u, m_all, r_all, t)
+    edges = {
+        (p, place): _edge(kind, partition, receive)
+        for p, partition in enumerate(kind.clocks)
+        for place, receive in enumerate(partition.receives)
+        if edge_name(partition, receive)
+    }
+    inside = casadi.vertcat(x, u, m_all, r_all)
+    affine = (
+        plain
+        and not (flat.numel() and casadi.depends_on(flat, moving))
+        # A force that jumps has the same slopes on either side.
+        and not guards_of(casadi.vertcat(*values), inside)
+        and all(edge.affine for edge in edges.values())
+    )
+    listening = [_listening(kind, p, edges) for p in range(len(kind.clocks))]
+    pattern = assemble(kind, affine, [_pattern(block) for block in blocks], [heard for _, heard in listening])
+    own = [parts for parts, _ in listening]
+    return SiteJacobians(
+        kind=kind,
+        function=casadi.Function("jacobians", [x, u, m_all, r_all, p, t], [flat]),
+        shapes=tuple((int(block.size1()), int(block.size2())) for block in blocks),
+        pattern=with_own_parts(pattern, own, np.logical_or, lambda a, b: a[:, None] & b[None, :]),
+        affine=affine,
+        edges=edges,
+    )
+
+
+def edge_name(partition: ClockPartition, receive: Receive) -> str:
+    """Return the name of a receive that looks at every sender by itself, "" for a plain sum or mean."""
+    plain = receive.edge is None and receive.operator in ("sum", "mean")
+    return "" if plain else f"{partition.clock}: {receive.name}"
+
+
+def _refuse_loop_with_edges(kind: Kind) -> None:
+    """Refuse what neither the scalar walk nor the implicit function theorem covers yet."""
+    functions = [kind.derivative, *(one.tick for one in kind.clocks), *(one.send for one in kind.sends)]
+    receives = [receive for partition in kind.clocks for receive in partition.receives]
+    edges = [receive.edge for receive in receives if receive.edge is not None]
+    if edges and not all(function.is_a("SXFunction") for function in (*functions, *edges)):
+        what = (
+            "has a nonlinear loop and a reduction that looks at each sender by itself; "
+            "together they can't be linearized"
+        )
+        raise ApcError(Mistake("E807", Place(kind.name), what))
+
+
+def _edge(kind: Kind, partition: ClockPartition, receive: Receive) -> Edge:
+    """Build a receive's edge function with its slopes; without one, it is the channel itself."""
+    symbol = casadi.SX.sym
+    channels = next(
+        (len(one.channels) for one in kind.sends if one.link == receive.link), receive.channel + 1
+    )
+    x, u, m = (
+        symbol("x", len(kind.states)),
+        symbol("u", len(kind.holds)),
+        symbol("m", len(partition.memories)),
+    )
+    s = symbol("s", receive.edge.numel_in(3) if receive.edge is not None else channels)
+    p, t = symbol("p", len(kind.parameters)), symbol("t")
+    value = s[receive.channel] if receive.edge is None else receive.edge(x, u, m, s, p, t)
+    slopes = casadi.densify(casadi.jacobian(value, casadi.vertcat(x, u, m, s)).T)
+    smooth = receive.operator in ("sum", "mean") and not guards_of(value, casadi.vertcat(x, u, m, s))
+    moves = casadi.depends_on(slopes, casadi.vertcat(x, u, m, s, t)) if slopes.numel() else False
+    function = casadi.Function("edge", [x, u, m, s, p, t], [casadi.vertcat(casadi.densify(value), slopes)])
+    return Edge(function, smooth and not moves)
+
+
+def _listening(
+    kind: Kind, p: int, edges: Mapping[tuple[int, int], Edge]
+) -> tuple[list[Matrix | None], tuple[tuple[int, ...], ...]]:
+    """Return, for each receive of a partition, the pattern of its own part and the channels it depends on."""
+    partition = kind.clocks[p]
+    inside = len(kind.states) + len(kind.holds) + len(partition.memories)
+    own: list[Matrix | None] = []
+    channels: list[tuple[int, ...]] = []
+    for place, receive in enumerate(partition.receives):
+        if (p, place) not in edges:
+            own.append(None)
+            channels.append((receive.channel,))
+            continue
+        function = edges[p, place].function
+        symbols = function.sx_in()
+        moving = casadi.vertcat(*symbols[:4])
+        depends = _pattern(casadi.jacobian(function(*symbols)[0], moving))[0]
+        own.append(depends[:inside])
+        channels.append(tuple(np.flatnonzero(depends[inside:]).tolist()))
+    return own, tuple(channels)
+
+
+def _pattern(block: Any) -> Matrix:
+    """Return the structural nonzeros of a CasADi matrix as truth values."""
+    pattern = np.zeros((block.size1(), block.size2()), dtype=bool)
+    rows, columns = block.sparsity().get_triplet()
+    pattern[rows, columns] = True
+    return pattern

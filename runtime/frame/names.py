@@ -1,0 +1,77 @@
+"""What a person calls a parameter or a timing, and what stands behind the name.
+
+Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
+Gives: `Free`, `find`, `parameter_of`, `unit_of`.
+Guarantees: a name that means nothing raises, with the nearest real one.
+Does not: read or change values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from apc.compiler.compiled import PEERS, CompiledSystem, Parameter
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+
+# The sections of a topology, which a name may start with.
+SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
+
+# Where a mistake in an override stands, when it came from no line of a file.
+OVERRIDE = Place("override")
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """A parameter or timing whose value is left open: of one group, or of all (`group` None)."""
+
+    name: str
+    group: str | None = None
+
+    @property
+    def label(self) -> str:
+        """The name as a person writes it, its group before it."""
+        return self.name if self.group is None else f"{self.group}.{self.name}"
+
+
+def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[str, str | None]:
+    """Return the parameter or timing a person's name means, and the group it names, if any.
+
+    Raises
+    ------
+    ApcError
+        E622 no such parameter, E623 the number of peers.
+    """
+    known = {parameter.name for parameter in system.parameters} | {timing.name for timing in system.timings}
+    groups = {group.name for group in system.groups}
+    first, _, rest = name.partition(".")
+    if first in SECTIONS and name not in known:
+        name = rest
+    first, _, rest = name.partition(".")
+    group = None
+    if name not in known and first in groups and rest in {parameter.name for parameter in system.parameters}:
+        name, group = rest, first
+    if name == PEERS:
+        raise ApcError(
+            Mistake("E623", place, "peers is the number of peers: change a count and compile again")
+        )
+    if name not in known:
+        near = nearest(name, sorted(known - {PEERS}))
+        raise ApcError(Mistake("E622", place, f"{name[:80]} is no parameter of {system.name}", hint=near))
+    return name, group
+
+
+def parameter_of(system: CompiledSystem, free: Free) -> Parameter:
+    """Return a free parameter as its group has it, or everybody."""
+    for group in system.groups:
+        for parameter in group.values:
+            if group.name == free.group and parameter.name == free.name:
+                return parameter
+    return next(parameter for parameter in system.parameters if parameter.name == free.name)
+
+
+def unit_of(system: CompiledSystem, name: str) -> str:
+    """Return the unit a parameter or timing wants."""
+    for parameter in system.parameters:
+        if parameter.name == name:
+            return parameter.unit
+    return "s"

@@ -1,0 +1,215 @@
+"""Parameter vectors for many at once: the different peers of a group, or many values of some parameters.
+
+Takes: a `CompiledSystem`, a group of it, and values of `Free` parameters.
+Gives: `Columns`, `different_rows`, `free_rows`.
+Guarantees: what depends on a value by an expression is worked out with it, in floats, in a time that grows
+with the number of values; what none reaches keeps the very number it was compiled with. Complex values are
+complex steps: the imaginary part is a derivative.
+Does not: check bounds; change what everybody shares (`overrides`, in exact rationals).
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem, Group, Parameter
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.frame.names import OVERRIDE, Free
+
+Floats = NDArray[np.float64]
+
+# The language's operators and functions of a parameter, over the values of all peers at once.
+_OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": np.true_divide,
+    "^": lambda base, exponent: _power(base, exponent),
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+}
+
+_EXTREMES: dict[str, Callable[[Any, Any], Any]] = {"max": np.maximum, "min": np.minimum}
+
+_FUNCTIONS: dict[str, Callable[[Any], Any]] = {
+    # Of a complex step, the imaginary part is a derivative and follows the real part.
+    "abs": lambda value: np.where(np.real(value) < 0, -value, value),
+    "sign": lambda value: np.sign(np.real(value)),
+    "floor": lambda value: np.floor(np.real(value)),
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tanh": np.tanh,
+}
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    """Return base^exponent; of a complex step, with the derivative as imaginary part."""
+    value = np.float_power(np.real(base), np.real(exponent))
+    if not (np.iscomplexobj(base) or np.iscomplexobj(exponent)):
+        return value
+    b, e = np.real(base), np.real(exponent)
+    slope = e * np.float_power(b, e - 1) * np.imag(base)
+    growing = np.imag(exponent)
+    if np.any(growing):
+        slope = slope + value * np.log(b) * growing
+    return value + 1j * slope
+
+
+class Columns:
+    """The parameters of one group that differ from peer to peer, given or by an expression."""
+
+    def __init__(self, system: CompiledSystem, group: Group, holder: Mapping[str, Parameter]) -> None:
+        self._group = group.name
+        self._holder = holder
+        self._timings = {timing.name: float(timing.value) for timing in system.timings}
+        self._given = bool(group.columns)
+        self._found: dict[str, Floats | None] = {column.name: column.values for column in group.columns}
+
+    def of(self, name: str) -> Floats | None:
+        """Return a parameter's values (count,), or None when all peers share one."""
+        if name not in self._found:
+            expression = self._holder[name].expression if name in self._holder else None
+            self._found[name] = self._evaluated(name, expression) if expression and self._given else None
+        return self._found[name]
+
+    def _evaluated(self, name: str, text: str) -> Floats | None:
+        from apc.compiler.expression import names
+        from apc.compiler.grammar import parse_expression
+
+        tree = parse_expression(text, Place(name, 1, 1, text))
+        if all(self.of(".".join(node.parts)) is None for node in names(tree)):
+            return None
+        with np.errstate(all="ignore"):
+            values = np.asarray(_evaluate_rows(tree, self._look_up), dtype=np.float64)
+        wrong = np.flatnonzero(~np.isfinite(values))
+        if len(wrong):
+            peer = f"{self._group}[{int(wrong[0]) + 1}]"
+            raise ApcError(Mistake("E331", OVERRIDE, f"{name} = {text[:80]} has no finite value for {peer}"))
+        return values
+
+    def _look_up(self, parts: tuple[str, ...]) -> Any:
+        name = ".".join(parts)
+        column = self.of(name)
+        if column is not None:
+            return column
+        return self._holder[name].value if name in self._holder else self._timings[name]
+
+
+def different_rows(system: CompiledSystem, group: Group) -> tuple[Floats, NDArray[np.int64]]:
+    """Return a group's different parameter rows (k, n_p) and which of them each peer has (count,)."""
+    names = system.kinds[group.kind].parameters
+    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    common = np.array([[holder[name].value for name in names]], dtype=np.float64).reshape(1, -1)
+    columns = Columns(system, group, holder)
+    varying = {place: column for place, name in enumerate(names) if (column := columns.of(name)) is not None}
+    if not varying:
+        # A view of one zero: a million equal peers take no memory.
+        return common, np.broadcast_to(np.int64(0), (group.count,))
+    table = np.stack(list(varying.values()), axis=1) + 0.0  # −0 and 0 are one number
+    known: dict[bytes, int] = {}
+    rows = np.array([known.setdefault(row.tobytes(), len(known)) for row in table], dtype=np.int64)
+    first = np.zeros(len(known), dtype=np.int64)
+    first[rows[::-1]] = np.arange(len(rows))[::-1]
+    parameters = np.repeat(common, len(known), axis=0)
+    parameters[:, list(varying)] = table[first]
+    return parameters, rows
+
+
+def free_rows(
+    system: CompiledSystem, group: Group, peer: int, values: Mapping[Free, NDArray[Any]]
+) -> NDArray[Any]:
+    """Return a peer's parameter vector for many values of some parameters, what depends on them included.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    group, peer
+        The peer: its group, and its number in it, from 0.
+    values
+        Values (k,) of each free parameter, as `apply` would set them; complex ones are complex steps, whose
+        imaginary part comes out as the derivative.
+
+    Returns
+    -------
+    The vectors (k, n_p), or (1, n_p) when none of the values reaches this peer.
+    """
+    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    columns = Columns(system, group, holder)
+    given = {column.name for column in group.columns}
+    known: dict[str, Any] = {free.name: value for free, value in values.items() if free.group is None}
+    known |= {free.name: value for free, value in values.items() if free.group == group.name}
+    timings = {timing.name: float(timing.value) for timing in system.timings}
+
+    def value_of(name: str) -> Any:
+        if name not in known:
+            known[name] = evaluated(name)
+        return known[name]
+
+    def evaluated(name: str) -> Any:
+        parameter = holder.get(name)
+        if parameter is None:
+            return timings[name]
+        if parameter.expression and name not in given:
+            from apc.compiler.expression import names
+            from apc.compiler.grammar import parse_expression
+
+            tree = parse_expression(parameter.expression, Place(name, 1, 1, parameter.expression))
+            reached = [value_of(".".join(node.parts)) for node in names(tree)]
+            if any(np.ndim(one) for one in reached):
+                with np.errstate(all="ignore"):
+                    return _evaluate_rows(tree, lambda parts: value_of(".".join(parts)))
+        column = columns.of(name)
+        return parameter.value if column is None else float(column[peer])
+
+    listed = [value_of(name) for name in system.kinds[group.kind].parameters]
+    count = max((len(one) for one in listed if np.ndim(one)), default=1)
+    dtype = np.result_type(np.float64, *(one.dtype for one in listed if np.ndim(one)))
+    rows = np.empty((count, len(listed)), dtype=dtype)
+    for place, one in enumerate(listed):
+        rows[:, place] = one
+    return rows
+
+
+def _evaluate_rows(expr: Any, lookup: Callable[[tuple[str, ...]], Any]) -> Any:
+    """Return an expression's value for all peers at once, in floats (or truth values)."""
+    from apc.compiler.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not, Number
+
+    def value(node: Any) -> Any:
+        match node:
+            case Number():
+                return float(node.value)
+            case Name():
+                return lookup(node.parts)
+            case Negate():
+                return -value(node.operand)
+            case Binary() | Compare():
+                return _OPERATORS[node.operator](value(node.left), value(node.right))
+            case Logic():
+                join = np.logical_and if node.operator == "and" else np.logical_or
+                return join(value(node.left), value(node.right))
+            case Not():
+                return np.logical_not(value(node.operand))
+            case Conditional():
+                return np.where(value(node.condition), value(node.then), value(node.otherwise))
+            case Call():
+                arguments = [value(argument) for argument in node.arguments]
+                if node.function in _EXTREMES:
+                    return functools.reduce(_EXTREMES[node.function], arguments)
+                return _FUNCTIONS[node.function](*arguments)
+        raise AssertionError(f"no such expression: {node!r}")
+
+    return value(expr)

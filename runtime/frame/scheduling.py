@@ -1,0 +1,332 @@
+"""When what happens in one frame, in what order, and what must be remembered from frame to frame.
+
+Takes: a `CompiledSystem`, its timings as exact rationals, the structural patterns of its kinds.
+Gives: `build_schedules`.
+Guarantees: the state at the start of a frame is what is demanded and nothing else: a hold that acts at once
+adds none, a link adds a sender's packets that are still to be heard.
+Does not: look at numbers other than times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.frame.exchange import Exchange, build_exchange
+from apc.runtime.frame.hearing import Ears, ears_of
+from apc.runtime.frame.hyperperiod import Grid, Times, times_in_use
+from apc.runtime.frame.liveness import live_holds, live_outputs, live_receives
+from apc.runtime.frame.schedule import (
+    ORDER,
+    Act,
+    Event,
+    Heard,
+    Kept,
+    Propagate,
+    Schedule,
+    Send,
+    Sent,
+    Tick,
+    Value,
+    Way,
+)
+from apc.runtime.frame.site import LinearSite
+
+MOST_PACKETS = 100_000  # of one peer: each has a name
+
+# What happens when: the instant, the rank of its like among what happens at once, and itself; None only stops
+# the propagation there.
+_Happening = tuple[int, int, Event | None]
+
+
+def build_schedules(
+    system: CompiledSystem,
+    timings: Mapping[str, Fraction],
+    patterns: Sequence[LinearSite],
+    *,
+    order: Sequence[str] = ORDER,
+    kept: Mapping[str, Kept] | None = None,
+) -> tuple[Schedule, ...]:
+    """Build the schedule of every group, over the frame they share; equal ones are one object.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    timings
+        Seconds by the name of the timing.
+    patterns
+        The structural pattern of each kind (`SiteJacobians.pattern`).
+    order
+        The order of coincident events, a permutation of `ORDER`. With "act" before "tick", a value that acts
+        at once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and
+        "tick" before "deliver" for a packet that arrives exactly at a tick.
+    kept
+        The links whose packets get lost or come late, by name: all that is sent over them is kept, and each
+        tick hears it in rows of its own. None: every link is as reliable as its delay says.
+
+    Raises
+    ------
+    ApcError
+        E801 a mean, maximum or minimum over nobody; E805 too many ticks or packets in a frame.
+    """
+    assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
+    rank = {name: place for place, name in enumerate(order)}
+    kept = kept or {}
+    exchange = build_exchange(system, timings)
+    live = [live_outputs(pattern) for pattern in patterns]
+    read = [live_receives(pattern, outputs) for pattern, outputs in zip(patterns, live, strict=True)]
+    ears = [ears_of(system, patterns, exchange, group, read) for group in range(len(system.groups))]
+    times = times_in_use(system, timings, patterns, live, ears)
+
+    known: dict[tuple[int, Ears], dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]] = {}
+    depth: dict[Sent, int] = {}
+    for group, own in zip(system.groups, ears, strict=True):
+        if (group.kind, own) not in known:
+            heard = _heard_at_ticks(patterns[group.kind], exchange, live[group.kind], own, times, rank, kept)
+            known[group.kind, own] = heard
+            for one in (one for row in heard.values() for receive in row for one in receive):
+                link = one.sent.link
+                if link in kept:
+                    slots = times.frame // times.clocks[exchange.links[link].clock].period
+                    depth |= {Sent(link, one.sent.channel, k): kept[link].frames for k in range(slots)}
+                else:
+                    depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
+    _check_depth(system, depth)
+    built = {
+        (kind, own): _build(patterns[kind], system, live[kind], heard, depth, times, rank)
+        for (kind, own), heard in known.items()
+    }
+    return tuple(built[group.kind, own] for group, own in zip(system.groups, ears, strict=True))
+
+
+def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
+    """Refuse delays so long that nobody can have meant them."""
+    packets = sum(depth.values())
+    if packets > MOST_PACKETS:
+        links = ", ".join(sorted({sent.link for sent in depth}))
+        what = (
+            f"with these delays each peer keeps {packets:,} numbers on their way over {links}; "
+            f"at most {MOST_PACKETS:,} can be named"
+        )
+        raise ApcError(
+            Mistake("E805", Place(system.name), what, hint="a shorter delay, or a slower link clock")
+        )
+
+
+def _heard_at_ticks(
+    pattern: LinearSite,
+    exchange: Exchange,
+    live: frozenset[tuple[int, int]],
+    ears: Ears,
+    times: Times,
+    rank: Mapping[str, int],
+    kept: Mapping[str, Kept],
+) -> dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]:
+    """Return, for every (partition, tick) of the frame, what each receive of the partition hears."""
+    heard: dict[tuple[int, int], tuple[tuple[Heard, ...], ...]] = {}
+
+    def rows(way: Way, channel: str, clock: str, index: int) -> tuple[Heard, ...]:
+        if way.link not in kept:
+            instant = times.clocks[clock].at(index)
+            return (_newest(way, channel, exchange.links[way.link], instant, times, rank),)
+        row = Heard(way, Sent(way.link, channel, 0), 0, clock, index)
+        return (row, replace(row, gap=True)) if kept[way.link].gaps else (row,)
+
+    for p in sorted({partition for partition, _ in live}):
+        clock = pattern.kind.clocks[p].clock
+        for index in range(times.frame // times.clocks[clock].period):
+            heard[p, index] = tuple(
+                tuple(row for way, channel in receive for row in rows(way, channel, clock, index))
+                for receive in ears[p]
+            )
+    return heard
+
+
+def _newest(way: Way, channel: str, link: Link, instant: int, times: Times, rank: Mapping[str, int]) -> Heard:
+    """Return the newest packet on a way that a tick at `instant` sees."""
+    delay, grid = times.delays[way.delay], times.clocks[link.clock]
+    missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0
+    number = grid.newest(instant - delay, strictly=rank["tick"] < rank["deliver"]) - missed
+    frames, slot = divmod(number, times.frame // grid.period)  # a negative number is of an earlier frame
+    return Heard(way, Sent(way.link, channel, slot), -frames)
+
+
+def _build(
+    pattern: LinearSite,
+    system: CompiledSystem,
+    live: frozenset[tuple[int, int]],
+    heard_at: Mapping[tuple[int, int], tuple[tuple[Heard, ...], ...]],
+    depth: Mapping[Sent, int],
+    times: Times,
+    rank: Mapping[str, int],
+) -> Schedule:
+    """Build one schedule, once it is known what the whole system hears."""
+    kind = pattern.kind
+    grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
+    heard = tuple(sorted({one for row in heard_at.values() for receive in row for one in receive}))
+    channels = {sending.link: sending.channels for sending in kind.sends}
+    sent = tuple(sorted(one for one in depth if one.channel in channels.get(one.link, ())))
+    acting, switches = _switches(pattern, live, times, rank)
+    marks = _marks(times)
+    events = _in_order(
+        [
+            *_computations(pattern, heard_at, heard, times, rank["tick"]),
+            *_sendings(pattern, grid_of, sent, times.frame, rank["send"]),
+            *switches,
+            *((mark, 0, None) for mark in marks),  # so that propagation stops there
+        ]
+    )
+    ticks = tuple(
+        times.frame // times.clocks[partition.clock].period if partition.clock in times.clocks else 0
+        for partition in kind.clocks
+    )
+    carried = _carried(pattern, live, events, acting, ticks)
+    return Schedule(
+        quantum=times.quantum,
+        frame=times.frame,
+        events=events,
+        acting=tuple(acting),
+        carried=carried,
+        heard=heard,
+        sent=sent,
+        depths=tuple(depth[one] for one in sent),
+        ticks=ticks,
+        marks=marks,
+        value_names=tuple(_value_name(pattern, value, times) for value in carried),
+        sent_names=tuple(f"{one.channel} sent" for one in sent),
+        sent_times=tuple(_slot_time(one, grid_of) for one in sent),
+    )
+
+
+def _marks(times: Times) -> tuple[int, ...]:
+    """Return the instants of the fastest clock's ticks, the frame's start and its end."""
+    fastest = min(times.clocks.values(), key=lambda grid: grid.period)
+    ticks = {fastest.at(index) for index in range(times.frame // fastest.period)}
+    return tuple(sorted({0, times.frame} | ticks))
+
+
+def _in_order(happenings: Sequence[_Happening]) -> tuple[Event, ...]:
+    """Return the events in the order of time and of their ranks, with propagation in the gaps."""
+    events: list[Event] = []
+    now = 0
+    for instant, _, event in sorted(happenings, key=lambda item: item[:2]):
+        if instant > now:
+            events.append(Propagate(instant - now))
+            now = instant
+        if event is not None:
+            events.append(event)
+    return tuple(events)
+
+
+def _computations(
+    pattern: LinearSite,
+    heard_at: Mapping[tuple[int, int], tuple[tuple[Heard, ...], ...]],
+    heard: Sequence[Heard],
+    times: Times,
+    rank: int,
+) -> Iterator[_Happening]:
+    """Yield when a site's clocks tick in a frame, and the rows of `heard` that each receive adds up."""
+    place_of = {one: index for index, one in enumerate(heard)}
+    for (p, index), row in heard_at.items():
+        places = tuple(tuple(place_of[one] for one in receive) for receive in row)
+        yield times.clocks[pattern.kind.clocks[p].clock].at(index), rank, Tick(p, index, places)
+
+
+def _sendings(
+    pattern: LinearSite, grid_of: Mapping[str, Grid | None], sent: Sequence[Sent], frame: int, rank: int
+) -> Iterator[_Happening]:
+    """Yield when a site sends what in a frame."""
+    for p, sending in enumerate(pattern.kind.sends):
+        grid = grid_of[sending.link]
+        for slot in range(frame // grid.period if grid else 0):
+            rows = tuple(
+                (sending.channels.index(one.channel), place)
+                for place, one in enumerate(sent)
+                if one.link == sending.link and one.slot == slot
+            )
+            if rows:
+                assert grid is not None
+                yield grid.at(slot), rank, Send(p, rows)
+
+
+def _switches(
+    pattern: LinearSite, live: frozenset[tuple[int, int]], times: Times, rank: Mapping[str, int]
+) -> tuple[list[Value | None], list[_Happening]]:
+    """Return what each hold holds as the frame begins, None if nobody feels it, and when it switches."""
+    kind = pattern.kind
+    partition_of = {partition.clock: index for index, partition in enumerate(kind.clocks)}
+    acting: list[Value | None] = []
+    happenings: list[_Happening] = []
+    for h, (hold, used) in enumerate(zip(kind.holds, live_holds(pattern, live), strict=True)):
+        if not used:
+            acting.append(None)
+            continue
+        grid, delay, p = times.clocks[hold.clock], times.delays[hold.delay], partition_of[hold.clock]
+        missed = 1 if delay == 0 and rank["act"] < rank["tick"] else 0
+        first = grid.newest(-delay, strictly=True)  # switched before the frame begins
+        acting.append(Value(p, hold.output, first - missed))
+        for index in range(first + 1, grid.newest(times.frame - delay, strictly=True) + 1):
+            switch = Act(h, Value(p, hold.output, index - missed))
+            happenings.append((grid.at(index) + delay, rank["act"], switch))
+    return acting, happenings
+
+
+def _slot_time(sent: Sent, grid_of: Mapping[str, Grid | None]) -> int:
+    """Return when a slot is sent, in quanta from the frame's start."""
+    grid = grid_of[sent.link]
+    assert grid is not None
+    return grid.at(sent.slot)
+
+
+def _carried(
+    pattern: LinearSite,
+    live: frozenset[tuple[int, int]],
+    events: Sequence[Event],
+    acting: Sequence[Value | None],
+    ticks: Sequence[int],
+) -> tuple[Value, ...]:
+    """Return the values of earlier frames that this frame reads, and those still to be read later.
+
+    A value read at index -j is, one frame on, the value of index n - j; if that is negative too, it is
+    carried as well.
+    """
+    kind = pattern.kind
+    now = list(acting)
+    demanded: set[Value] = set()
+
+    def read(row: Iterable[int]) -> None:
+        demanded.update(value for h in row if (value := now[h]) is not None)
+
+    for event in events:
+        match event:
+            case Act(hold, value):
+                now[hold] = value
+            case Propagate():
+                read(np.flatnonzero(pattern.b.any(axis=0)).tolist())
+            case Send(partition, rows):
+                for channel, _ in rows:
+                    read(pattern.sends[partition].u[channel].nonzero()[0].tolist())
+            case Tick(partition, index, _):
+                for output in (o for p, o in live if p == partition):
+                    read(pattern.ticks[partition].u[output].nonzero()[0].tolist())
+                    for m in pattern.ticks[partition].m[output].nonzero()[0]:
+                        demanded.add(Value(partition, kind.clocks[partition].memories[m], index - 1))
+    carried: set[Value] = set()
+    for value in demanded:
+        while value.index < 0:
+            carried.add(value)
+            value = Value(value.partition, value.output, value.index + ticks[value.partition])
+    return tuple(sorted(carried))
+
+
+def _value_name(pattern: LinearSite, value: Value, times: Times) -> str:
+    """Return `name(-1 ms)`: a value as it was at a time before the frame."""
+    partition = pattern.kind.clocks[value.partition]
+    seconds = times.clocks[partition.clock].at(value.index) * times.quantum
+    return f"{partition.outputs[value.output]}({float(seconds * 1000):.6g} ms)"

@@ -1,0 +1,90 @@
+"""A site at the start of time: its states, what it remembers, what it sends and what it hears.
+
+Takes: a kind's Jacobians and a parameter vector, in any kind of number.
+Gives: `start_values`, `start_sends`, `start_arguments`; `Listening`.
+Guarantees: holds put out zero.
+Does not: ask who hears whom (see `peers`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import casadi
+import numpy as np
+
+from apc.compiler.compiled import PEERS
+from apc.runtime.frame.exact import evaluate_exact
+from apc.runtime.frame.jacobians import SiteJacobians
+
+
+@dataclass(frozen=True, slots=True)
+class Listening:
+    """What a site's receives (of all clocks in a row) are at the start, and their own parts.
+
+    `values` (n_r,) are exact; `own` are the slopes over (x, u, m) of each receive, None for a plain one.
+    """
+
+    values: tuple[Fraction, ...]
+    own: tuple[tuple[Fraction, ...] | None, ...]
+
+
+def start_values(
+    site: SiteJacobians, parameters: Sequence[Any]
+) -> tuple[list[Any], list[Any], list[list[Any]]]:
+    """Return x, u and every clock partition's m at the start, where holds put out zero."""
+    place = {name: index for index, name in enumerate(site.kind.parameters)}
+    x = [parameters[place[state.start]] for state in site.kind.states]
+    m = [[parameters[place[start]] for start in partition.starts] for partition in site.kind.clocks]
+    return x, [0] * len(site.kind.holds), m
+
+
+def start_sends(
+    site: SiteJacobians, parameters: Sequence[Any], number: Callable[[float], Any] = Fraction
+) -> dict[str, list[Any]]:
+    """Return what a site sends at the start, by link."""
+    x, u, _ = start_values(site, parameters)
+    sent = {}
+    for sending in site.kind.sends:
+        if not sending.send.is_a("SXFunction"):
+            rounded = sending.send(*([float(value) for value in part] for part in (x, u, parameters, [0.0])))
+            sent[sending.link] = [number(float(value)) for value in np.asarray(rounded).ravel()]
+            continue
+        symbols = sending.send.sx_in()
+        dense = casadi.Function("send", symbols, [casadi.densify(sending.send(*symbols))])
+        sent[sending.link] = evaluate_exact(dense, [x, u, parameters, [number(0.0)]], number=number)[0]
+    return sent
+
+
+def start_arguments(
+    site: SiteJacobians,
+    parameters: list[Any],
+    number: Callable[[float], Any],
+    listening: Listening | None,
+) -> list[list[Any]]:
+    """Return (x, u, m, r, p, t) at the start: holds put out zero.
+
+    The Jacobians of an affine site look at nothing but the parameters: zeros will do.
+    """
+    kind, zero = site.kind, number(0.0)
+    if site.affine:
+        sizes = [site.function.numel_in(argument) for argument in range(4)]
+        x, u, m, r = ([zero] * size for size in sizes)
+        return [x, u, m, r, parameters, [zero]]
+    x, u, memories = start_values(site, parameters)
+    m = [value for one in memories for value in one]
+    if listening is not None:
+        r = [number(value) for value in listening.values]  # type: ignore[arg-type] # Fraction and float take both
+        return [x, u, m, r, parameters, [zero]]
+    place = {name: index for index, name in enumerate(kind.parameters)}
+    sent = start_sends(site, parameters, number)
+    others = parameters[place[PEERS]] - 1 if PEERS in place else number(1.0)
+    r = [
+        sent[heard.link][heard.channel] * (others if heard.operator == "sum" else number(1.0))
+        for partition in kind.clocks
+        for heard in partition.receives
+    ]
+    return [x, u, m, r, parameters, [zero]]
