@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.dimensions import DIMENSIONLESS
 from apc.compiler.errors import ApcError, Mistakes
+from apc.compiler.nodes import Mapping as MappingNode
+from apc.compiler.nodes import Node, Scalar
 from apc.compiler.reading import brief, check_keys, read_text
-from apc.compiler.source import Mapping as MappingNode
-from apc.compiler.source import Node, Scalar
-from apc.compiler.tables import read_trace
-from apc.compiler.units import DIMENSIONLESS
+from apc.compiler.recordings import read_trace
 from apc.compiler.values import Value
 
 PROBABILITIES = ("p", "r", "1-h", "1-k")  # netem's names, in netem's order

@@ -22,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
+from apc.compiler.clock_inference import CONTINUOUS, ClockInference, domain
 from apc.compiler.component import OTHERS
 from apc.compiler.errors import Mistakes
 from apc.compiler.expression import (
@@ -29,18 +30,14 @@ from apc.compiler.expression import (
     Call,
     Expr,
     Name,
-    Negate,
     Number,
-    children,
     format_expression,
     names,
     transform,
 )
 from apc.compiler.flatten import FlatEquation, FlatKind, FlatSend, FlatSystem
+from apc.compiler.reductions import affine_in_others, count_of, hears_others
 from apc.compiler.scene import Scene
-
-CONTINUOUS = "continuous"
-REDUCTIONS = ("mean", "sum", "max", "min", "count")
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,15 +123,14 @@ def partition(flat: FlatSystem) -> ClockedSystem:
 
 
 class _Partitioner:
-    """One kind's clock inference: variables and equations that must tick together are merged into sets."""
+    """One kind: its holds get variables of their own, then clocks are inferred, then crossings are named."""
 
     def __init__(self, kind: FlatKind, mistakes: Mistakes) -> None:
         self.kind = kind
         self.mistakes = mistakes
         self.variables = {variable.name: None for variable in kind.variables}  # a dict keeps their order
         self.starts = {variable.name for variable in kind.variables if variable.start}
-        self.parents: dict[str, str] = {}
-        self.clock_of_set: dict[str, str] = {}
+        self.clocks = ClockInference(self.variables, mistakes)
         self.extra: list[FlatEquation] = []
         self.samples: dict[str, SampleCrossing] = {}
         self.holds: dict[str, HoldCrossing] = {}
@@ -149,18 +145,17 @@ class _Partitioner:
         ]
         equations += self.extra
         for index, equation in enumerate(equations):
-            for side in (equation.left, equation.right):
-                self._visit(side, f"equation {index}", equation)
+            self.clocks.visit(f"equation {index}", equation)
         sends = tuple(self._sent(send) for send in lifted)
         if self.mistakes:
             return ClockedKind(self.kind, (), (), (), (), (), ())
         by_clock: dict[str, list[FlatEquation]] = {CONTINUOUS: []}
         for index, equation in enumerate(equations):
-            clock = self._clock(f"equation {index}")
+            clock = self.clocks.of(f"equation {index}")
             by_clock.setdefault(clock, []).append(self._crossed(equation, clock))
         members: dict[str, list[str]] = {clock: [] for clock in by_clock}
         for name in self.variables:
-            members.setdefault(self._clock(name), []).append(name)
+            members.setdefault(self.clocks.of(name), []).append(name)
         partitions = tuple(
             Partition(clock, tuple(members[clock]), tuple(by_clock.get(clock, ()))) for clock in members
         )
@@ -173,98 +168,6 @@ class _Partitioner:
             tuple(self.receives.values()),
             sends,
         )
-
-    # ---- sets of names that tick together ----
-
-    def _find(self, name: str) -> str:
-        root = name
-        while (parent := self.parents.get(root, root)) != root:
-            root = parent
-        while (parent := self.parents.get(name, name)) != root:
-            self.parents[name] = root
-            name = parent
-        return root
-
-    def _clock(self, name: str) -> str:
-        return self.clock_of_set.get(self._find(name), CONTINUOUS)
-
-    def _join(self, one: str, two: str, equation: FlatEquation) -> None:
-        a, b = self._find(one), self._find(two)
-        if a == b:
-            return
-        clock_a, clock_b = self.clock_of_set.get(a), self.clock_of_set.get(b)
-        if clock_a is not None and clock_b is not None and clock_a != clock_b:
-            self._report(two, clock_b, clock_a, equation)
-            return
-        self.parents[b] = a
-        if clock_b is not None:
-            self.clock_of_set[a] = clock_b
-
-    def _pin(self, name: str, clock: str, because: str, equation: FlatEquation) -> None:
-        root = self._find(name)
-        known = self.clock_of_set.setdefault(root, clock)
-        if known != clock:
-            self._report(because, clock, known, equation)
-
-    def _report(self, name: str, its: str, others: str, equation: FlatEquation) -> None:
-        if its == CONTINUOUS:
-            hint = f"sample({name})"
-        elif others == CONTINUOUS:
-            hint = f"hold({name})"
-        else:
-            hint = f"one clock for both, or sample(hold({name}))"
-        self.mistakes.add(
-            "E505",
-            equation.place,
-            f"in `{equation.text}` of {equation.origin}, "
-            f"{name} is {_domain(its)} and the rest is {_domain(others)}",
-            hint=hint,
-        )
-
-    # ---- one pass that finds the clocks ----
-
-    def _visit(self, expression: Expr, domain: str, equation: FlatEquation, *, heard: bool = False) -> None:
-        """Join what ticks together; `heard` is inside a reduction, where alone `others` can be named."""
-        if isinstance(expression, Name):
-            name = ".".join(expression.parts)
-            if name in self.variables:
-                self._join(domain, name, equation)
-            elif expression.parts[0] == OTHERS and not heard:
-                shown = f"others.{expression.parts[-1]}"
-                what = f"{shown} of {equation.origin} is a value of each other peer, and one is due here"
-                self.mistakes.add("E506", equation.place, what, hint=f"mean({shown}), or sum, max, min")
-        elif isinstance(expression, Call):
-            self._visit_call(expression, domain, equation, heard)
-        else:
-            for child in children(expression):
-                self._visit(child, domain, equation, heard=heard)
-
-    def _visit_call(self, call: Call, domain: str, equation: FlatEquation, heard: bool) -> None:
-        text = format_expression(call)
-        if call.function == "sample":
-            assert isinstance(call.arguments[1], Name)
-            self._pin(domain, call.arguments[1].parts[0], text, equation)
-            inner = f"inside {text} of {equation.origin}"
-            self._pin(inner, CONTINUOUS, text, equation)
-            self._visit(call.arguments[0], inner, equation)
-        elif call.function == "hold":
-            self._pin(domain, CONTINUOUS, text, equation)  # its variable was pinned by its own equation
-        elif call.function == "der":
-            self._pin(domain, CONTINUOUS, text, equation)
-            self._visit(call.arguments[0], domain, equation)
-        elif _hears(call):
-            for argument in call.arguments:
-                self._visit(argument, domain, equation, heard=True)
-            if equation.clock is None:
-                what = f"{equation.origin} hears the other peers but has no parameter that names one clock"
-                self.mistakes.add("E504", equation.place, what, hint="parameters: {clock: clock}")
-            else:
-                self._pin(domain, equation.clock, text, equation)
-        else:
-            if call.function == "previous" and equation.clock is not None:
-                self._pin(domain, equation.clock, text, equation)
-            for argument in call.arguments:
-                self._visit(argument, domain, equation, heard=heard)
 
     # ---- crossings ----
 
@@ -316,7 +219,7 @@ class _Partitioner:
             return Name((symbol,))
         if call.function == "hold":
             variable = format_expression(call.arguments[0])
-            source = self._clock(variable)
+            source = self.clocks.of(variable)
             if source == CONTINUOUS:
                 what = f"{symbol} holds {variable}, which is continuous already"
                 self.mistakes.add("E505", where.place, what, hint=variable)
@@ -327,7 +230,7 @@ class _Partitioner:
         if call.function == "initial":
             self._check_start(call, symbol, where)
             return Name((symbol,))
-        if _hears(call):
+        if hears_others(call):
             return self._receive(call, symbol, clock, where)
         return None
 
@@ -410,25 +313,11 @@ class _Partitioner:
         expression = transform(send.expression, bare)
         for name in names(_without_holds(expression)):
             whole = ".".join(name.parts)
-            if whole in self.variables and self._clock(whole) != CONTINUOUS:
-                its = _domain(self._clock(whole))
+            if whole in self.variables and self.clocks.of(whole) != CONTINUOUS:
+                its = domain(self.clocks.of(whole))
                 what = f"{send.name} is sent at ticks of {send.link}, and {whole} is {its}"
                 self.mistakes.add("E505", send.place, what, hint=f"sample(hold({whole}))")
         return replace(send, expression=self._cross(expression, CONTINUOUS, send))
-
-
-def count_of(link: str) -> str:
-    """Return the name of the parameter that counts, with their weights, the peers heard over a link."""
-    return f"count({link})"
-
-
-def _hears(call: Call) -> bool:
-    """Return whether a call reduces the other peers to one value; max(a, b) is of two values, and doesn't."""
-    return (
-        call.function in REDUCTIONS
-        and len(call.arguments) == 1
-        and any(name.parts[0] == OTHERS for name in names(call))
-    )
 
 
 def _without_holds(expression: Expr) -> Expr:
@@ -436,60 +325,3 @@ def _without_holds(expression: Expr) -> Expr:
         return Number(Fraction(0)) if isinstance(node, Call) and node.function == "hold" else None
 
     return transform(expression, drop)
-
-
-Affine = tuple[Expr | None, dict[str, Expr | None]]  # constant and coefficients; None: 0, and 1
-
-
-def affine_in_others(expression: Expr) -> Affine | None:
-    """Return an expression as c₀ + Σ cₖ·others.k, or None when it is not of that form.
-
-    c₀ is None for 0, cₖ None for 1; k is the name of what is sent.
-    """
-    if not any(name.parts[0] == OTHERS for name in names(expression)):
-        return expression, {}
-    match expression:
-        case Name(parts=parts):
-            return None, {".".join(parts[1:]): None}
-        case Negate(operand=operand):
-            inside = affine_in_others(operand)
-            return None if inside is None else _scaled(inside, Number(Fraction(-1)), "*")
-        case Binary(operator="+" | "-" as operator, left=left, right=right):
-            one, two = affine_in_others(left), affine_in_others(right)
-            if one is None or two is None:
-                return None
-            return _added(one, two if operator == "+" else _scaled(two, Number(Fraction(-1)), "*"))
-        case Binary(operator="*" | "/" as operator, left=left, right=right):
-            one, two = affine_in_others(left), affine_in_others(right)
-            if one is None or two is None:
-                return None
-            if not two[1]:
-                return _scaled(one, right, operator)
-            return _scaled(two, left, "*") if operator == "*" and not one[1] else None
-    return None
-
-
-def _scaled(affine: Affine, factor: Expr, operator: str) -> Affine:
-    def scaled(expression: Expr | None) -> Expr:
-        if expression is None:
-            return factor if operator == "*" else Binary("/", Number(Fraction(1)), factor)
-        return Binary(operator, expression, factor)
-
-    constant, terms = affine
-    return (None if constant is None else scaled(constant)), {name: scaled(c) for name, c in terms.items()}
-
-
-def _added(one: Affine, two: Affine) -> Affine:
-    def added(a: Expr | None, b: Expr | None, nothing: Expr) -> Expr:
-        return Binary("+", a or nothing, b or nothing)
-
-    unit = Number(Fraction(1))
-    constant = one[0] if two[0] is None else two[0] if one[0] is None else Binary("+", one[0], two[0])
-    terms = dict(one[1])
-    for name, coefficient in two[1].items():
-        terms[name] = added(terms[name], coefficient, unit) if name in terms else coefficient
-    return constant, terms
-
-
-def _domain(clock: str) -> str:
-    return "continuous" if clock == CONTINUOUS else f"on clock {clock}"

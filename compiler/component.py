@@ -11,13 +11,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
+from apc.compiler.dimensions import Dimension
 from apc.compiler.errors import Place
-from apc.compiler.expression import Compare, Equation, Expr, Name, walk
-from apc.compiler.source import Node
-from apc.compiler.units import Dimension, Unit
+from apc.compiler.expression import FUNCTIONS, KEYWORDS, Compare, Equation, Expr, Name, walk
+from apc.compiler.nodes import Node
+from apc.compiler.units import Unit
 from apc.compiler.values import Binding, Bounds
 
 OTHERS = "others"
+# Words of the language, which nothing may have as its name.
+RESERVED = frozenset(
+    {"peers", "others", "time", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
+)
 # A parameter of one of these roles isn't a number: it names, or describes, something of the scene.
 ROLES = ("clock", "link", "graph", "delays", "loss", "trace", "table")
 

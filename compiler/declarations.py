@@ -15,6 +15,7 @@ from apc.compiler.component import ROLES, Number, Option, Parameter, Reference, 
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.expression import Equation, Expr
 from apc.compiler.grammar import parse_equation, parse_expression
+from apc.compiler.nodes import Mapping, Node, Scalar, Sequence
 from apc.compiler.reading import (
     add_unknown,
     brief,
@@ -25,7 +26,6 @@ from apc.compiler.reading import (
     read_name,
     read_text,
 )
-from apc.compiler.source import Mapping, Node, Scalar, Sequence
 from apc.compiler.units import Unit, parse_quantity, parse_unit, quantity
 from apc.compiler.values import text_place
 

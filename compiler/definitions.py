@@ -1,51 +1,31 @@
 """Component and connector definitions: YAML text to typed data, checked once per component.
 
 Takes: the YAML source of a definition, and the library it stands in. Gives: `Component`, `Connector`.
-Guarantees: every name in an equation is declared, every equation's units agree, and a component has as
-many equations as it must have; a component that breaks this is never handed out.
+Guarantees: what a definition extends and contains is there and read before it; a component that isn't sound
+(see `component_check`) is never handed out.
 Does not: know any topology, or which component is used where.
-
-A component is locally balanced in Modelica's sense (Modelica Language Specification 3.6, section 4.8): it
-gives one equation for each of its variables and one for each flow of its connectors; the connections of a
-scene give the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import replace
-from fractions import Fraction
 from typing import Protocol, TypeVar
 
 from apc.compiler.component import (
-    OTHERS,
+    RESERVED,
     Component,
     Connector,
     Inner,
-    Option,
     Parameter,
     Reference,
-    Send,
     Variable,
-    option_test,
 )
-from apc.compiler.declarations import Sends, read_equations, read_parameters, read_sends, read_variables
-from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
+from apc.compiler.component_check import ComponentNames, check_balance
+from apc.compiler.declarations import read_equations, read_parameters, read_sends, read_variables
+from apc.compiler.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.expression import (
-    FUNCTIONS,
-    KEYWORDS,
-    Call,
-    Compare,
-    Equation,
-    Expr,
-    Name,
-    format_expression,
-    names,
-    transform,
-    walk,
-)
-from apc.compiler.expression import Number as Literal
+from apc.compiler.nodes import Mapping, Node, Scalar
 from apc.compiler.parts import Scope, read_entry
 from apc.compiler.reading import (
     add_unknown,
@@ -56,10 +36,8 @@ from apc.compiler.reading import (
     read_name,
     read_text,
 )
-from apc.compiler.source import Mapping, Node, Scalar, Source, place_in
-from apc.compiler.units import DIMENSIONLESS, Dimension
+from apc.compiler.source import Source
 from apc.compiler.values import PEERS
-from apc.compiler.words import counted
 
 COMPONENT_KEYS = (
     "component",
@@ -74,11 +52,7 @@ COMPONENT_KEYS = (
     "sends",
     "equations",
 )
-RESERVED = frozenset(
-    {"peers", "others", "time", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
-)
 DEEPEST = 10  # levels of parts inside parts
-_TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
 
 
 def read_connector(source: Source) -> Connector:
@@ -123,14 +97,14 @@ def read_component(source: Source, library: Definitions) -> Component:
     root = check_keys(root, COMPONENT_KEYS, "a component", mistakes)
     draft = _read_declarations(root, library, mistakes)
     mistakes.raise_if_any()
-    names = _Names(draft)
+    names = ComponentNames(draft)
     sends = read_sends(root.get("sends"), mistakes)
     locals_, found = names.infer_locals(sends), names.infer_sends(sends, mistakes)
     component = replace(draft, locals=(*draft.locals, *locals_), sends=(*draft.sends, *found))
     mistakes.raise_if_any()
     names.check(component, mistakes)
     mistakes.raise_if_any()
-    _check_balance(component, mistakes)
+    check_balance(component, mistakes)
     mistakes.raise_if_any()
     return component
 
@@ -314,161 +288,6 @@ def read_type(
         return None
     place = node.place if node is not None else key.place
     return _found(name, place, library, mistakes, f"type: {example}")
-
-
-class _Names:
-    """Resolves a component's names to dimensions, and finds the locals on the way."""
-
-    def __init__(self, component: Component) -> None:
-        self.component = component
-        self.dimensions: dict[tuple[str, ...], Dimension | None] = {PEERS: DIMENSIONLESS, ("time",): SECOND}
-        self.dimensions.update(dict(visible_names(component)))
-        for parameter in component.numbers:
-            self.dimensions[(parameter.name,)] = parameter.unit.dimension
-            for word, _ in parameter.words:
-                self.dimensions.setdefault((word,), parameter.unit.dimension)
-        passed = {connector for connector, _, _ in component.passed}
-        for name, connector in component.connectors:
-            if name not in passed:
-                for flow in connector.flows:
-                    self.dimensions[(name, flow.name)] = flow.unit.dimension
-        self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
-        for send in component.sends:
-            self.dimensions[(OTHERS, send.name)] = send.dimension
-        for table in component.parameters:
-            if isinstance(table, Reference) and table.role == "table" and table.unit is not None:
-                self.dimensions[(table.name,)] = table.unit.dimension
-
-    def infer_sends(self, sends: Sends, mistakes: Mistakes) -> tuple[Send, ...]:
-        """Return the sends with the dimension of what they send."""
-        return tuple(
-            Send(name, expression, text, place, _known(self._dimension(expression, text, place, mistakes)))
-            for name, expression, text, place in sends
-        )
-
-    def infer_locals(self, sends: Sends) -> tuple[tuple[str, Dimension], ...]:
-        """Return the undeclared names that stand alone on the left of an equation."""
-        for name, expression, text, place in sends:
-            self.dimensions[(OTHERS, name)] = self._dimension(expression, text, place, Mistakes())
-        found: list[tuple[str, Dimension]] = []
-        for equation in self.component.equations:
-            left = equation.left
-            if isinstance(left, Name) and len(left.parts) == 1 and left.parts not in self.dimensions:
-                # An unknown name on the right is reported once, by `check`; a local may still be undecided.
-                dimension = self._dimension(equation.right, equation.text, equation.place, Mistakes())
-                self.dimensions[left.parts] = dimension
-                found.append((left.parts[0], _known(dimension)))
-        return tuple(found)
-
-    def check(self, component: Component, mistakes: Mistakes) -> None:
-        """Check the names, then the units, of every equation."""
-        for equation in component.equations:
-            unknown = False
-            left, right = self._decided(equation.left), self._decided(equation.right)
-            for side in (left, right):
-                unknown |= self._check_names(side, equation.text, equation.place, mistakes)
-                unknown |= self._check_reductions(side, equation.text, equation.place, mistakes)
-            if not unknown:
-                try:
-                    check_equation(
-                        Equation(left, right, equation.text, equation.place),
-                        lambda name: self.dimensions.get(name.parts),
-                    )
-                except ApcError as error:
-                    mistakes.take(error)
-
-    def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
-        """Record a reduction that doesn't run over the other peers."""
-        wrong = False
-        for node in walk(expression):
-            if not isinstance(node, Call) or any(name.parts[0] == OTHERS for name in names(node)):
-                continue
-            if node.function in ("mean", "sum", "count"):
-                what, expected = f"{node.function} runs over the other peers and", "others.x in it"
-            elif node.function in ("max", "min") and len(node.arguments) == 1:
-                what, expected = node.function, "two values, or one of the other peers"
-            else:
-                continue
-            wrong = True
-            hint = "count(others)" if node.function == "count" else f"{node.function}(others.x)"
-            where, got = place_in(place, text, node.start), format_expression(node)
-            mistakes.add("E506", where, what, expected=expected, got=got, hint=hint)
-        return wrong
-
-    def _decided(self, expression: Expr) -> Expr:
-        """Return the expression with each test of an option replaced by a true statement.
-
-        Both branches of such a test are checked; the words of an option have no dimension.
-        """
-        options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
-        return transform(expression, lambda node: _TRUE if option_test(node, options) else None)
-
-    def _dimension(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> Dimension | None:
-        expression = self._decided(expression)
-        if self._check_names(expression, text, place, mistakes):
-            return None
-        try:
-            return dimension_of(expression, lambda name: self.dimensions.get(name.parts), text, place)
-        except ApcError as error:
-            mistakes.take(error)
-            return None
-
-    def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
-        wrong = False
-        for node in walk(expression):
-            if isinstance(node, Name) and node.parts not in self.dimensions:
-                wrong = True
-                shown = ".".join(node.parts)
-                if node.parts[0] == OTHERS:
-                    what = f"{self.component.name} sends nothing called {brief('.'.join(node.parts[1:]))}"
-                    mistakes.add(
-                        "E303", place_in(place, text, node.start), what, hint="sends: {x: sample(object.x)}"
-                    )
-                    continue
-                known = sorted(".".join(parts) for parts in self.dimensions)
-                what = f"{self.component.name} has no {brief(shown)}"
-                add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)
-        return wrong
-
-
-def visible_names(component: Component) -> Iterator[tuple[tuple[str, ...], Dimension]]:
-    """Yield what may be named of a component from outside: its variables and its connectors' potentials."""
-    for variable in component.variables:
-        yield (variable.name,), variable.unit.dimension
-    for name, dimension in component.locals:
-        yield (name,), dimension
-    for name, connector in component.connectors:
-        for potential in connector.potentials:
-            yield (name, potential.name), potential.unit.dimension
-    for inner in component.inner:
-        for path, dimension in visible_names(inner.component):
-            yield (inner.name, *path), dimension
-
-
-def _known(dimension: Dimension | None) -> Dimension:
-    """Return a dimension that was inferred; what fits every dimension, such as 0, has none."""
-    return DIMENSIONLESS if dimension in (None, ANY) else dimension
-
-
-def _check_balance(component: Component, mistakes: Mistakes) -> None:
-    passed = {connector for connector, _, _ in component.passed}
-    flows = [
-        f"{name}.{flow.name}"
-        for name, connector in component.connectors
-        if name not in passed
-        for flow in connector.flows
-    ]
-    unknowns = [variable.name for variable in component.variables]
-    unknowns += [name for name, _ in component.locals] + flows
-    if len(component.equations) == len(unknowns):
-        return
-    mistakes.add(
-        "E501",
-        component.place,
-        f"{component.name} is unbalanced: {counted(len(component.equations), 'equation')} for "
-        f"{counted(len(unknowns), 'unknown')} ({', '.join(unknowns) or 'none'})",
-        hint="one equation for each variable and one for each flow of a connector",
-    )
 
 
 def _check_distinct(

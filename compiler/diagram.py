@@ -1,8 +1,8 @@
-"""A scene as a graph: parts joined within a peer, peers joined over links; and as Graphviz text.
+"""A scene as a graph: parts joined within a peer, peers joined over links.
 
-Takes: `Scene`. Gives: `Diagram`, `build_diagram`, `draw_dot`; `seconds`, `common_period`.
+Takes: `Scene`. Gives: `Diagram`, `build_diagram`; `seconds`, `common_period`.
 Guarantees: every part of the topology is in it, a long array as one node; the same scene gives the same text.
-Does not: place anything on a page (see `picture`).
+Does not: place anything on a page (see `picture`, `graphviz`).
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.component import Number, Reference
-from apc.compiler.dimensions import SECOND
+from apc.compiler.dimensions import SECOND, Dimension
+from apc.compiler.instances import Part
+from apc.compiler.links import SceneLink
 from apc.compiler.parts import GROUND
-from apc.compiler.scene import DEFAULT_TYPES, Part, Scene, SceneLink
-from apc.compiler.units import Dimension, format_si
+from apc.compiler.scene import Scene
+from apc.compiler.sections import DEFAULT_TYPES
+from apc.compiler.unit_text import format_si
 from apc.compiler.values import Value
-from apc.compiler.words import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
 STIFFNESS = Dimension((("kg", 1), ("s", -2)))
@@ -29,7 +31,7 @@ LONGEST_EXPRESSION = 24  # characters shown beside its value
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class Vertex:
     """A part, or where parts meet.
 
     `role` is mass, coupler, hand, ground or joint; `lines` are what to write below its name: its type, then
@@ -83,7 +85,7 @@ class Diagram:
 
     title: str
     about: str
-    nodes: tuple[Node, ...]
+    nodes: tuple[Vertex, ...]
     joints: tuple[tuple[str, str], ...]
     nets: tuple[Net, ...]
     crowds: tuple[Crowd, ...]
@@ -101,7 +103,7 @@ def build_diagram(scene: Scene) -> Diagram:
     sizes: dict[str, int] = {}
     for part in parts:
         sizes[_array(part.name)] = sizes.get(_array(part.name), 0) + 1
-    nodes: dict[str, Node] = {}
+    nodes: dict[str, Vertex] = {}
     joints: dict[tuple[str, str], None] = {}
 
     def shown(name: str) -> str:
@@ -116,11 +118,11 @@ def build_diagram(scene: Scene) -> Diagram:
             one, two = shown(part.name), shown(other.partition(".")[0])
             if other == GROUND:
                 two = f"{GROUND} of {one}"  # each has its own: the ground joins nothing
-                nodes.setdefault(two, Node(two, GROUND, (), "", ()))
+                nodes.setdefault(two, Vertex(two, GROUND, (), "", ()))
             elif (nodes[one].role == "mass") == (nodes[two].role == "mass"):
                 # Parts of one role are joined rigidly, at a point of its own: the graph has two sides.
                 middle = f"{one} and {two}"
-                nodes.setdefault(middle, Node(middle, "joint", (), "", ()))
+                nodes.setdefault(middle, Vertex(middle, "joint", (), "", ()))
                 joints[(middle, one)] = None
                 one = middle
             joints[(two, one)] = None
@@ -139,7 +141,7 @@ def _array(name: str) -> str:
     return name.partition("[")[0]
 
 
-def _node(scene: Scene, part: Part, name: str, count: int) -> Node:
+def _node(scene: Scene, part: Part, name: str, count: int) -> Vertex:
     component = part.component
     role = ROLES[part.section]
     lines = [] if component.name == DEFAULT_TYPES.get(part.section) else [component.name]
@@ -153,7 +155,7 @@ def _node(scene: Scene, part: Part, name: str, count: int) -> Node:
     by_role = {p.name: p.role for p in component.parameters if isinstance(p, Reference)}
     named = [(by_role.get(own), word) for own, word in part.references]
     dimensions = {p.unit.dimension for p in component.numbers}
-    return Node(
+    return Vertex(
         name,
         role,
         (*lines, *numbers),
@@ -237,52 +239,6 @@ def _crowds(scene: Scene) -> Iterator[Crowd]:
         yield Crowd(group.name, group.count, tuple(settings))
 
 
-# ---- Graphviz ----
-
-_SHAPES = {"mass": "box", "coupler": "box", "hand": "cds", "ground": "underline", "joint": "point"}
-
-
-def draw_dot(diagram: Diagram) -> str:
-    """Return a diagram in Graphviz's language."""
-    title = diagram.title if not diagram.about else f"{diagram.title}\n{diagram.about}"
-    lines = [
-        f"digraph {_quoted(diagram.title)} {{",
-        "  rankdir=LR",
-        '  node [fontname="Helvetica", fontsize=10]',
-        "  edge [dir=none]",
-        f'  label={_quoted(title)}; labelloc=t; fontname="Helvetica"',
-        "  subgraph cluster_peer {",
-        f"    label={_quoted(one_of(diagram))}; style=rounded",
-    ]
-    for node in diagram.nodes:
-        text = "\n".join((node.name, *node.lines, *([f"clock {node.clock}"] if node.clock else [])))
-        label = "ground" if node.role == GROUND else text
-        style = ', style="filled", fillcolor="#e8eff8"' if node.role == "mass" else ""
-        lines.append(f"    {_quoted(node.name)} [label={_quoted(label)}, shape={_SHAPES[node.role]}{style}]")
-    lines += [f"    {_quoted(one)} -> {_quoted(two)}" for one, two in diagram.joints]
-    lines.append("  }")
-    for net in diagram.nets:
-        text = "\n".join((net.name, f"graph {net.shape}", *net.lines))
-        lines.append(f"  {_quoted(net.name)} [label={_quoted(text)}, shape=ellipse, style=dashed]")
-        for crowd in diagram.crowds:
-            lines.append(
-                f"  {_quoted(net.name)} -> {_quoted(f'peers {crowd.name}')} [dir=both, style=dashed]"
-            )
-    for node in diagram.nodes:
-        lines += [
-            f"  {_quoted(node.name)} -> {_quoted(link)} [dir=both, style=dashed]" for link in node.links
-        ]
-    for crowd in diagram.crowds:
-        text = "\n".join((f"{crowd.name}: {counted(crowd.count, 'peer')}", *crowd.settings))
-        lines.append(f"  {_quoted(f'peers {crowd.name}')} [label={_quoted(text)}, shape=box3d]")
-    return "\n".join([*lines, "}"])
-
-
 def one_of(diagram: Diagram) -> str:
     """Return what the peer drawn is, in words."""
     return "the only peer" if diagram.peers == 1 else f"one of {diagram.peers} peers"
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-    return f'"{escaped}"'

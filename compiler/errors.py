@@ -1,6 +1,6 @@
 """What a user is told when the input is at fault.
 
-Takes: nothing. Gives: `Place`, `Mistake`, `ApcError` and the collector `Mistakes`.
+Takes: nothing. Gives: `Place` and `place_in`, `Mistake`, `ApcError` and the collector `Mistakes`.
 Guarantees: mistakes of one file come out together, in file order, each once.
 Does not: print, or decide exit codes.
 """
@@ -30,6 +30,18 @@ class Place:
     def shifted(self, columns: int) -> Place:
         """Return the place `columns` further right on the same line."""
         return Place(self.file, self.line, self.column + columns, self.source_line)
+
+
+def place_in(place: Place, text: str, offset: int) -> Place:
+    """Return the place of character `offset` of a text that starts at `place`.
+
+    A text folded from several lines, or one with escapes, does not stand in the source line as it is: then
+    the start of the text is the best place we know.
+    """
+    start = place.column - 1
+    if place.source_line and not place.source_line.startswith(text[:offset], max(start, 0)):
+        return place
+    return place.shifted(offset)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,20 @@
-"""The value of an expression of parameters, exact as long as every operation is rational.
+"""The value of an expression, in any arithmetic, and of an expression of parameters.
 
-Takes: an `Expr` tree and what its names stand for. Gives: `Value`, `evaluate`.
-Guarantees: exact rationals stay below 2^4096, so evaluating always ends soon; a value is finite.
+Takes: an `Expr` tree, and an arithmetic or what the tree's names stand for.
+Gives: `Arithmetic`, `compute`; `Value`, `evaluate`.
+Guarantees: of `evaluate`: exact as long as every operation is rational; exact rationals stay below 2^4096, so
+that evaluating always ends soon; a value is finite.
 Does not: know units, or values that change with time or with the peers.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import NoReturn
+from typing import Any, NoReturn, Protocol, TypeVar
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.expression import (
@@ -25,13 +28,77 @@ from apc.compiler.expression import (
     Negate,
     Not,
     Number,
-    cut,
+    children,
     format_expression,
 )
+from apc.compiler.words import cut
 
 MAX_BITS = 4096  # of an exact numerator or denominator; beyond it a float takes over
 
+Operation = Negate | Binary | Compare | Not | Call
 Value = Fraction | float | bool
+V = TypeVar("V")
+
+# What the operators mean wherever Python's own do; a power means something else in every arithmetic.
+OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+}
+
+
+class Arithmetic(Protocol[V]):
+    """What an expression is computed in: its numbers, its conditions and its operations.
+
+    Exact numbers, rows of numbers, quotients of polynomials and symbols each have one of their own.
+    """
+
+    def literal(self, value: Fraction, /) -> V:
+        """Return a number of the text."""
+
+    def named(self, node: Name, /) -> V:
+        """Return what a name stands for."""
+
+    def operation(self, node: Operation, /) -> Callable[..., V]:
+        """Return what computes an operator or a function from its operands; raise if there is no such."""
+
+    def joined(self, node: Logic, left: V, right: Callable[[], V], /) -> V:
+        """Return the conjunction or disjunction of two conditions, the second computed when it is called."""
+
+    def chosen(
+        self, node: Conditional, condition: V, then: Callable[[], V], otherwise: Callable[[], V], /
+    ) -> V:
+        """Return what a condition chooses; a branch is computed when it is called."""
+
+
+def compute(expr: Expr, arithmetic: Arithmetic[V]) -> V:
+    """Return the value of an expression in an arithmetic."""
+
+    def value(node: Expr) -> V:
+        match node:
+            case Number():
+                return arithmetic.literal(node.value)
+            case Name():
+                return arithmetic.named(node)
+            case Logic():
+                return arithmetic.joined(node, value(node.left), lambda: value(node.right))
+            case Conditional():
+                condition = value(node.condition)
+                return arithmetic.chosen(
+                    node, condition, lambda: value(node.then), lambda: value(node.otherwise)
+                )
+            case _:
+                operation = arithmetic.operation(node)
+                return operation(*(value(operand) for operand in children(node)))
+
+    return value(expr)
 
 
 def evaluate(
@@ -59,7 +126,7 @@ def evaluate(
     ApcError
         E330 a name without a value, E331 no finite real value, E332 a function that has none in a parameter.
     """
-    return _Evaluator(lookup, place or Place("an expression")).value(expr)
+    return compute(expr, _Exact(lookup, place or Place("an expression")))
 
 
 def _root(value: Fraction | float) -> Fraction | float:
@@ -71,7 +138,7 @@ def _root(value: Fraction | float) -> Fraction | float:
     return math.sqrt(value)
 
 
-_SIMPLE: dict[str, Callable[[Fraction | float], Fraction | float]] = {
+_FUNCTIONS: dict[str, Callable[[Fraction | float], Fraction | float]] = {
     "abs": lambda value: -value if value < 0 else value,
     "sign": lambda value: Fraction((value > 0) - (value < 0)),
     "floor": lambda value: Fraction(math.floor(value)),
@@ -85,109 +152,108 @@ _SIMPLE: dict[str, Callable[[Fraction | float], Fraction | float]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Evaluator:
+class _Exact:
+    """Exact rationals, floats where there is no rational, and truth values."""
+
     lookup: Callable[[tuple[str, ...]], Value | int]
     place: Place
 
-    def fail(self, expr: Expr, code: str, what: str) -> NoReturn:
-        # Without the text we can only trust a column that exists.
-        line = self.place.source_line
-        fits = not line or self.place.column + expr.start <= len(line)
-        raise ApcError(Mistake(code, self.place.shifted(expr.start) if fits else self.place, what))
+    def literal(self, value: Fraction) -> Value:
+        return value
 
-    def value(self, expr: Expr) -> Value:
-        match expr:
-            case Number():
-                return expr.value
-            case Name():
-                return self.named(expr)
-            case Compare():
-                return _compare(expr.operator, self.number(expr.left), self.number(expr.right))
-            case Logic("and"):
-                return self.condition(expr.left) and self.condition(expr.right)
-            case Logic():
-                return self.condition(expr.left) or self.condition(expr.right)
-            case Not():
-                return not self.condition(expr.operand)
-            case Conditional():
-                return self.value(expr.then if self.condition(expr.condition) else expr.otherwise)
-            case Negate() | Binary() | Call():
-                try:
-                    return self.checked(expr, self.computed(expr))
-                except ZeroDivisionError:
-                    self.fail(expr, "E331", f"{cut(format_expression(expr))} divides by zero")
-                except OverflowError:
-                    self.fail(expr, "E331", f"{cut(format_expression(expr))} is too large for a number")
-                except ValueError:
-                    self.fail(expr, "E331", f"{cut(format_expression(expr))} has no real value")
-
-    def named(self, expr: Name) -> Value:
+    def named(self, node: Name) -> Value:
         try:
-            value = self.lookup(expr.parts)
+            value = self.lookup(node.parts)
         except KeyError:
-            self.fail(expr, "E330", f"{'.'.join(expr.parts)} has no value here")
+            self.fail(node, "E330", f"{'.'.join(node.parts)} has no value here")
         if isinstance(value, bool):
             return value
-        return self.checked(expr, value if isinstance(value, float) else Fraction(value))
+        return self.checked(node, value if isinstance(value, float) else Fraction(value))
 
-    def number(self, expr: Expr) -> Fraction | float:
-        value = self.value(expr)
-        if isinstance(value, bool):
-            self.fail(
-                expr, "E327", f"{cut(format_expression(expr))} is a condition, and a number is due here"
-            )
+    def operation(self, node: Operation) -> Callable[..., Value]:
+        match node:
+            case Not():
+                return lambda operand: not self.condition(node.operand, operand)
+            case Compare():
+                compare = OPERATORS[node.operator]
+                return lambda *operands: bool(compare(*self.numbers(node, operands)))
+            case Call("max" | "min"):
+                extreme = max if node.function == "max" else min
+                return self.guarded(node, lambda *operands: extreme(operands))
+            case Call() if node.function in _FUNCTIONS:
+                return self.guarded(node, _FUNCTIONS[node.function])
+            case Call():
+                what = f"{node.function}(…) changes with time or with the peers: a parameter cannot hold it"
+                return self.fail(node, "E332", what)
+            case Negate():
+                return self.guarded(node, operator.neg)
+            case Binary("^"):
+                return self.guarded(node, _power)
+            case Binary():
+                return self.guarded(node, OPERATORS[node.operator])
+
+    def joined(self, node: Logic, left: Value, right: Callable[[], Value]) -> Value:
+        # Of `and` a false left side decides, of `or` a true one.
+        if self.condition(node.left, left) != (node.operator == "and"):
+            return left
+        return self.condition(node.right, right())
+
+    def chosen(
+        self, node: Conditional, condition: Value, then: Callable[[], Value], otherwise: Callable[[], Value]
+    ) -> Value:
+        return then() if self.condition(node.condition, condition) else otherwise()
+
+    def guarded(self, node: Operation, function: Callable[..., Fraction | float]) -> Callable[..., Value]:
+        """Return a function of numbers whose value is checked, and whose failures name the node."""
+
+        def value(*operands: Value) -> Value:
+            numbers = self.numbers(node, operands)
+            try:
+                return self.checked(node, function(*numbers))
+            except ZeroDivisionError:
+                self.fail(node, "E331", f"{cut(format_expression(node))} divides by zero")
+            except OverflowError:
+                self.fail(node, "E331", f"{cut(format_expression(node))} is too large for a number")
+            except ValueError:
+                self.fail(node, "E331", f"{cut(format_expression(node))} has no real value")
+
         return value
 
-    def condition(self, expr: Expr) -> bool:
-        value = self.value(expr)
+    def numbers(self, node: Operation, operands: tuple[Value, ...]) -> list[Fraction | float]:
+        """Return the operands, each of which has to be a number."""
+        found: list[Fraction | float] = []
+        for operand, value in zip(children(node), operands, strict=True):
+            if isinstance(value, bool):
+                shown = cut(format_expression(operand))
+                self.fail(operand, "E327", f"{shown} is a condition, and a number is due here")
+            found.append(value)
+        return found
+
+    def condition(self, node: Expr, value: Value) -> bool:
         if not isinstance(value, bool):
-            self.fail(
-                expr, "E327", f"{cut(format_expression(expr))} is a number, and a condition is due here"
-            )
+            shown = cut(format_expression(node))
+            self.fail(node, "E327", f"{shown} is a number, and a condition is due here")
         return value
 
-    def checked(self, expr: Expr, value: Fraction | float) -> Fraction | float:
+    def checked(self, node: Expr, value: Fraction | float) -> Fraction | float:
         """Return a value that is a finite float or could be one, and exact only while that is cheap."""
         try:
             rounded = float(value)
         except OverflowError:
             rounded = math.inf
         if not math.isfinite(rounded):
-            self.fail(expr, "E331", f"{cut(format_expression(expr))} is too large for a number")
+            self.fail(node, "E331", f"{cut(format_expression(node))} is too large for a number")
         return value if isinstance(value, Fraction) and _bits(value) <= MAX_BITS else rounded
 
-    def computed(self, expr: Negate | Binary | Call) -> Fraction | float:
-        match expr:
-            case Negate():
-                return -self.number(expr.operand)
-            case Binary("^", base, Number(exponent)):
-                return _power(self.number(base), exponent)
-            case Binary():
-                return _arithmetic(expr.operator, self.number(expr.left), self.number(expr.right))
-            case Call("max" | "min" as function, arguments):
-                values = [self.number(argument) for argument in arguments]
-                return max(values) if function == "max" else min(values)
-            case Call(function, (argument,)) if function in _SIMPLE:
-                return _SIMPLE[function](self.number(argument))
-            case Call():
-                what = f"{expr.function}(…) changes with time or with the peers: a parameter cannot hold it"
-                return self.fail(expr, "E332", what)
+    def fail(self, node: Expr, code: str, what: str) -> NoReturn:
+        # Without the text we can only trust a column that exists.
+        line = self.place.source_line
+        fits = not line or self.place.column + node.start <= len(line)
+        raise ApcError(Mistake(code, self.place.shifted(node.start) if fits else self.place, what))
 
 
 def _bits(value: Fraction) -> int:
     return max(value.numerator.bit_length(), value.denominator.bit_length())
-
-
-def _arithmetic(operator: str, left: Fraction | float, right: Fraction | float) -> Fraction | float:
-    match operator:
-        case "+":
-            return left + right
-        case "-":
-            return left - right
-        case "*":
-            return left * right
-        case _:
-            return left / right
 
 
 def _power(base: Fraction | float, exponent: Fraction) -> Fraction | float:
@@ -199,19 +265,3 @@ def _power(base: Fraction | float, exponent: Fraction) -> Fraction | float:
         exact = isinstance(base, Fraction) and _bits(base) * abs(whole) <= 2 * MAX_BITS
         return (base if exact else float(base)) ** whole
     return math.pow(base, exponent)
-
-
-def _compare(operator: str, left: Fraction | float, right: Fraction | float) -> bool:
-    match operator:
-        case "<":
-            return left < right
-        case "<=":
-            return left <= right
-        case ">":
-            return left > right
-        case ">=":
-            return left >= right
-        case "==":
-            return left == right
-        case _:
-            return left != right

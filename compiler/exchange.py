@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.channels import SceneChannel
-from apc.compiler.clocks import HoldCrossing, count_of
+from apc.compiler.clocks import HoldCrossing
 from apc.compiler.compiled import (
     PEERS,
     Channel,
@@ -33,8 +33,10 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.evaluation import evaluate
 from apc.compiler.expression import Expr, Name, Number, format_expression, transform
 from apc.compiler.flatten import FlatKind
-from apc.compiler.scene import Scene, SceneGroup, SceneLink
-from apc.compiler.units import format_dimension
+from apc.compiler.links import SceneLink
+from apc.compiler.reductions import count_of
+from apc.compiler.scene import Scene, SceneGroup
+from apc.compiler.unit_text import format_dimension
 from apc.compiler.values import Value
 
 NO_DELAY = "no delay"
@@ -104,7 +106,15 @@ class Timings:
 def used_links(
     scene: Scene, kinds: Sequence[Kind], timings: Timings
 ) -> tuple[list[Link], list[tuple[str, str]]]:
-    """Return the links over which something is heard, and those left out with the reason."""
+    """Return the links over which something is heard, and those left out with the reason.
+
+    Parameters
+    ----------
+    scene, kinds
+        All links, and who hears over which.
+    timings
+        Takes the delays of the links that are used.
+    """
     heard = {receive.link for kind in kinds for clock in kind.clocks for receive in clock.receives}
     links, dropped = [], []
     for link in scene.links:
@@ -248,7 +258,17 @@ def _counts(
 
 
 def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
-    """Return a number of the scene as a parameter, with its unit, bounds and what it is about."""
+    """Return a number of the scene as a parameter, with its unit, bounds and what it is about.
+
+    Parameters
+    ----------
+    scene
+        Knows what the component of a part declares.
+    name
+        The whole name: `contact.stiffness`, or that of a named number, which has no bounds.
+    value
+        The number, in SI.
+    """
     unit = format_dimension(value.dimension)
     number = float(value.number)
     part, _, own = name.rpartition(".")
@@ -273,7 +293,15 @@ def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
 
 
 def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
-    """Return every parameter of the scene: named ones, each part's, start values in use, those of links."""
+    """Return every parameter of the scene: named ones, each part's, start values in use, those of links.
+
+    Parameters
+    ----------
+    scene
+        Their values.
+    kinds, links
+        What is compiled: whose start values and counts are in use, and which links.
+    """
     found = {name: compiled_parameter(scene, name, value) for name, value in scene.parameters}
     needed = {name for kind in kinds for name in kind.parameters}
     for part in scene.parts:

@@ -174,11 +174,6 @@ LEVELS = {
 }
 
 
-def cut(text: str) -> str:
-    """Return a text short enough for a message."""
-    return text if len(text) <= 40 else text[:37] + "…"
-
-
 def format_expression(expr: Expr) -> str:
     """Return the text of a tree, with no more parentheses than it needs.
 

@@ -8,14 +8,14 @@ Does not: put a number in the place of a parameter, or look at clocks beyond nam
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 
 from apc.compiler.component import OTHERS, Component, Option, Reference, Send, option_test
 from apc.compiler.component import Number as NumberParameter
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.connections import connection_equations
+from apc.compiler.dimensions import Dimension
+from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.expression import (
     Binary,
     Call,
@@ -28,10 +28,8 @@ from apc.compiler.expression import (
     transform,
     walk,
 )
-from apc.compiler.parts import GROUND
-from apc.compiler.scene import Part, Scene, SceneGroup
-from apc.compiler.source import place_in
-from apc.compiler.units import Dimension
+from apc.compiler.instances import Part
+from apc.compiler.scene import Scene, SceneGroup
 from apc.compiler.values import Value
 
 PEERS = Name(("peers",))
@@ -142,7 +140,10 @@ def _flatten_kind(scene: Scene, groups: list[SceneGroup], delays: set[str], mist
         variables += instance.variables()
         equations += instance.equations()
         sends += instance.sends()
-    equations += _connections(parts, mistakes)
+    equations += [
+        FlatEquation(left, right, "connection", None, place)
+        for left, right, place in connection_equations(parts, mistakes)
+    ]
     for group in groups:
         for name, _ in group.columns:
             if name in delays:
@@ -289,88 +290,3 @@ class _Instance:
         if self.part.shared and len(node.parts) == 1 and head in self.divided:
             return Binary("/", whole, PEERS)
         return whole
-
-
-Node = tuple[str, str]  # (part, connector)
-
-
-def _connections(parts: list[Part], mistakes: Mistakes) -> Iterator[FlatEquation]:
-    """Yield, for each set of connectors that meet: potentials equal, flows summing to zero.
-
-    In a set with the ground the potentials are zero and the flows are whatever they must be.
-    """
-    here = {part.name: part for part in parts}
-    passed: dict[Node, list[Node]] = {}
-    for part in parts:
-        for connector, inner, its in part.component.passed:
-            passed.setdefault((part.name, connector), []).append((f"{part.name}.{inner}", its))
-    for members in _meeting(parts, here, passed, mistakes):
-        grounded = (GROUND, "") in members
-        joined = [node for node in members if node[0] != GROUND and node not in passed]
-        first_part, first_connector = joined[0]
-        type_ = dict(here[first_part].component.connectors)[first_connector]
-        place = here[joined[-1][0]].place
-        for variable in type_.potentials:
-            names = [_whole_name(node, variable.name) for node in joined]
-            if grounded:
-                for name in names:
-                    yield FlatEquation(name, Number(Fraction(0)), "connection", None, place)
-            else:
-                for name in names[1:]:
-                    yield FlatEquation(name, names[0], "connection", None, place)
-        if grounded:
-            continue
-        for variable in type_.flows:
-            total = _sum([_whole_name(node, variable.name) for node in joined])
-            yield FlatEquation(total, Number(Fraction(0)), "connection", None, place)
-
-
-def _sum(terms: Sequence[Expr]) -> Expr:
-    """Return a sum as a tree of little depth, so that a thousand parts may meet at one flange."""
-    if len(terms) <= 16:  # few read best as they are written, one after the other
-        return functools.reduce(lambda total, term: Binary("+", total, term), terms)
-    half = len(terms) // 2
-    return Binary("+", _sum(terms[:half]), _sum(terms[half:]))
-
-
-def _whole_name(node: Node, variable: str) -> Name:
-    return Name((*node[0].split("."), node[1], variable))
-
-
-def _meeting(
-    parts: list[Part], here: dict[str, Part], passed: dict[Node, list[Node]], mistakes: Mistakes
-) -> Iterator[list[Node]]:
-    """Yield the sets of connectors that meet, each read from what is joined to outwards."""
-    sets: dict[Node, list[Node]] = {}
-    for part in parts:
-        for connector, _ in part.component.connectors:
-            sets[(part.name, connector)] = [(part.name, connector)]
-
-    def join(one: Node, two: Node) -> None:
-        mine, other = sets[one], sets[two]
-        if mine is not other:
-            # What is joined to comes first, so that a set reads from the mass outwards.
-            other.extend(mine)
-            for member in mine:
-                sets[member] = other
-
-    for outer, inside in passed.items():
-        for inner in inside:
-            join(outer, inner)
-    for part in parts:
-        for connector, other, its_connector in part.connections:
-            own = (part.name, connector)
-            if other == GROUND:
-                if (GROUND, "") not in sets[own]:
-                    sets[own].append((GROUND, ""))  # each set has its own: the ground joins nothing
-            elif other not in here:
-                what = f"{part.name} is at groups where {other}, which it joins, is not"
-                hint = f"at: the same groups at both {part.name} and {other}"
-                mistakes.add("E210", part.place, what, hint=hint)
-            else:
-                join(own, (other, its_connector))
-    seen: set[int] = set()
-    for members in sets.values():
-        if id(members) not in seen:
-            seen.add(id(members))
-            yield members

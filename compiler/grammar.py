@@ -24,14 +24,11 @@ The grammar, loosest first; `^` and `**` are the same:
 
 from __future__ import annotations
 
-import re
-import unicodedata
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from typing import NoReturn
 
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.errors import ApcError, Mistake, Place, nearest, place_in
 from apc.compiler.expression import (
     COMPARISONS,
     FUNCTIONS,
@@ -49,10 +46,10 @@ from apc.compiler.expression import (
     Negate,
     Not,
     Number,
-    cut,
     format_expression,
 )
-from apc.compiler.source import place_in
+from apc.compiler.lexer import Token, tokens
+from apc.compiler.words import cut
 
 MAX_LENGTH = 10_000  # characters of an expression
 MAX_DEPTH = 100  # levels of the tree; Python's own stack allows about 300
@@ -107,89 +104,6 @@ def parse_equation(text: str, place: Place) -> Equation:
     return Equation(left, right, text, place)
 
 
-_TOKEN = re.compile(
-    r"(?P<space>[ \t\r\n]+)"
-    r"|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
-    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*(?:\[[0-9]+\])?(?:\.[A-Za-z_][A-Za-z0-9_]*(?:\[[0-9]+\])?)*)"
-    r"|(?P<symbol>\*\*|<=|>=|==|!=|[-+*/^(),<>=])"
-)
-_INDEX = re.compile(r"\[([0-9]+)\]")
-_LOOKALIKES = {"−": "-", "–": "-", "×": "*", "·": "*", "⋅": "*", "÷": "/", "²": "^2", "³": "^3"} | {
-    "≤": "<=",
-    "≥": ">=",
-    "≠": "!=",
-}
-_UNEXPECTED = {
-    "[": "an index is a whole number right behind its name, as in finger[2]",
-    ".": "only a name can be followed by a dot and another name",
-    "'": "an expression holds no quoted text",
-    '"': "an expression holds no quoted text",
-    "!": "an opposite is written not, an inequality !=",
-    "&": "two conditions are joined by and",
-    "|": "two conditions are joined by or",
-    "%": "there is no % in an expression; write a hundredth as 0.01",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class _Token:
-    kind: str  # "number", "name", "end", or the keyword or symbol itself
-    text: str
-    start: int
-    end: int
-
-
-def _raise(
-    text: str, place: Place, at: int, code: str, what: str, expected: str, got: str, hint: str
-) -> NoReturn:
-    """Raise one mistake at offset `at` of a text."""
-    raise ApcError(Mistake(code, place_in(place, text, at), what, expected, got, hint))
-
-
-def _tokens(text: str, place: Place) -> Iterator[_Token]:
-    """Split a text; `**` becomes `^`."""
-    at = 0
-    while at < len(text):
-        found = _TOKEN.match(text, at)
-        if found is None:
-            _refuse_character(text, place, at)
-        token, kind = found.group(), found.lastgroup or ""
-        if kind == "symbol":
-            kind = token = "^" if token == "**" else token
-        elif token in KEYWORDS:
-            kind = token
-        elif kind == "name":
-            _check_name(token, text, place, at)
-        if kind != "space":
-            yield _Token(kind, token, at, found.end())
-        at = found.end()
-    yield _Token("end", "", len(text), len(text))
-
-
-def _refuse_character(text: str, place: Place, at: int) -> NoReturn:
-    character = text[at]
-    if character in _UNEXPECTED:
-        what = f"{character} cannot stand here: {_UNEXPECTED[character]}"
-        _raise(text, place, at, "E321", what, "", "", "")
-    got = character if character.isascii() and character.isprintable() else ""
-    if not got:
-        name = unicodedata.name(character, "no character that has a name")
-        got = f"{character if character.isprintable() else ''} (U+{ord(character):04X}, {name})".lstrip()
-    hint = _LOOKALIKES.get(character, "")
-    _raise(text, place, at, "E321", "an expression", "ASCII letters, digits and + - * / ^ ( )", got, hint)
-
-
-def _check_name(name: str, text: str, place: Place, at: int) -> None:
-    for segment in name.split("."):
-        if segment.startswith("_"):
-            _raise(text, place, at, "E324", "a name", "a letter first", cut(name), "")
-        if segment in KEYWORDS:
-            _raise(text, place, at, "E324", f"{segment} is a word of the language, not a name", "", "", "")
-    for index in _INDEX.findall(name):
-        if index.startswith("0") or len(index) > 9:
-            _raise(text, place, at, "E324", "an index", "a whole number counted from 1", cut(index), "")
-
-
 class _Parser:
     """Precedence climbing over the tokens (Pratt 1973); `self.token` is the next one not yet used."""
 
@@ -200,7 +114,7 @@ class _Parser:
         self.depths: dict[int, tuple[Expr, int]] = {}
         if len(text) > MAX_LENGTH:
             self.too_long()
-        self.tokens = _tokens(text, place)
+        self.tokens = tokens(text, place)
         self.token = next(self.tokens)
         self.last_end = 0
 
@@ -208,7 +122,7 @@ class _Parser:
     def kind(self) -> str:
         return self.token.kind
 
-    def step(self) -> _Token:
+    def step(self) -> Token:
         """Use the next token."""
         used = self.token
         self.last_end = used.end
@@ -228,7 +142,8 @@ class _Parser:
     ) -> NoReturn:
         """Raise one mistake at an offset, by default at the next token."""
         offset = self.token.start if at is None else at
-        _raise(self.text, self.place, offset, code, what, expected, got, hint)
+        place = place_in(self.place, self.text, offset)
+        raise ApcError(Mistake(code, place, what, expected, got, hint))
 
     def too_long(self) -> NoReturn:
         got = f"{len(self.text)}"
@@ -238,7 +153,7 @@ class _Parser:
         """Name the next token for a message."""
         return cut(self.token.text) if self.token.text else "the end of the text"
 
-    def expect(self, kind: str, inside: str) -> _Token:
+    def expect(self, kind: str, inside: str) -> Token:
         """Use the next token, which has to be this one."""
         if self.kind != kind:
             self.fail("E322", inside, kind, self.got())
@@ -392,7 +307,7 @@ class _Parser:
             self.fail("E323", what, hint=hint, at=token.start)
         return Number(value, token.start, token.end)
 
-    def exact(self, token: _Token) -> Fraction:
+    def exact(self, token: Token) -> Fraction:
         """Return a literal's exact value, inside bounds."""
         if len(token.text) > MAX_DIGITS:
             got = f"{len(token.text)}"

@@ -17,8 +17,8 @@ import numpy as np
 
 from apc.compiler.compiled import Graph
 from apc.compiler.errors import ApcError, Mistakes
+from apc.compiler.nodes import Node, Scalar, Sequence
 from apc.compiler.reading import add_unknown, brief, check_keys, entries, form, read_mapping, read_text
-from apc.compiler.source import Node, Scalar, Sequence
 from apc.compiler.tables import Table, read_table
 from apc.compiler.values import Value
 
@@ -213,7 +213,17 @@ class _ArcReader:
 def read_pairs(
     node: Node | None, groups: MappingType[str, int], mistakes: Mistakes
 ) -> list[tuple[str, str, Node]]:
-    """Read `{SENDER: {RECEIVER: value}}` between groups, the values unread."""
+    """Read `{SENDER: {RECEIVER: value}}` between groups, the values unread.
+
+    Parameters
+    ----------
+    node
+        The mapping; None gives no pairs.
+    groups
+        How many peers each group has.
+    mistakes
+        Takes E203 and E206.
+    """
     found = []
     hint = "delays: {left: {right: 12 ms}}"
     for sender, body in entries(read_mapping(node, "delays", mistakes, hint=hint)):

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.component import Number, Option, Reference, Settable, Variable
 from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.nodes import Mapping as MappingNode
+from apc.compiler.nodes import Node, Scalar, Sequence
 from apc.compiler.reading import (
     add_unknown,
     brief,
@@ -27,10 +29,8 @@ from apc.compiler.reading import (
     read_name,
     read_text,
 )
-from apc.compiler.source import Mapping as MappingNode
-from apc.compiler.source import Node, Scalar, Sequence
 from apc.compiler.tables import Column, Table, read_table
-from apc.compiler.units import format_dimension
+from apc.compiler.unit_text import format_dimension
 from apc.compiler.values import Value
 
 LARGEST_COUNT = 10**9

@@ -13,7 +13,8 @@ from apc.compiler.cache import builtin_files
 from apc.compiler.component import Component, Connector
 from apc.compiler.definitions import read_component, read_connector
 from apc.compiler.errors import ApcError, Mistake
-from apc.compiler.source import Mapping, Scalar, Source, parse_source, read_source
+from apc.compiler.nodes import Mapping, Scalar
+from apc.compiler.source import Source, parse_source, read_source
 
 
 class Library:

@@ -14,15 +14,16 @@ from typing import Any
 import casadi
 import sympy
 
-from apc.compiler.blocks import Assignment, ImplicitBlock
 from apc.compiler.clocks import ClockedSystem, ReceiveCrossing
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.expression import format_expression
 from apc.compiler.flatten import FlatKind, FlatSystem
+from apc.compiler.nodes import Mapping, Node, Scalar
 from apc.compiler.scene import Scene
-from apc.compiler.source import Mapping, Node, Scalar, Source
+from apc.compiler.solution import Assignment, ImplicitBlock
+from apc.compiler.source import Source
 from apc.compiler.structure import SortedSystem
-from apc.compiler.units import format_dimension
+from apc.compiler.unit_text import format_dimension
 from apc.compiler.values import Value
 
 

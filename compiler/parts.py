@@ -12,11 +12,11 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 from apc.compiler.component import Component, Entry, Number, Option, Reference
+from apc.compiler.dimensions import Dimension
 from apc.compiler.errors import Mistakes, Place
+from apc.compiler.nodes import Mapping as MappingNode
+from apc.compiler.nodes import Node, Scalar
 from apc.compiler.reading import add_unknown, brief, check_keys, read_text
-from apc.compiler.source import Mapping as MappingNode
-from apc.compiler.source import Node, Scalar
-from apc.compiler.units import Dimension
 from apc.compiler.values import Binding, read_binding
 
 GROUND = "ground"
@@ -93,42 +93,32 @@ def read_entry(
         mistakes,
     )
     reader = _EntryReader(name, body, place, scope, mistakes, index, count)
-    values, options, references, described = [], [], [], []
-    for parameter in component.parameters:
-        if isinstance(parameter, Number):
-            value = reader.number(parameter)
-            if value is not None:
-                values.append((parameter.name, value))
-        elif isinstance(parameter, Option):
-            word = reader.option(parameter)
-            if word is not None:
-                options.append((parameter.name, word))
-        elif parameter.role in ("clock", "link") or (parameter.role == "table" and scope.outer is not None):
-            target = reader.reference(parameter)
-            if target is not None:
-                references.append((parameter.name, target))
-        elif (node := body.get(parameter.name)) is not None:
-            described.append((parameter.name, node))
-    starts = []
-    for variable in component.variables:
-        if variable.start is not None and body.get(variable.name) is not None:
-            start = reader.binding(variable.name, variable.unit.dimension, variable.unit.text, ())
-            if start is not None:
-                starts.append((variable.name, start))
-    connections = [
+    told = reader.parameters(component)
+    starts = reader.starts(component)
+    connections = tuple(
         joined
         for connector, type_ in component.connectors
         if (joined := reader.connection(connector, type_.name, connector in free_connectors)) is not None
-    ]
+    )
     targets = [(part, its) for _, part, its in connections if part != GROUND]
     if len(targets) > 1 and len(set(targets)) == 1:
         mistakes.add("E210", place, f"{name} joins {targets[0][0]} to itself")
-    return Entry(
-        tuple(values), tuple(options), tuple(references), tuple(described), tuple(starts), tuple(connections)
-    )
+    return Entry(told.values, told.options, told.references, told.described, starts, connections)
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What an entry says of its component's parameters: those of `Entry`."""
+
+    values: tuple[tuple[str, Binding], ...]
+    options: tuple[tuple[str, str], ...]
+    references: tuple[tuple[str, str], ...]
+    described: tuple[tuple[str, Node], ...]
 
 
 class _EntryReader:
+    """Reads one entry, value by value; what is missing or at fault is reported and left out."""
+
     def __init__(
         self,
         name: str,
@@ -146,6 +136,41 @@ class _EntryReader:
         self.mistakes = mistakes
         self.index = index
         self.count = count
+
+    def parameters(self, component: Component) -> _Told:
+        """Read the component's parameters, each by what it is."""
+        values, options, references, described = [], [], [], []
+        for parameter in component.parameters:
+            if isinstance(parameter, Number):
+                value = self.number(parameter)
+                if value is not None:
+                    values.append((parameter.name, value))
+            elif isinstance(parameter, Option):
+                word = self.option(parameter)
+                if word is not None:
+                    options.append((parameter.name, word))
+            elif self._is_named(parameter):
+                target = self.reference(parameter)
+                if target is not None:
+                    references.append((parameter.name, target))
+            elif (node := self.body.get(parameter.name)) is not None:
+                described.append((parameter.name, node))
+        return _Told(tuple(values), tuple(options), tuple(references), tuple(described))
+
+    def _is_named(self, parameter: Reference) -> bool:
+        """Return whether a parameter names something; inside a component, a table is one of the outer's."""
+        handed_on = parameter.role == "table" and self.scope.outer is not None
+        return parameter.role in ("clock", "link") or handed_on
+
+    def starts(self, component: Component) -> tuple[tuple[str, Binding], ...]:
+        """Read the start values that are given."""
+        found = []
+        for variable in component.variables:
+            if variable.start is not None and self.body.get(variable.name) is not None:
+                start = self.binding(variable.name, variable.unit.dimension, variable.unit.text, ())
+                if start is not None:
+                    found.append((variable.name, start))
+        return tuple(found)
 
     def binding(
         self, key: str, dimension: Dimension, unit: str, words: Collection[tuple[str, object]]

@@ -1,140 +1,52 @@
-"""A diagram as a picture: placed by a layout of our own, written as SVG.
+"""A diagram placed on a page: one peer's parts, the links beside it, groups and clocks below.
 
-Takes: `Diagram`. Gives: `place`, what stands where, and `draw_svg`.
-Guarantees: the same diagram gives the same bytes; no text overlaps another or is crossed by a line.
-Does not: look at equations.
-
-One peer's parts stand in columns: what drives a device first, then each part one column behind the one it is
-joined to (layers by breadth-first search, after Sugiyama, Tagawa and Toda, IEEE Trans. SMC 1981). As masses
-are joined to couplers only, every line runs between neighbouring columns and crosses no box.
+Takes: `Diagram`. Gives: `place`, a `Picture`.
+Guarantees: no text overlaps another or is crossed by a line; the same diagram gives the same picture.
+Does not: look at equations, or write a file (see `svg`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from html import escape
 
-from apc.compiler.diagram import Crowd, Diagram, Net, Node, Pulse, common_period, one_of, seconds
+from apc.compiler.diagram import Crowd, Diagram, Net, Pulse, Vertex, common_period, one_of, seconds
+from apc.compiler.layers import (
+    BETWEEN,
+    LINE,
+    PAD,
+    SYMBOL,
+    Spot,
+    connected_columns,
+    has_symbol,
+    joint_lines,
+    link_ways,
+    place_columns,
+)
+from apc.compiler.marks import (
+    EDGE,
+    FAINT,
+    FILL,
+    INK,
+    SIZE,
+    SMALL,
+    TITLE,
+    Box,
+    Dot,
+    Line,
+    Mark,
+    Picture,
+    Text,
+    text_width,
+)
 from apc.compiler.words import counted
 
-FONT = "Helvetica, Arial, 'DejaVu Sans', sans-serif"
-SIZE, SMALL, TITLE = 12.0, 10.5, 18.0
-LINE = 15.0  # from one line of text to the next
-PAD, GAP, BETWEEN = 10.0, 42.0, 20.0  # inside a box, between columns, between rows
-SYMBOL = 26.0  # height of a spring or damper
 THUMB = 96.0  # diameter of a picture of who hears whom
 WIDEST_ABOUT = 900.0  # what a longer sentence is cut to, unless the picture is wider
 MOST_PEERS = 16  # in such a picture
 MOST_TICKS = 120  # of one clock along the frame
-INK, FAINT, FILL, EDGE = "#1f2933", "#6b7785", "#e8eff8", "#2b4a72"
 # Colours that stay apart for a colour-blind reader (Okabe and Ito, 2008).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-
-
-@dataclass(frozen=True, slots=True)
-class Text:
-    """A line of text; (x, y) is where its baseline starts, or its middle with `middle`."""
-
-    x: float
-    y: float
-    text: str
-    size: float = SMALL
-    bold: bool = False
-    middle: bool = False
-    colour: str = INK
-
-    @property
-    def box(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom: an upper bound, as fonts differ."""
-        width = text_width(self.text, self.size, bold=self.bold)
-        left = self.x - width / 2 if self.middle else self.x
-        return left, self.y - 0.8 * self.size, left + width, self.y + 0.25 * self.size
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A rectangle with round corners."""
-
-    x: float
-    y: float
-    width: float
-    height: float
-    fill: str = "white"
-    stroke: str = INK
-    dashed: bool = False
-    round: float = 4.0
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A line through points, or with `curved` the curve from the first to the last, level at both ends."""
-
-    points: tuple[tuple[float, float], ...]
-    colour: str = INK
-    dashed: bool = False
-    arrows: bool = False
-    curved: bool = False
-    width: float = 1.4
-
-
-@dataclass(frozen=True, slots=True)
-class Dot:
-    """A circle."""
-
-    x: float
-    y: float
-    radius: float
-    fill: str = INK
-    stroke: str = INK
-
-
-Mark = Text | Box | Line | Dot
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """Marks on a page of `width` times `height`."""
-
-    width: float
-    height: float
-    marks: tuple[Mark, ...]
-
-
-def text_width(text: str, size: float, *, bold: bool = False) -> float:
-    """Return about how wide a text is, rather too wide: as in DejaVu Sans, the widest font."""
-    em = sum(
-        0.36 if c in "iljtfrI.,:;|!'()[]/ -" else 0.98 if c in "mwMW@%…" else 0.72 if c.isupper() else 0.64
-        for c in text
-    )
-    return em * size * (1.1 if bold else 1.0)
-
-
-# ---- layout ----
-
-
-@dataclass(frozen=True, slots=True)
-class _Cell:
-    """What stands in a column: a node, or (without one) the way of a line that goes on to the right."""
-
-    key: str
-    node: Node | None
-    width: float
-    height: float
-    link: str = ""  # where the line leads
-    after: str = ""  # the cell it comes from
-
-
-@dataclass(frozen=True, slots=True)
-class _Spot:
-    """Where a cell stands: its left side and middle, and the sides of its column."""
-
-    cell: _Cell
-    x: float
-    middle: float
-    left: float
-    right: float
 
 
 def place(diagram: Diagram) -> Picture:
@@ -147,12 +59,12 @@ def place(diagram: Diagram) -> Picture:
     y = top + 30
     ports: list[tuple[str, float, float]] = []  # link, x, y: where a line leaves the peer
     right = left + text_width(heading, SIZE, bold=True) + 2 * PAD
-    for columns in _connected(diagram):
-        spots, width, height = _layered(columns, diagram, left + 18, y)
-        marks += _joints(diagram, spots)
+    for columns in connected_columns(diagram):
+        spots, width, height = place_columns(columns, diagram, left + 18, y)
+        marks += joint_lines(diagram, spots)
         for spot in spots.values():
             marks += _drawn(spot, colours)
-        for link, way, port in _outgoing(columns, spots):
+        for link, way, port in link_ways(columns, spots):
             marks += way
             ports.append((link, *port))
         right = max(right, left + 18 + width + 18)
@@ -177,135 +89,7 @@ def _cut(text: str, width: float, size: float) -> str:
     return text
 
 
-def _cell(node: Node) -> _Cell:
-    if node.role == "joint":
-        return _Cell(node.name, node, 8, 8)
-    if node.role == "ground":
-        return _Cell(node.name, node, 26, 30)
-    widths = [text_width(node.name, SIZE, bold=True), *(text_width(line, SMALL) for line in node.lines), 70]
-    height = 2 * PAD + LINE * (1 + len(node.lines)) + (SYMBOL if _has_symbol(node) else 0)
-    return _Cell(node.name, node, max(widths) + 2 * PAD, height)
-
-
-def _has_symbol(node: Node) -> bool:
-    return node.role == "hand" or (node.role == "coupler" and (node.spring or node.damper))
-
-
-def _connected(diagram: Diagram) -> list[list[list[_Cell]]]:
-    """Return the connected sets of nodes, each as columns of cells; lines that go on right get cells too."""
-    neighbours: dict[str, list[str]] = {node.name: [] for node in diagram.nodes}
-    for one, two in diagram.joints:
-        neighbours[one].append(two)
-        neighbours[two].append(one)
-    by_name = {node.name: node for node in diagram.nodes}
-    rank = {"hand": 0, "mass": 1, "coupler": 2, "joint": 3, "ground": 4}
-    left = sorted(by_name, key=lambda name: rank[by_name[name].role])  # stable: the file's order within
-    seen: set[str] = set()
-    found = []
-    for first in left:
-        if first in seen:
-            continue
-        layer = [first]
-        seen.add(first)
-        layers = []
-        while layer:
-            layers.append([_cell(by_name[name]) for name in layer])
-            ahead = dict.fromkeys(two for one in layer for two in neighbours[one] if two not in seen)
-            seen |= ahead.keys()
-            layer = list(ahead)
-        for depth, cells in enumerate([list(cells) for cells in layers]):
-            for cell in cells:
-                for link in cell.node.links if cell.node else ():
-                    after = cell.key
-                    for column in layers[depth + 1 :]:
-                        key = f"{link} behind {after}"
-                        column.append(_Cell(key, None, 0, 6, link, after))
-                        after = key
-        found.append(layers)
-    return found
-
-
-def _layered(
-    columns: list[list[_Cell]], diagram: Diagram, left: float, top: float
-) -> tuple[dict[str, _Spot], float, float]:
-    """Return where each cell stands, and the width and height of all."""
-    depth = {cell.key: i for i, column in enumerate(columns) for cell in column}
-    before: dict[str, list[str]] = {key: [] for key in depth}
-    for one, two in diagram.joints:
-        if one in depth and two in depth:
-            first, second = sorted((one, two), key=lambda name: depth[name])
-            before[second].append(first)
-    for column in columns:
-        for cell in column:
-            if cell.after:
-                before[cell.key].append(cell.after)
-    centre: dict[str, float] = {}
-    spots: dict[str, _Spot] = {}
-    x = left
-    for column in columns:
-        width = max(cell.width for cell in column)
-        wanted = {
-            cell.key: sum(centre[name] for name in before[cell.key]) / max(1, len(before[cell.key]))
-            for cell in column
-        }
-        ordered = sorted(column, key=lambda cell: wanted[cell.key])
-        edge = -math.inf
-        for cell in ordered:
-            centre[cell.key] = max(wanted[cell.key], edge + cell.height / 2)
-            edge = centre[cell.key] + cell.height / 2 + BETWEEN
-        shift = sum(wanted[cell.key] - centre[cell.key] for cell in ordered) / len(ordered)
-        for cell in ordered:
-            centre[cell.key] += shift
-            start = x if cell.node is None else x + (width - cell.width) / 2
-            spots[cell.key] = _Spot(cell, start, centre[cell.key], x, x + width)
-        x += width + GAP
-    highest = min(spot.middle - spot.cell.height / 2 for spot in spots.values())
-    lowest = max(spot.middle + spot.cell.height / 2 for spot in spots.values())
-    moved = {key: replace(spot, middle=spot.middle - highest + top) for key, spot in spots.items()}
-    return moved, x - GAP - left, lowest - highest
-
-
-def _joints(diagram: Diagram, spots: dict[str, _Spot]) -> Iterable[Line]:
-    for one, two in diagram.joints:
-        if one in spots and two in spots:
-            first, second = sorted((spots[one], spots[two]), key=lambda spot: spot.left)
-            yield from _way(first, second, INK)
-
-
-def _way(first: _Spot, second: _Spot, colour: str, *, dashed: bool = False) -> Iterable[Line]:
-    """Draw from a cell to one in the next column: level beside the cells, bending between the columns."""
-    y0, y1 = first.middle, second.middle
-    if y0 == y1:
-        yield Line(((first.x + first.cell.width, y0), (second.x, y1)), colour, dashed)
-        return
-    if first.x + first.cell.width < first.right:
-        yield Line(((first.x + first.cell.width, y0), (first.right, y0)), colour, dashed)
-    yield Line(((first.right, y0), (second.left, y1)), colour, dashed, curved=True)
-    if second.left < second.x:
-        yield Line(((second.left, y1), (second.x, y1)), colour, dashed)
-
-
-def _outgoing(
-    columns: list[list[_Cell]], spots: dict[str, _Spot]
-) -> Iterable[tuple[str, list[Line], tuple[float, float]]]:
-    """Yield, for each line from a part to a link: the link, its way to the last column, where that ends."""
-    for column in columns:
-        for cell in column:
-            for link in cell.node.links if cell.node else ():
-                way: list[Line] = []
-                spot = spots[cell.key]
-                for later in columns:
-                    for passing in later:
-                        if passing.link == link and passing.after == spot.cell.key:
-                            way += _way(spot, spots[passing.key], FAINT, dashed=True)
-                            spot = spots[passing.key]
-                yield link, way, (spot.x + spot.cell.width, spot.middle)
-
-
-# ---- marks ----
-
-
-def _drawn(spot: _Spot, colours: dict[str, str]) -> Iterable[Mark]:
+def _drawn(spot: Spot, colours: dict[str, str]) -> Iterable[Mark]:
     cell, node = spot.cell, spot.cell.node
     if node is None:
         return
@@ -328,7 +112,7 @@ def _drawn(spot: _Spot, colours: dict[str, str]) -> Iterable[Mark]:
     )
     middle = x + cell.width / 2
     text_y = y + PAD + 10
-    if _has_symbol(node):
+    if has_symbol(node):
         yield from _symbol(node, middle, y + PAD + 6)
         text_y += SYMBOL
     yield Text(middle, text_y, node.name, SIZE, bold=True, middle=True)
@@ -337,7 +121,7 @@ def _drawn(spot: _Spot, colours: dict[str, str]) -> Iterable[Mark]:
         yield Text(middle, text_y, line, middle=True, colour=INK if " " in line else FAINT)
 
 
-def _symbol(node: Node, x: float, y: float) -> Iterable[Mark]:
+def _symbol(node: Vertex, x: float, y: float) -> Iterable[Mark]:
     """Draw a spring, a damper, both side by side, or the arrow of a force."""
     if node.role == "hand":
         yield Line(((x - 22, y), (x + 22, y)), width=2)
@@ -508,62 +292,3 @@ def _filled(crowd: Crowd, width: float) -> list[str]:
         else:
             lines.append(setting)
     return lines
-
-
-# ---- SVG ----
-
-
-def draw_svg(diagram: Diagram) -> str:
-    """Return a diagram as an SVG document."""
-    picture = place(diagram)
-    size = f"{_n(picture.width)} {_n(picture.height)}"
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" width="{_n(picture.width)}" '
-        f'height="{_n(picture.height)}" font-family="{FONT}" role="img">'
-    )
-    what = escape(f"{diagram.title}. {diagram.about}".strip())
-    body = [_svg(mark) for mark in picture.marks]
-    return "\n".join(
-        [head, f"<title>{what}</title>", '<rect width="100%" height="100%" fill="white"/>', *body, "</svg>"]
-    )
-
-
-def _svg(mark: Mark) -> str:
-    match mark:
-        case Text():
-            bold = ' font-weight="bold"' if mark.bold else ""
-            anchor = ' text-anchor="middle"' if mark.middle else ""
-            place_ = f'x="{_n(mark.x)}" y="{_n(mark.y)}" font-size="{_n(mark.size)}"'
-            return f'<text {place_} fill="{mark.colour}"{bold}{anchor}>{escape(mark.text)}</text>'
-        case Box():
-            dash = ' stroke-dasharray="5 3"' if mark.dashed else ""
-            size = f'x="{_n(mark.x)}" y="{_n(mark.y)}" width="{_n(mark.width)}" height="{_n(mark.height)}"'
-            look = f'rx="{_n(mark.round)}" fill="{mark.fill}" stroke="{mark.stroke}" stroke-width="1.3"{dash}'
-            return f"<rect {size} {look}/>"
-        case Dot():
-            where = f'cx="{_n(mark.x)}" cy="{_n(mark.y)}" r="{_n(mark.radius)}"'
-            return f'<circle {where} fill="{mark.fill}" stroke="{mark.stroke}" stroke-width="0.8"/>'
-        case Line():
-            return _line(mark)
-
-
-def _line(line: Line) -> str:
-    dash = ' stroke-dasharray="5 3"' if line.dashed else ""
-    style = f'fill="none" stroke="{line.colour}" stroke-width="{_n(line.width)}"{dash}'
-    (x0, y0), (x1, y1) = line.points[0], line.points[-1]
-    if line.curved:
-        half = (x1 - x0) / 2
-        path = f"M{_n(x0)} {_n(y0)} C{_n(x0 + half)} {_n(y0)} {_n(x1 - half)} {_n(y1)} {_n(x1)} {_n(y1)}"
-    else:
-        path = "M" + " L".join(f"{_n(x)} {_n(y)}" for x, y in line.points)
-    drawn = f'<path d="{path}" {style}/>'
-    if line.arrows:
-        for x, y, way in ((x0, y0, 1), (x1, y1, -1)):
-            head = f"{_n(x)} {_n(y)} {_n(x + 7 * way)} {_n(y - 3.5)} {_n(x + 7 * way)} {_n(y + 3.5)}"
-            drawn += f'<polygon points="{head}" fill="{line.colour}"/>'
-    return drawn
-
-
-def _n(number: float) -> str:
-    """Return a coordinate, in tenths; the same on every machine."""
-    return f"{number + 0.0:.1f}".removesuffix(".0")

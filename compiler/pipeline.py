@@ -17,8 +17,9 @@ from apc.compiler.compiled import CompiledSystem, Origin
 from apc.compiler.flatten import FlatSystem, flatten
 from apc.compiler.functions import build_functions
 from apc.compiler.library import Library
+from apc.compiler.nodes import Mapping, Scalar, Sequence
 from apc.compiler.scene import Scene, build_scene, library_folders
-from apc.compiler.source import Mapping, Scalar, Sequence, Source, read_source
+from apc.compiler.source import Source, read_source
 from apc.compiler.structure import SortedSystem, sort
 
 Stage = Literal["source", "scene", "flat", "clocked", "sorted", "compiled"]

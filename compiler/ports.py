@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import sympy
 
-from apc.compiler.blocks import ImplicitBlock
-from apc.compiler.scene import Part, Scene
+from apc.compiler.dimensions import Dimension
+from apc.compiler.instances import Part
+from apc.compiler.scene import Scene
+from apc.compiler.solution import ImplicitBlock
 from apc.compiler.structure import SortedKind
 from apc.compiler.symbolic import symbol
-from apc.compiler.units import Dimension
 
 WORK = Dimension((("kg", 1), ("m", 2), ("s", -2)))  # the joule
 

@@ -11,7 +11,7 @@ import re
 from collections.abc import Collection, Iterator
 
 from apc.compiler.errors import Mistakes, Place, nearest
-from apc.compiler.source import Mapping, Node, Scalar, Sequence
+from apc.compiler.nodes import Mapping, Node, Scalar, Sequence
 
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}\Z")
 

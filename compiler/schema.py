@@ -14,15 +14,17 @@ from typing import Any
 
 from apc.compiler.channels import PROBABILITIES
 from apc.compiler.component import Component, Number, Option, Parameter, Reference
+from apc.compiler.dimensions import Dimension
 from apc.compiler.errors import Place
 from apc.compiler.exchange import LOSS_ABOUT
 from apc.compiler.graphs import SHAPES
 from apc.compiler.groups import LARGEST_COUNT
+from apc.compiler.instances import PART_KEYS
 from apc.compiler.library import Library
 from apc.compiler.parts import LARGEST_ARRAY
 from apc.compiler.reading import IDENTIFIER
-from apc.compiler.scene import DEFAULT_TYPES, PART_KEYS, SECTIONS
-from apc.compiler.units import Dimension, Unit, parse_unit
+from apc.compiler.sections import DEFAULT_TYPES, SECTIONS
+from apc.compiler.units import Unit, parse_unit
 
 Schema = dict[str, Any]
 

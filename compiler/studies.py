@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.component import Number, Settable
 from apc.compiler.errors import Mistakes
+from apc.compiler.nodes import Node, Scalar, Sequence
 from apc.compiler.reading import add_unknown, brief, check_keys, form, read_mapping
-from apc.compiler.source import Node, Scalar, Sequence
 from apc.compiler.values import Value
 
 # What can be set: by the name a person writes, the whole names it stands for.
@@ -23,7 +23,17 @@ SettableNames = Mapping[str, list[tuple[str, Settable]]]
 def read_experiment(
     node: Node | None, read_time: Callable[[Node | None, str], Value | None], mistakes: Mistakes
 ) -> Experiment:
-    """Read `experiment: {duration: 3 s, seed: 1}`; `read_time` reads a duration."""
+    """Read `experiment: {duration: 3 s, seed: 1}`.
+
+    Parameters
+    ----------
+    node
+        The section.
+    read_time
+        Reads a duration in seconds; its second argument says what it is, for messages.
+    mistakes
+        Takes E203 and E207.
+    """
     section = read_mapping(node, "experiment", mistakes, hint="experiment: {duration: 3 s}")
     if section is None:
         return Experiment()

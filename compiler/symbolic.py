@@ -7,15 +7,16 @@ Does not: know clocks or crossings, or which symbols move (see `index`).
 
 from __future__ import annotations
 
-import random
+import operator
 import sys
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Set
+from dataclasses import dataclass
 from fractions import Fraction
-from math import prod
 
 import sympy
 
-from apc.compiler.expression import Binary, Call, Compare, Conditional, Expr, Logic, Name, Negate, Not, Number
+from apc.compiler.evaluation import OPERATORS, Operation, compute
+from apc.compiler.expression import Binary, Call, Compare, Conditional, Expr, Logic, Name, Negate, Not
 
 # Smooth functions are SymPy's own; the others are opaque heads that only `functions` gives a meaning.
 SMOOTH: dict[str, Callable[[sympy.Expr], sympy.Expr]] = {
@@ -53,47 +54,49 @@ def derivative_symbol(name: str) -> sympy.Symbol:
 
 def to_sympy(expression: Expr, differentiate: Callable[[sympy.Expr], sympy.Expr]) -> sympy.Expr:
     """Build the SymPy expression; `differentiate` gives the time derivative of one, for `der`."""
+    return compute(expression, _Symbols(differentiate))
 
-    def build(node: Expr) -> sympy.Expr:
+
+@dataclass(frozen=True, slots=True)
+class _Symbols:
+    """SymPy's expressions as an arithmetic."""
+
+    differentiate: Callable[[sympy.Expr], sympy.Expr]
+
+    def literal(self, value: Fraction) -> sympy.Expr:
+        return sympy.Rational(value.numerator, value.denominator)
+
+    def named(self, node: Name) -> sympy.Expr:
+        return symbol(".".join(node.parts))
+
+    def operation(self, node: Operation) -> Callable[..., sympy.Expr]:
+        found: Callable[..., sympy.Expr]
         match node:
-            case Number(value=value):
-                return sympy.Rational(value.numerator, value.denominator)
-            case Name(parts=parts):
-                return symbol(".".join(parts))
-            case Negate(operand=operand):
-                return -build(operand)
-            case Binary(operator=operator, left=left, right=right):
-                return _binary(operator, build(left), build(right))
-            case Compare(operator=operator, left=left, right=right):
-                return head(COMPARISONS[operator])(build(left), build(right))
-            case Logic(operator=operator, left=left, right=right):
-                return head(operator)(build(left), build(right))
-            case Not(operand=operand):
-                return head("not")(build(operand))
-            case Conditional(condition=condition, then=then, otherwise=otherwise):
-                return head("if")(build(condition), build(then), build(otherwise))
-            case Call(function="der", arguments=arguments):
-                return differentiate(build(arguments[0]))
-            case Call(function=function, arguments=arguments):
-                values = [build(argument) for argument in arguments]
-                smooth = SMOOTH.get(function)
-                return smooth(*values) if smooth else head(function)(*values)
-        raise AssertionError(f"no SymPy form of {node!r}")
+            case Negate():
+                found = operator.neg
+            case Binary():
+                found = operator.pow if node.operator == "^" else OPERATORS[node.operator]
+            case Compare():
+                found = head(COMPARISONS[node.operator])
+            case Not():
+                found = head("not")
+            case Call("der"):
+                found = self.differentiate
+            case Call():
+                found = SMOOTH.get(node.function) or head(node.function)
+        return found
 
-    return build(expression)
+    def joined(self, node: Logic, left: sympy.Expr, right: Callable[[], sympy.Expr]) -> sympy.Expr:
+        return head(node.operator)(left, right())
 
-
-def _binary(operator: str, left: sympy.Expr, right: sympy.Expr) -> sympy.Expr:
-    match operator:
-        case "+":
-            return left + right
-        case "-":
-            return left - right
-        case "*":
-            return left * right
-        case "/":
-            return left / right
-    return left**right
+    def chosen(
+        self,
+        node: Conditional,
+        condition: sympy.Expr,
+        then: Callable[[], sympy.Expr],
+        otherwise: Callable[[], sympy.Expr],
+    ) -> sympy.Expr:
+        return head("if")(condition, then(), otherwise())
 
 
 def is_no_number(expression: sympy.Expr) -> bool:
@@ -210,82 +213,6 @@ def linear_form(expression: sympy.Expr, unknowns: Set[sympy.Symbol]) -> LinearFo
     return None
 
 
-class ZeroTest:
-    """Says whether a rational expression is zero for all values of its symbols.
-
-    Each symbol, and each function value, gets a random residue modulo the prime 2⁶¹ − 1; an expression that
-    isn't zero vanishes there with probability below its degree/2⁶¹ (Schwartz 1980, Zippel 1979). Expansion
-    would decide the same at a cost that grows with the number of terms. The generator is seeded.
-
-    With `nonzero`, all other symbols are taken as zero: whether an expression is zero then. With `values`,
-    these symbols have their values: whether it is zero for all values of the others.
-    """
-
-    _PRIME = 2**61 - 1
-
-    def __init__(
-        self,
-        nonzero: Set[sympy.Symbol] | None = None,
-        values: Mapping[sympy.Symbol, Fraction] | None = None,
-    ) -> None:
-        self._nonzero = nonzero
-        self._values: dict[sympy.Expr, int] = {
-            name: value.numerator * pow(value.denominator, -1, self._PRIME) % self._PRIME
-            for name, value in (values or {}).items()
-        }
-        self._random = random.Random(0)
-
-    def define(self, name: sympy.Symbol, expression: sympy.Expr) -> None:
-        """Let a symbol stand for an expression."""
-        self._values[name] = self._value(expression)
-
-    def __call__(self, expression: sympy.Expr) -> bool:
-        """Return whether the expression is zero."""
-        return expression.is_zero is True or (not expression.is_Number and self._value(expression) == 0)
-
-    def _value(self, node: sympy.Expr) -> int:
-        known = self._values.get(node)
-        if known is None:
-            known = self._values[node] = self._compute(node)
-        return known
-
-    def _compute(self, node: sympy.Expr) -> int:
-        prime = self._PRIME
-        if node.is_Symbol and self._nonzero is not None and node not in self._nonzero:
-            return 0
-        if node.is_Rational:
-            return int(node.p) * pow(int(node.q), -1, prime) % prime
-        if node.is_Add:
-            return sum(self._value(term) for term in node.args) % prime
-        if node.is_Mul:
-            return prod(self._value(factor) for factor in node.args) % prime
-        if node.is_Pow and node.exp.is_Integer and (base := self._value(node.base)):
-            return pow(base, int(node.exp), prime)
-        return self._random.randrange(1, prime)
-
-
 def no_derivative(expression: sympy.Expr) -> sympy.Expr:
     """Stand in for `differentiate` where `der` can't occur."""
     raise AssertionError(f"der of {expression} stands in a clocked equation")
-
-
-class Vanishing:
-    """Says whether an expression is zero with the numbers of some group of peers.
-
-    What is divided by must not be, even though other numbers would do.
-    """
-
-    def __init__(self, numbers: Sequence[Mapping[sympy.Symbol, Fraction]]) -> None:
-        self._tests = [ZeroTest(values=values) for values in numbers]
-
-    def define(self, name: sympy.Symbol, expression: sympy.Expr) -> None:
-        """Let a symbol stand for an expression."""
-        for test in self._tests:
-            test.define(name, expression)
-
-    def __call__(self, expression: sympy.Expr) -> bool:
-        """Return whether the expression is zero for one of the groups."""
-        return any(test(expression) for test in self._tests)
-
-
-NOTHING_VANISHES = Vanishing(())

@@ -13,22 +13,16 @@ from dataclasses import dataclass
 from fractions import Fraction
 from graphlib import CycleError, TopologicalSorter
 
-from apc.compiler.dimensions import ANY, dimension_of
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.dimensions import DIMENSIONLESS, Dimension
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, place_in
 from apc.compiler.evaluation import evaluate
 from apc.compiler.expression import Expr, Name, format_expression, names, transform
 from apc.compiler.grammar import parse_expression
+from apc.compiler.nodes import Node, Scalar
 from apc.compiler.reading import add_unknown, brief, read_text
-from apc.compiler.source import Node, Scalar, place_in
-from apc.compiler.units import (
-    DIMENSIONLESS,
-    Dimension,
-    format_dimension,
-    format_si,
-    parse_quantity,
-    parse_unit,
-    quantity,
-)
+from apc.compiler.unit_check import ANY, dimension_of
+from apc.compiler.unit_text import format_dimension, format_si
+from apc.compiler.units import parse_quantity, parse_unit, quantity
 
 PEERS = ("peers",)
 
@@ -263,6 +257,15 @@ def resolve_in_order(
     waiting: Mapping[str, Binding], peers: int, mistakes: Mistakes
 ) -> tuple[dict[str, Value], set[str]]:
     """Settle named numbers that depend on each other, in the order in which they can be known.
+
+    Parameters
+    ----------
+    waiting
+        The numbers as written, by name.
+    peers
+        What the name `peers` stands for.
+    mistakes
+        Takes E206 a name that isn't known, E209 a circle, and those of evaluating.
 
     Returns
     -------

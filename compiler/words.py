@@ -1,6 +1,6 @@
 """The words of messages and reports: numbers with their nouns and units, and lines that fit a terminal.
 
-Takes: numbers and texts. Gives: `WIDTH`, `counted`, `with_unit`, `wrapped`.
+Takes: numbers and texts. Gives: `WIDTH`, `cut`, `counted`, `with_unit`, `wrapped`.
 Guarantees: a line is at most `WIDTH` columns wide, but for a word that has no place to break it at.
 Does not: know what is told, or print.
 """
@@ -14,9 +14,14 @@ WIDTH = 80  # columns of a terminal as it opens
 _PIECE = re.compile(r"[^*/(,]+[*/(,]*|[*/(,]+")  # of a word, broken behind an operator
 
 
-def counted(number: int, noun: str) -> str:
-    """Return a number and its noun."""
-    return f"{number} {noun}" + ("" if number == 1 else "s")
+def cut(text: str) -> str:
+    """Return a text short enough for a message."""
+    return text if len(text) <= 40 else text[:37] + "…"
+
+
+def counted(number: int, noun: str, form: str = "d") -> str:
+    """Return a number and its noun; `form` is Python's format of the number: `,` groups its digits."""
+    return f"{number:{form}} {noun}" + ("" if number == 1 else "s")
 
 
 def with_unit(number: str, unit: str) -> str:

@@ -1,12 +1,13 @@
-"""`dimensions`: what fits together, and which term is named when something does not."""
+"""`unit_check`: what fits together, and which term is named when something does not."""
 
 import pytest
 
-from apc.compiler.dimensions import ANY, SECOND, check_equation, dimension_of
+from apc.compiler.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.expression import Name
 from apc.compiler.grammar import parse_equation, parse_expression
-from apc.compiler.units import DIMENSIONLESS, Dimension, parse_unit
+from apc.compiler.unit_check import ANY, check_equation, dimension_of
+from apc.compiler.units import parse_unit
 
 HERE = Place("a.yaml")
 UNITS = {
