@@ -1,6 +1,6 @@
 """One thread for the linear algebra of small matrices.
 
-Takes: nothing. Gives: the context manager `single_threaded`.
+Takes: nothing. Gives: the context manager `single_threaded`; `start_single_threaded`.
 Guarantees: BLAS and OpenMP pools are back as they were on leaving.
 Does not: limit threads of our own, or libraries loaded after its first use.
 """
@@ -8,11 +8,17 @@ Does not: limit threads of our own, or libraries loaded after its first use.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped] # it ships no types
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped] # it ships no types
+
+# What says how many threads a pool has: OpenMP's for all, OpenBLAS's and MKL's own before it.
+POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @contextmanager
@@ -30,14 +36,24 @@ def single_threaded() -> Iterator[None]:
         yield
 
 
+def start_single_threaded() -> None:
+    """Ask for one thread of the libraries that are about to be loaded, unless the environment says other.
+
+    For a process that does nothing else: threads that are never made save a short command 20 to 40 ms. With
+    NumPy loaded already it is too late, and nothing is done.
+    """
+    if "numpy" not in sys.modules and not any(name in os.environ for name in POOLS):
+        os.environ |= dict.fromkeys(POOLS, "1")
+
+
 @lru_cache(maxsize=1)
 def _pinned() -> bool:
     """Say whether every pool got one thread from the environment when it was loaded.
 
     OpenBLAS looks at its own variable first, and MKL at its own; both, and OpenMP, at OMP_NUM_THREADS.
     """
-    own = (os.environ.get(name, "1") for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"))
-    return os.environ.get("OMP_NUM_THREADS") == "1" and all(value == "1" for value in own)
+    own = (os.environ.get(name, "1") for name in POOLS)
+    return "OMP_NUM_THREADS" in os.environ and all(value == "1" for value in own)
 
 
 @lru_cache(maxsize=1)
@@ -46,4 +62,6 @@ def _pools() -> ThreadpoolController:
 
     A library loaded after the first call is not seen; every stage imports its own at the top.
     """
+    from threadpoolctl import ThreadpoolController  # not needed where there is one thread already
+
     return ThreadpoolController()

@@ -63,7 +63,7 @@ def frame_matrix(
     The state is every peer's (x, v, x_O, v_O), then its last computed forces, newest first, then its last
     packets, newest first: as many as any delay can ask for, so some entries may matter to nobody.
     """
-    frame = _frame(scene.haptic, scene.network)
+    frame = common_period(scene.haptic, scene.network)
     force_depth = math.ceil(scene.comp / scene.haptic) + 1
     packet_depth = math.ceil(max(scene.comm, *scene.late.values(), Fraction(0)) / scene.network) + 1
     n = scene.peers * (4 + 3 * force_depth + 2 * packet_depth)
@@ -74,7 +74,7 @@ def frame_matrix(
     return [[columns[c][r] for c in range(n)] for r in range(n)]
 
 
-def _frame(one: Fraction, other: Fraction) -> Fraction:
+def common_period(one: Fraction, other: Fraction) -> Fraction:
     """Return the least common multiple of two periods."""
     return Fraction(
         math.lcm(one.numerator * other.denominator, other.numerator * one.denominator),

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import sys
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
+import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.runtime.bench.bench import SAME, Bench, Measured, bench, bench_analysis, pareto_front
@@ -70,6 +74,13 @@ def test_every_method_that_serves_the_scene_is_measured_beside_its_error(found: 
     assert simulation.notes == ("the scene starts at rest: its first peer is moved by 10 mm",)
 
 
+def test_the_function_of_its_name_does_what_the_command_does() -> None:
+    found = apc.bench(compiled(AVERAGE), set={"coordination.stiffness": "400 N/m"}, rounds=1)
+    assert isinstance(found, apc.Bench)
+    assert found.comparisons[0].reference.startswith("spectral radius 0.95")
+    assert found.topology == "three-users-average"
+
+
 def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     text = replaced(
         AVERAGE,
@@ -79,6 +90,15 @@ def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     [(name, reason)] = bench_analysis(compiled(text), rounds=1).refused
     assert name == "paper"
     assert "one clock of forces (here are haptic and slow)" in reason
+
+
+def test_a_matrix_of_all_peers_that_would_take_minutes_is_left_out() -> None:
+    many = compiled(replaced(AVERAGE, ("count: 3", "count: 1000000")))
+    found = bench_analysis(many, rounds=1)
+    for name in ("dense", "krylov"):
+        assert dict(found.refused)[name] == "its matrix of 8,000,000 states takes minutes"
+    assert dict(found.refused)["paper"] == "its matrix of 32,000,000 states takes minutes"
+    assert {"modes", "certified"} <= {one.name for one in found.measured}
 
 
 def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
@@ -96,6 +116,19 @@ def test_the_picture_has_a_panel_a_task(found: Bench, tmp_path: Path) -> None:
     assert "exact (default)" in [text.get_text() for text in axes[1].texts]
     save_bench(found, tmp_path / "bench.svg")
     assert (tmp_path / "bench.svg").stat().st_size > 10_000
+
+
+def test_no_name_in_the_picture_stands_over_another_or_leaves_its_panel(found: Bench) -> None:
+    near = [_one(f"semi-implicit:{k} ms", 1e-3 * (1 + k / 50), 1e-9 * (1 + k / 20)) for k in range(9)]
+    for comparison in (*found.comparisons, replace(found.comparisons[1], measured=pareto_front(near))):
+        figure = draw_bench(replace(found, comparisons=(comparison, *found.comparisons[1:])))
+        figure.draw_without_rendering()
+        ax = figure.axes[0]
+        boxes = [text.get_window_extent() for text in ax.texts]
+        assert len(boxes) >= len(comparison.measured)
+        assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
+        frame = ax.get_window_extent()
+        assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes)
 
 
 def test_a_scaled_scene_is_the_text_with_another_count(tmp_path: Path) -> None:
@@ -138,6 +171,33 @@ def test_the_command_prints_one_document(tmp_path: Path, capsys: pytest.CaptureF
     assert run(["bench", str(path), "--scale", "3", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert [row["peers"] for row in document["rows"]] == [3]
-    assert run(["bench", str(path), "--scale", "many"]) == 1
-    assert "E921 the numbers wants like 3,30,300, got many" in capsys.readouterr().err
     assert run(["bench", str(path), "--hard"]) == 2
+
+
+@pytest.mark.parametrize("words", ["many", "3,,4", "3.5", "nan", "1e400", "0", "1e10"])
+def test_a_list_that_is_none_of_peers_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["bench", str(SCENES / "template.yaml"), "--scale", words]) == 1
+    assert capsys.readouterr().err.startswith("--scale: E921 the list wants numbers ")
+
+
+def test_a_picture_that_cannot_be_drawn_is_refused_before_anything_is_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: pytest.fail("it is measured"))
+    words = ["bench", str(SCENES / "template.yaml"), "--plot"]
+    assert run([*words, "bench.txt"]) == 1
+    assert "E878 the suffix of --plot" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert run([*words, "bench.png"]) == 1
+    assert "E875 matplotlib is not installed" in capsys.readouterr().err
+
+
+def test_a_picture_that_cannot_be_written_costs_no_figures(
+    found: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: found)
+    words = ["bench", str(SCENES / "template.yaml"), "--plot", str(tmp_path / "nowhere" / "bench.png")]
+    assert run(words) == 1
+    printed = capsys.readouterr()
+    assert "E601 can't be written" in printed.err
+    assert "analyze chooses modes" in printed.out

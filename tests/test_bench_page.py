@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import re
+from pathlib import Path
 
 from tests.bench.__main__ import HERE, PAGE, PARTS, Part, run, sections
+from tests.bench.readme import BLOCK, ERROR, README, pictures, printed
 
-HELPERS = {"__init__", "__main__", "naive_region"}  # not run by themselves
+HELPERS = {"__init__", "__main__", "naive_region", "drake", "pathsim"}  # not run by themselves
 
 
 def test_every_benchmark_is_part_of_the_page() -> None:
@@ -34,3 +37,35 @@ def test_the_page_has_a_section_a_part_and_gives_them_back() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert list(sections(text)) == [part.title for part in PARTS]
     assert text.endswith("\n".join(sections(text).values()))
+
+
+def test_every_picture_of_the_readme_is_drawn_by_a_command_that_stands_there() -> None:
+    text = README.read_text(encoding="utf-8")
+    shown = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
+    found = pictures(text)
+    assert shown
+    assert list(found) == shown
+    assert {words[1] for words in found.values()} == {"region", "simulate"}
+    for picture, words in found.items():
+        assert words[-1] == picture
+        assert all((README.parent / word).is_file() for word in words if word.endswith(".yaml"))
+    assert {path.name for path in (README.parent / "models" / "figures").iterdir()} == {
+        Path(picture).name for picture in shown
+    }
+
+
+def test_every_printed_block_of_the_readme_has_a_maker_that_prints_it() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert len(BLOCK.findall(text)) == text.count("```text\n") > 0
+    for words, block in BLOCK.findall(text):
+        if words == ERROR:  # the commands are run by the tests of the README
+            assert printed(words, text) == block
+
+
+def test_every_number_of_the_readmes_prose_on_regions_stands_on_the_page() -> None:
+    """1.51 to 1.85 times with damping, and the mesh ahead from where the contact is at its limit."""
+    page = sections(PAGE.read_text(encoding="utf-8"))["Regions"]
+    low, high = 1.5116401379, 1.8485695579
+    assert f"{low:.10f}" in page
+    assert f"{high:.10f}" in page
+    assert f"{low:.2f} to {high:.2f} times" in README.read_text(encoding="utf-8")

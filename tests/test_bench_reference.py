@@ -101,13 +101,7 @@ def test_a_course_is_that_of_stepping_by_hand() -> None:
 
 
 def test_what_has_no_reference_says_why() -> None:
-    timed = replaced(
-        AVERAGE,
-        ("studies:", "hands:\n  push: {type: RampForce, flange: device, force: 2 N, rise: 0.5 s}\nstudies:"),
-    )
     lossy = replaced(AVERAGE, ("delay: 8 ms}\nstudies", "delay: 8 ms, loss: 2 %}\nstudies"))
-    assert refusal(compiled(timed), in_time=True) == "a force on user changes between its ticks"
-    assert refusal(compiled(timed), in_time=False) == ""
     assert refusal(compiled(lossy), in_time=True) == "packets get lost or come late by chance"
     assert refusal(edged(paper()), in_time=False) == "user looks at each sender by itself"
     many = columned(paper(peers=20), device__mass=[0.1 + 0.01 * i for i in range(20)])

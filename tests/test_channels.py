@@ -14,8 +14,9 @@ from apc.compiler.compiled import Channel, CompiledSystem, Loss
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.listing import describe
 from apc.compiler.pipeline import compile_topology
+from apc.compiler.recordings import read_trace
 from apc.compiler.store import load, save
-from apc.compiler.tables import MOST_MISTAKES, read_trace
+from apc.compiler.tables import MOST_MISTAKES
 from tests.topologies import AVERAGE, compiled, replaced, scene, told
 
 LINK = "  lan: {clock: network, delay: 8 ms}"

@@ -65,7 +65,7 @@ def test_json_is_one_document_with_what_made_it(capsys: pytest.CaptureFixture[st
     ("words", "said"),
     [
         ([], "three-users-average: E877 the scene says no duration."),
-        (["--duration", "3"], "--duration: E204 duration wants s, got 3 (no unit). Write: duration: 3 s"),
+        (["--duration", "3"], '--duration: E204 duration wants s, got 3 (no unit). Write: --duration "3 s"'),
         (["--duration", "-1 s"], "three-users-average: E877 the duration wants more than 0 s, got -1 s."),
         (["--duration", "1 s", "--signals", "cube.y"], "three-users-average: E873 no signal fits 'cube.y';"),
         (["--duration", "1 s", "--out", "run.doc"], "run.doc: E878 the suffix of --out wants one of .csv,"),
@@ -74,6 +74,11 @@ def test_json_is_one_document_with_what_made_it(capsys: pytest.CaptureFixture[st
         (
             ["--duration", "1 s", "--method", "rk4:-1 ms"],
             "--method: E911 the step of rk4 wants more than 0 s",
+        ),
+        (["--duration", "1e9 s"], "three-users-average: E915 the duration wants at most 1e+06 s"),
+        (
+            ["--duration", "1 s", "--method", "rk4:0"],
+            "--method: E204 the step of rk4 wants s, got 0 (no unit). Write: rk4:0.1ms",
         ),
         (["--duration", "1 s", "--method", "rk4:3 ms"], "three-users-average: E913 the step of rk4 wants at"),
         (["--duration", "1 s", "--still", "run.doc"], "run.doc: E878 the suffix of --still wants one of"),
@@ -89,6 +94,18 @@ def test_what_is_wrong_is_told_in_one_line(
     assert out == ""
     assert err.startswith(said)
     assert [one.name for one in Path().iterdir()] == ["scene.yaml"]
+
+
+def test_a_scene_at_rest_is_said_to_rest(capsys: pytest.CaptureFixture[str]) -> None:
+    scene(AVERAGE)
+    assert run(["simulate", "--duration", "1 s"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "three-users-average: rests",
+        "",
+        "  Nothing moves: no force and no start value sets it in motion.",
+        "",
+        "  recorded       1001 rows of 24 signals until 1 s",
+    ]
 
 
 def test_an_unstable_scene_is_an_answer(capsys: pytest.CaptureFixture[str]) -> None:

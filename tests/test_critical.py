@@ -18,7 +18,7 @@ from apc.runtime.vary.critical import critical
 from apc.runtime.vary.crossings import scan
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, LIMITS
-from tests.topologies import AVERAGE, MESH, compiled, replaced
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 TEXTS = {"AP": AVERAGE, "VC": MESH}
 NONE = {"contact.delay": "0", "coordination.delay": "0", "lan.delay": "0"}
@@ -196,7 +196,16 @@ def test_no_crossing_is_an_answer_in_words() -> None:
         (["peers"], "E623 peers is the number of peers"),
         (["contact.stifness"], "E622 contact.stifness is no parameter"),
         (["haptic.period"], "E844 haptic.period sets the rhythm of a clock"),
+        (["haptic.phase"], "E844 haptic.phase sets the rhythm of a clock"),
+        (["user.contact.delay"], "contact.delay is one time for all groups. Write: contact.delay"),
+        ([""], "E622 an empty name is no parameter of"),
+        (["links."], "E622 links. is no parameter of"),
         (["contact.stiffness", "--upper", "3 kg"], "E204 contact.stiffness wants N/m, got 3 kg"),
+        (
+            ["contact.stiffness", "--upper", "900"],
+            "--upper: E204 contact.stiffness wants N/m, got 900 (no",
+        ),
+        (["contact.stiffness", "--upper", "900"], 'Write: --upper "900 N/m"'),
         (
             ["contact.stiffness", "--lower", "9 N/m", "--upper", "3 N/m"],
             "E842 the range of contact.stiffness wants",
@@ -226,12 +235,49 @@ def test_the_command_prints_one_document_or_lines_of_80_columns(tmp_path, monkey
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_a_scene_that_is_not_linear_has_estimates_and_says_so() -> None:
-    from tests.topologies import SCENES
-
+def test_a_scene_that_is_not_linear_is_bounded_in_floats_and_says_so() -> None:
     text = (SCENES / "finger.yaml").read_text(encoding="utf-8").partition("\n")[2]
     found = critical(compiled(text), "wall.stiffness", lower="2000 N/m", upper="9000 N/m")
     assert found.crossings
-    assert found.crossings[0].proof == "estimated in floats"
+    assert found.crossings[0].proof == "bounded in floats"
     with pytest.raises(ApcError, match="E845"):
         critical(compiled(text), "wall.delay")
+
+
+def test_many_packets_on_their_way_give_the_crossings_that_few_give(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a matrix that holds the packets: the argument principle instead, from this many on."""
+    system = with_values(compiled(AVERAGE), {"coordination.stiffness": "690", "contact.stiffness": "100"})
+    by_matrix = critical(system, "lan.delay", upper="16 ms")
+    monkeypatch.setattr("apc.runtime.vary.delays.LONG_LINES", 0)
+    monkeypatch.setattr("apc.runtime.analysis.plan.LONG_LINES", 0)
+    by_count = critical(system, "lan.delay", upper="16 ms")
+    assert by_matrix.crossings
+    for one, other in zip(by_matrix.crossings, by_count.crossings, strict=True):
+        assert (one.value, one.stable_side, one.kind) == (other.value, other.stable_side, other.kind)
+        assert one.frequency_hz == pytest.approx(other.frequency_hz, rel=1e-6)
+
+
+def test_what_does_not_enter_the_analysis_is_said_not_to() -> None:
+    found = critical(compiled(AVERAGE), "cube.x")
+    assert not found.enters
+    assert found.value is None
+    assert "stable whatever its value: nothing that decides stability depends on it" in str(found)
+    assert critical(compiled(AVERAGE), "coordination.stiffness", upper="900 N/m").enters
+
+
+def test_how_far_a_search_is_can_be_followed() -> None:
+    told: list[str] = []
+    critical(compiled(AVERAGE), "coordination.stiffness", told=told.append)
+    assert told[0].startswith("looking at ")
+    assert told[-1] == "proving crossing 1 of 1"
+    critical(compiled(AVERAGE), "lan.delay", upper="10 ms", told=told.append)
+    assert told[-1] == "looking at lan.delay up to 0.01 s of 0.01 s"
+
+
+def test_where_a_contact_begins_to_push_is_found_from_either_number_of_free_motions() -> None:
+    """The half width of the cube, 20 mm: beyond it a device moves freely, which is one motion more."""
+    text = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8").partition("\n")[2]
+    found = critical(compiled(text), "left.device.x")
+    assert found.enters
+    assert found.value == pytest.approx(-0.02, abs=1e-12)
+    assert found.scanned[0] < -0.03, "a negative value is within what is scanned"

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from apc.compiler.pipeline import compile_topology
 from apc.runtime.analysis.analysis import Analysis, analyze, lifted_groups
-from apc.runtime.eigen.modes import complete_loops, dense, split
+from apc.runtime.eigen.modes import arrange, complete_loops, dense, split
 from apc.runtime.eigen.spectrum import Spectrum
+from apc.runtime.frame.overrides import apply, parse_override
 from apc.runtime.large.characteristic import characteristic_ball, refine
 from apc.runtime.large.determinant import of_crowds
 from apc.runtime.large.determinant_spectrum import solve_crowds, solve_loops
@@ -19,6 +21,7 @@ from apc.runtime.large.zeros import find_zeros, near_poles
 from tests.bruteforce import Scene, frame_matrix
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper
+from tests.topologies import SCENES
 
 VARIED: list[dict[str, Any]] = [
     {},
@@ -265,3 +268,27 @@ def test_a_zero_that_no_start_leads_to_is_found_by_the_count() -> None:
     blind = find_zeros(function, np.array([0.5 + 0.1j]), rigid=1, listed=3, near=0)
     sighted = find_zeros(function, np.zeros(0, complex), rigid=1, listed=3, near=8)
     assert blind.counted and blind.low == pytest.approx(sighted.low, abs=1e-9)
+
+
+def test_an_eigenvalue_that_is_a_pole_is_told_by_the_count() -> None:
+    """On a ring of eight, graph eigenvalue 0, nobody hears anybody: f is 1, the eigenvalues are the poles."""
+    groups, exchange = lifted_groups(linked(paper(peers=8, kt=300.0, bt=1.0, kc=1000.0), "ring"))
+    [deaf] = [loop for loop in arrange(groups, exchange).loops if loop.name == "graph +0"]
+    found = solve_loops([deaf])
+    poles = np.linalg.eigvals(groups[0].lifted.p)
+    assert found.spectral_radius == pytest.approx(np.abs(poles).max(), abs=1e-13)
+    assert found.spectral_radius_error < 1e-10
+    [site] = deaf.sites
+    shares = dict(found.modes[0].participation)
+    assert sum(shares[name] for name in site.lifted.z_names) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_equal_students_of_a_star_near_the_boundary_are_not_missed() -> None:
+    scene = compile_topology(SCENES / "star-lecture.yaml")
+    system = apply(scene, [parse_override(scene, "contact.stiffness=2098 N/m")])
+    found, whole = analyze(system, method="determinant"), analyze(system, method="dense")
+    assert found.stable is whole.stable is True
+    apart = abs(found.spectral_radius - whole.spectral_radius)
+    assert apart <= found.spectral_radius_error + whole.spectral_radius_error
+    assert found.spectral_radius_error < 1e-8
+    assert {mode.multiplicity for mode in found.modes} == {1, 19}

@@ -166,6 +166,34 @@ def test_every_function_of_the_language_has_its_meaning(tmp_path: Path) -> None:
         assert got == pytest.approx(-expected / 2, rel=1e-14), a
 
 
+def test_the_largest_of_three_is_one_of_them(tmp_path: Path) -> None:
+    own = library(
+        tmp_path,
+        "component: Odd\nconnectors: {flange: Flange}\nparameters: {k: {unit: N/m}}\n"
+        "equations: ['flange.f = max(k*flange.x, 1.5*k*flange.x, 2*k*flange.x)']\n",
+    )
+    system = compiled(ONE_MASS + "hands: {odd: {type: Odd, flange: device, k: 3 N/m}}\n", own)
+    (kind,) = system.kinds
+    p = vector(system, kind)
+    got = [numbers(kind.derivative([x, 0.0], [], p, 0))[1] for x in (-1.0, 1.0)]
+    assert got == [3 / 2, -6 / 2]  # of 2 kg
+
+
+def test_a_memory_that_nobody_reads_is_none(tmp_path: Path) -> None:
+    own = library(
+        tmp_path,
+        "component: Filter\nconnectors: {flange: Flange}\n"
+        "parameters: {clock: clock, k: {unit: N/m}}\nvariables: {s: {unit: m, start: 2 mm}}\n"
+        "equations: [s = sample(flange.x), before = previous(s), flange.f = k*hold(s)]\n",
+    )
+    text = ONE_MASS + (
+        "clocks: {tick: 1 ms}\ncouplers: {all: {type: Filter, flange: device, k: 9 N/m, clock: tick}}\n"
+    )
+    (kind,) = compiled(text, own).kinds
+    assert (kind.clocks[0].outputs, kind.clocks[0].memories) == (("all.s",), ())
+    assert "all.s" not in kind.parameters
+
+
 def test_a_group_may_have_a_delay_of_its_own() -> None:
     groups = "one: {count: 1, set: {contact.delay: 2 ms}}\n  two: {count: 2}"
     system = compiled(replaced(AVERAGE, ("user: {count: 3}", groups)))

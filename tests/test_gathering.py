@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.frame.packets import PacketSource, channel_law
+from apc.runtime.frame.channel_law import channel_law
+from apc.runtime.frame.packets import PacketSource
 from apc.runtime.simulate.blocks import blocks
 from apc.runtime.simulate.simulation import Simulation, prepare
 from tests.eventwise import MS, Play, User, coast, contact, pull
@@ -105,7 +106,7 @@ def test_a_played_scene_is_what_looking_at_every_packet_gives(operator: str, mor
     expected = by_hand(
         Play(USERS, operator),
         duration,
-        lambda i, j: PacketSource(law, "lan", i, j, seed=3).take(70).tolist(),
+        lambda i, j: PacketSource(law, "lan", [(i, j)], seed=3).take(70)[0].tolist(),
         newest="all" not in more,
         zero="zero" in more,
     )

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from apc.runtime.sweep.grid import GridAxis, build_grid, parse_axis
+from apc.runtime.sweep.grid import GridAxis, build_grid, check_size, parse_axis
 from tests.topologies import AVERAGE, compiled, told
 
 MODEL = compiled(AVERAGE)
@@ -170,5 +170,16 @@ def test_a_grid_needs_axes_each_once_and_not_too_many_points() -> None:
     assert told(build_grid, [axis, axis]) == ["sweep: E883 contact.stiffness is swept twice."]
     many = [GridAxis(f"p{i}", None, "1", tuple(Fraction(v) for v in range(1000))) for i in range(3)]
     assert told(build_grid, many) == [
-        "sweep: E883 a sweep wants at most 10,000,000 points, got 1000 × 1000 × 1000 = 1,000,000,000."
+        "sweep: E883 a sweep wants at most 10,000,000 points, got 1,000 × 1,000 × 1,000 = 1,000,000,000."
     ]
+
+
+def test_a_grid_too_large_is_refused_before_its_values_are_built() -> None:
+    """A tenth of a millisecond; the values would take seconds and gigabytes."""
+    expected = "sweep: E883 a sweep wants at most 10,000,000 points, got "
+    assert told(check_size, ["0 N/m:1 N/m:1000000", "0 N/m:1 N/m:1000000:log"]) == [
+        f"{expected}1,000,000 × 1,000,000 = 1,000,000,000,000."
+    ]
+    assert told(check_size, ["0:1 N/m:99999999"]) == [f"{expected}99,999,999."]
+    assert told(check_size, ["0:1 N/m:" + "9" * 5000])[0].startswith(expected)
+    check_size(["0:1 N/m", "1, 2, 3 N/m", "0:1 N/m:many", "0:1 N/m:10000"])

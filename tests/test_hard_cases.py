@@ -54,6 +54,10 @@ def analysed(**values: Any) -> Analysis:
     return analyze(system)
 
 
+# What a Jordan block of ten zeros, a queue, keeps of the truth's 300 digits or so.
+SCATTERED = 1e-25
+
+
 def check(found: Analysis, values: list[flint.acb], *, rigid: int, bits: int = 200) -> None:
     """Assert that the truth is within every bound and the verdict is what it says.
 
@@ -71,7 +75,8 @@ def check(found: Analysis, values: list[flint.acb], *, rigid: int, bits: int = 2
     with precision(bits):
         for mode in found.modes:
             place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
-            assert min(float(abs(place - value).mid()) for value in values) <= mode.error * (1 + 1e-9)
+            apart = min(float(abs(place - value).mid()) for value in values)
+            assert apart <= mode.error * (1 + 1e-9) + SCATTERED
         apart = sorted(values, key=lambda value: float(abs(value - 1).mid()))
         assert all(float(abs(value - 1).mid()) < 1e-25 for value in apart[:rigid])
         radius = max((abs(value).mid() for value in apart[rigid:]), default=flint.arb(0))

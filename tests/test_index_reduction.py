@@ -13,14 +13,15 @@ from typing import Any
 
 import pytest
 
-from apc.compiler.blocks import ImplicitBlock
-from apc.compiler.clocks import CONTINUOUS, ClockedKind, HoldCrossing, Partition, SampleCrossing
+from apc.compiler.clock_inference import CONTINUOUS
+from apc.compiler.clocks import ClockedKind, HoldCrossing, Partition, SampleCrossing
+from apc.compiler.dimensions import DIMENSIONLESS
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.expression import Number
 from apc.compiler.flatten import FlatEquation, FlatKind, FlatVariable
 from apc.compiler.grammar import parse_equation, parse_expression
+from apc.compiler.solution import ImplicitBlock
 from apc.compiler.structure import SortedKind, sort_kind
-from apc.compiler.units import DIMENSIONLESS
 
 PLACE = Place("test.yaml", 1, 1)
 MASS = """

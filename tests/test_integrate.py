@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import casadi
 import numpy as np
@@ -53,23 +55,25 @@ experiment: {duration: 40 ms}
 """
 
 
-def dense_output(laws: object, start: list[float], times: np.ndarray) -> np.ndarray:
+def dense_output(
+    laws: Callable[[bool], Callable[[float, Any], Any]], start: list[float], times: np.ndarray
+) -> np.ndarray:
     """Integrate piece by piece: `laws(inside)` is a right-hand side, pieces end where x changes sign."""
 
     def surface(t: float, x: np.ndarray) -> float:
         return float(x[0])
 
-    surface.terminal = True  # type: ignore[attr-defined]
+    surface.terminal = True  # type: ignore[attr-defined] # solve_ivp looks for it on the function
     rows, x, t, inside = [start], np.array(start), times[0], start[0] > 0
     for end in times[1:]:
         while t < end:
-            law = laws(inside)  # type: ignore[operator]
+            law = laws(inside)
             found = solve_ivp(law, (t, end), x, "DOP853", rtol=3e-14, atol=1e-17, events=surface)
             t, x = found.t[-1], found.y[:, -1]
             if found.status == 1:
                 inside = not inside
                 h = min(1e-12, end - t)
-                x, t = x + h * np.array(laws(inside)(t, x)), t + h  # type: ignore[operator]
+                x, t = x + h * np.array(laws(inside)(t, x)), t + h
         rows.append(x.tolist())
     return np.array(rows)
 
@@ -231,9 +235,9 @@ def test_what_jumps_without_a_slope_is_not_linear() -> None:
     ],
 )
 def test_what_cant_be_integrated_on_is_kept_until_there(
-    law: object, rows: int, last: float | None, capfd: pytest.CaptureFixture[str]
+    law: Callable[[Any], Any], rows: int, last: float | None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    played = blocks(prepare(alone(lambda x, u: law(x)), Fraction(1, 10)))  # type: ignore[operator]
+    played = blocks(prepare(alone(lambda x, u: law(x)), Fraction(1, 10)))
     block = next(played)
     assert len(block.time) == rows
     if last is not None:

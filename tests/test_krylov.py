@@ -1,4 +1,4 @@
-"""Claims about `sparse_system` and `krylov`: different peers on sparse graphs."""
+"""Claims about `sparse_system`, `relative` and `krylov`: different peers on sparse graphs."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import pytest
 
 from apc.runtime.analysis.analysis import analyze, lifted_groups
 from apc.runtime.eigen.modes import dense
-from apc.runtime.large.krylov import count_beyond, solve_sparse
-from apc.runtime.large.sparse_system import relative_matrix, sparse_system
-from apc.runtime.large.translation import common_translation
+from apc.runtime.large.krylov import argument_of, count_beyond, solve_sparse
+from apc.runtime.large.relative import relative_matrix, rigid_space
+from apc.runtime.large.sparse_system import small_matrix, sparse_system
+from apc.runtime.large.translation import free_motions
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper
 
@@ -45,11 +46,13 @@ def test_groups_with_delays_of_their_own_are_the_dense_matrix_too() -> None:
 
 @pytest.mark.parametrize("graph", ["ring", PATH])
 def test_taking_the_rigid_motion_out_leaves_all_other_eigenvalues(graph: Any) -> None:
-    system = different(6, graph=graph)
-    whole = sparse_system(*crowded(system))
-    [motions] = common_translation(*crowded(system)) or [np.zeros((0, 0))]
-    relative = relative_matrix(whole, np.tile(motions, (6, 1)))
-    assert len(relative.places) == relative.matrix.shape[0] == whole.matrix.shape[0] - 1
+    listed, exchange = crowded(different(6, graph=graph))
+    whole = sparse_system(listed, exchange)
+    motions = free_motions(listed, exchange)
+    rigid = motions and rigid_space(whole, exchange, motions)
+    assert rigid and len(rigid.held) == 1
+    relative = relative_matrix(whole, rigid)
+    assert len(rigid.rest) == relative.matrix.shape[0] == whole.matrix.shape[0] - 1
     one, other = (np.linalg.eigvals(part.toarray()) for part in (relative.matrix, whole.matrix))
     large = other[(np.abs(other) > 0.3) & (np.abs(other - 1) > 1e-9)]
     assert all(np.abs(one - value).min() < 1e-11 for value in large)
@@ -93,14 +96,14 @@ def test_a_count_on_samples_is_the_number_of_larger_eigenvalues(radius: float) -
     values = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
     [crowd] = listed
     alone = np.linalg.eigvals(crowd.lifted.p).astype(complex).ravel()
-    matrix = sparse_system(listed, exchange).matrix
-    found = count_beyond(matrix, (alone, np.ones(len(alone))), np.array([1.0 + 0j]), radius)
+    argument = argument_of(sparse_system(listed, exchange), listed)
+    found = count_beyond(argument, (alone, np.ones(len(alone))), np.array([1.0 + 0j]), radius)
     assert found == int((np.abs(values) > radius).sum())
 
 
 def test_the_notes_say_what_is_an_estimate() -> None:
     listed, exchange = crowded(different(20, graph="ring"))
-    found = solve_sparse(listed, exchange, common_translation(listed, exchange))
+    found = solve_sparse(listed, exchange)
     assert found.notes == (
         "the largest modes only, by Arnoldi's method; their errors are estimates, not bounds",
         "that no eigenvalue is larger was counted by the argument principle on samples",
@@ -116,7 +119,47 @@ def test_two_rings_that_do_not_hear_each_other_translate_apart() -> None:
     assert found.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-11)
 
 
-def test_peers_free_to_move_one_by_one_leave_the_verdict_open() -> None:
-    found = analyze(different(12, graph="ring", kt=0.0, bt=0.0), method="krylov")
+@pytest.mark.parametrize("values", CLOCKS)
+def test_the_small_determinant_is_that_of_the_whole_over_those_of_the_peers(values: dict[str, Any]) -> None:
+    listed, exchange = crowded(different(5, graph=PATH[:4] + PATH[5:9], **values))
+    system = sparse_system(listed, exchange)
+    small, whole = small_matrix(system, listed), system.matrix.toarray()
+    for point in (1.1 + 0.2j, 0.9j, -1.05 + 0j):
+        peers = np.prod([np.linalg.det(np.eye(p.shape[-1]) - p / point) for p in listed[0].lifted.p])
+        expected = np.linalg.det(np.eye(len(whole)) - whole / point) / peers
+        assert np.linalg.det(small(point).toarray()) == pytest.approx(expected, rel=1e-9)
+
+
+def test_peers_free_to_move_one_by_one_are_so_in_the_whole() -> None:
+    system = different(12, graph="ring", kt=0.0, bt=0.0)
+    found, whole = analyze(system, method="krylov"), analyze(system, method="dense")
+    assert (found.verdict, found.rigid_modes) == (whole.verdict, whole.rigid_modes)
+    assert found.rigid_modes == 12
+    assert found.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-11)
+
+
+@pytest.mark.parametrize("loose", ["contact__stiffness", "none"])
+def test_a_device_that_hangs_loose_translates_by_itself(loose: str) -> None:
+    """Devices nobody holds, and copies that only move together, on a path of two parts."""
+    arcs = [arc for arc in PATH if {arc[0], arc[1]} != {2, 3}]
+    system = different(6, graph=arcs, kc=0.0, bc=0.0) if loose != "none" else different(6, graph=arcs)
+    found, whole = analyze(system, method="krylov"), analyze(system, method="dense")
+    assert (found.verdict, found.rigid_modes) == (whole.verdict, whole.rigid_modes)
+    assert found.rigid_modes == (8 if loose != "none" else 2)
+    assert found.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-10)
+
+
+def test_what_drifts_leaves_the_radius_open() -> None:
+    frictionless = {"device.damping": 0.0, "cube.damping": 0.0}
+    base = paper(peers=4, comp=Fraction(0), kt=0.0, bt=2.0, kc=500.0, bc=2.0)
+    found = analyze(linked(grouped(base, ("user", 4, frictionless)), "ring"), method="krylov")
     assert found.stable is None
-    assert any("left open" in note for note in found.notes)
+    assert found.spectral_radius_error >= found.spectral_radius
+    assert any("drifts" in note for note in found.notes)
+
+
+def test_a_peer_that_differs_in_what_it_is_free_to_do_leaves_the_verdict_open() -> None:
+    system = columned(linked(paper(peers=5), "ring"), contact__stiffness=[0.0, *[1000.0] * 4])
+    found = analyze(system, method="krylov")
+    assert found.stable is None
+    assert found.spectral_radius_error >= found.spectral_radius

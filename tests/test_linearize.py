@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
 
 import casadi
 import numpy as np
-import pytest
 
-from apc.compiler.compiled import Kind
 from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.linearize import linearize, linearize_exact
+from apc.runtime.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row, sites_of_rows
 from apc.runtime.frame.parameters import resolve
-from tests.sites import NAMES, edged, paper, user
+from tests.sites import NAMES, paper, user
 
 
 def _vector(**values: float) -> np.ndarray:
@@ -49,12 +45,6 @@ def test_exact_matrices_are_the_floats_without_their_rounding() -> None:
     np.testing.assert_allclose(exact.a.astype(float), rounded.a, rtol=1e-15)
 
 
-def test_a_pattern_is_structure_whatever_the_numbers() -> None:
-    built = jacobians(user("mean"))
-    assert built.pattern.ticks[0].r[1].all()
-    assert not linearize(built, _vector(kt=0.0, bt=0.0)).ticks[0].r.any()
-
-
 def test_a_site_that_is_not_affine_is_linearized_at_its_start_values() -> None:
     kind = user("mean")
     x, u = casadi.SX.sym("x", 4), casadi.SX.sym("u", 2)
@@ -68,47 +58,13 @@ def test_a_site_that_is_not_affine_is_linearized_at_its_start_values() -> None:
     assert linearize_exact(built, parameters).a[1, 0] == -12
 
 
-@pytest.mark.parametrize(
-    "force",
-    [
-        lambda x, t: casadi.sign(x),
-        lambda x, t: casadi.floor(x / 0.001),
-        lambda x, t: casadi.if_else(x > 0, 1.0, 0.0),
-        lambda x, t: casadi.if_else(x == 0, 1.0, 0.0),
-    ],
-)
-@pytest.mark.parametrize("where", ["moving", "ticking", "heard", "sent", "each other"])
-def test_a_force_that_jumps_is_not_affine_though_its_slopes_are_the_same_everywhere(
-    force: Callable[[Any, Any], Any], where: str
-) -> None:
-    assert jacobians(jumping(lambda x, t: 0 * x, where)).affine
-    assert not jacobians(jumping(force, where)).affine
-
-
-@pytest.mark.parametrize("where", ["moving", "ticking", "sent"])
-def test_a_force_that_jumps_at_a_time_is_affine(where: str) -> None:
-    assert jacobians(jumping(lambda x, t: casadi.if_else(t > 1, 1.0, 0.0), where)).affine
-
-
-def jumping(force: Callable[[Any, Any], Any], where: str) -> Kind:
-    """Return the paper's user with a force added to what moves, is computed, heard or sent."""
-    [kind] = edged(paper()).kinds if where == "each other" else [user("mean")]
-    [partition], [sending] = kind.clocks, kind.sends
-    if where == "moving":
-        x, u, p, t = (casadi.SX.sym("a", *kind.derivative.size_in(i)) for i in range(4))
-        changed = kind.derivative(x, u, p, t) + casadi.vertcat(0, force(x[0], t), 0, 0)
-        return replace(kind, derivative=casadi.Function("derivative", [x, u, p, t], [changed]))
-    if where == "sent":
-        x, u, p, t = (casadi.SX.sym("a", *sending.send.size_in(i)) for i in range(4))
-        send = casadi.Function("send", [x, u, p, t], [sending.send(x, u, p, t) + force(x[0], t)])
-        return replace(kind, sends=(replace(sending, send=send),))
-    if where == "each other":
-        [receive] = partition.receives
-        assert receive.edge is not None
-        x, u, m, s, p, t = (casadi.SX.sym("a", *receive.edge.size_in(i)) for i in range(6))
-        edge = casadi.Function("edge", [x, u, m, s, p, t], [receive.edge(x, u, m, s, p, t) + force(s[0], t)])
-        return replace(kind, clocks=(replace(partition, receives=(replace(receive, edge=edge),)),))
-    x, u, m, r, p, t = (casadi.SX.sym("a", *partition.tick.size_in(i)) for i in range(6))
-    outputs = partition.tick(x, u, m, r, p, t) + force(r[0] if where == "heard" else x[0], t)
-    tick = casadi.Function("tick", [x, u, m, r, p, t], [outputs])
-    return replace(kind, clocks=(replace(partition, tick=tick),))
+def test_many_rows_are_the_sites_one_by_one() -> None:
+    built = jacobians(user("mean"))
+    vectors = np.stack([_vector(kt=kt, cube=cube) for kt, cube in ((100.0, 0.1), (200.0, 0.3), (0.0, 1.0))])
+    rows = linearize_rows(built, vectors)
+    together = sites_of_rows(built, rows)
+    for place, vector in enumerate(vectors):
+        alone = linearize(built, vector)
+        for site in (site_of_row(built, rows[place]), alone):
+            np.testing.assert_array_equal(site.a, together.a[place])
+            np.testing.assert_array_equal(site.ticks[0].r, together.ticks[0].r[place])

@@ -572,6 +572,11 @@ TOPOLOGY = [
         "library: ./nowhere\nstudies:",
         "16:10: E214 the library folder ./nowhere does not exist.",
     ),
+    (  # longer than any file system's names
+        "studies:",
+        f"library: {'x' * 300}\nstudies:",
+        f"16:10: E214 the library folder {'x' * 57}... does not exist.",
+    ),
     (
         "500 N/m,",
         "peers*100,",

@@ -10,7 +10,7 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.modes import dense, modes, split
+from apc.runtime.eigen.modes import dense, split
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, columned, edged, grouped, linked, paper
 
@@ -59,12 +59,12 @@ def test_groups_are_the_whole_spectrum_too() -> None:
         ("alone", 1, {"cube.damping": 7.0}),
     )
     groups, exchange = lifted_groups(system)
-    assert [(one.name, one.multiplicity) for one in modes(groups, exchange)] == [
+    assert [(one.name, one.multiplicity) for one in split(groups, exchange).systems] == [
         ("common", 1),
         ("difference left", 1),
         ("difference right", 2),
     ]
-    assert modes(groups, exchange)[0].names[:2] == ("left.device.x", "left.device.v")
+    assert split(groups, exchange).systems[0].names[:2] == ("left.device.x", "left.device.v")
     assert _apart(_split(system), np.linalg.eigvals(dense(groups, exchange).matrix)) < 1e-12
 
 
@@ -72,7 +72,7 @@ def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
     system = grouped(paper(), ("left", 2, {"device.x.start": 0.1}), ("right", 1, {"hand.force": 2.0}))
     [group], exchange = lifted_groups(system)
     assert (group.name, group.count) == ("left+right", 3)
-    assert [one.name for one in modes([group], exchange)] == ["common", "difference"]
+    assert [one.name for one in split([group], exchange).systems] == ["common", "difference"]
 
 
 CONVENTIONS: list[dict[str, object]] = [
@@ -216,7 +216,7 @@ def test_peers_that_differ_one_by_one_are_grouped_by_what_they_share() -> None:
     ]
     scene = Scene(peers=5, users=({}, {"device": 0.2}, {}, {}, {"device": 0.2}), **GAINS)
     assert _apart(_split(system), _brute(scene), same_size=False) < 1e-12
-    assert [one.multiplicity for one in modes(groups, exchange)] == [1, 2, 1]
+    assert [one.multiplicity for one in split(groups, exchange).systems] == [1, 2, 1]
 
 
 PAIRS = {("left", "right"): 12 * MS, ("right", "left"): 3 * MS, ("right", "right"): 8 * MS}
@@ -293,7 +293,9 @@ def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values
     gains = {"kc": 1500.0, "bc": 2.0}
     mesh = paper("sum", peers=peers, kt=900.0 / others, bt=3.0 / others, **gains, **values)
     mean = paper("mean", peers=peers, kt=900.0, bt=3.0, **gains, **values)
-    for one, other in zip(modes(*lifted_groups(mesh)), modes(*lifted_groups(mean)), strict=True):
+    for one, other in zip(
+        split(*lifted_groups(mesh)).systems, split(*lifted_groups(mean)).systems, strict=True
+    ):
         size = np.abs(other.matrix).max()
         np.testing.assert_allclose(one.matrix, other.matrix, rtol=1e-12, atol=1e-12 * size)
         assert _apart(np.linalg.eigvals(one.matrix), np.linalg.eigvals(other.matrix)) < 1e-12
@@ -301,15 +303,15 @@ def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values
 
 def test_two_peers_cannot_tell_a_mean_from_a_sum() -> None:
     for one, other in zip(
-        modes(*lifted_groups(paper("sum", peers=2))),
-        modes(*lifted_groups(paper("mean", peers=2))),
+        split(*lifted_groups(paper("sum", peers=2))).systems,
+        split(*lifted_groups(paper("mean", peers=2))).systems,
         strict=True,
     ):
         np.testing.assert_array_equal(one.matrix, other.matrix)
 
 
 def test_a_million_peers_are_two_small_systems() -> None:
-    systems = modes(*lifted_groups(paper(peers=1_000_000)))
+    systems = split(*lifted_groups(paper(peers=1_000_000))).systems
     assert [(len(one.matrix), one.multiplicity) for one in systems] == [(8, 1), (8, 999_999)]
 
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.frame.packets import PacketSource, channel_law
+from apc.runtime.frame.channel_law import channel_law
+from apc.runtime.frame.packets import PacketSource
 from apc.runtime.simulate.simulation import prepare
 from apc.runtime.simulate.trajectory import simulate
 from tests.eventwise import MS, coast
@@ -212,7 +213,7 @@ def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, mo
     system = scene(tmp_path, text, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
     law = channel_law(system, system.links[0], 8 * MS)
     ways = GRAPHS[graph] if graph else COMPLETE
-    late = {way: PacketSource(law, "lan", *way, seed=3).take(50).tolist() for way in ways}
+    late = {way: PacketSource(law, "lan", [way], seed=3).take(50)[0].tolist() for way in ways}
 
     def packet(i: int, j: int, tick: int) -> tuple[int, bool]:
         return effective(late[i, j], tick, newest="all" not in more)

@@ -6,7 +6,6 @@ event with none of their code. `python -m tests.fuzz --scenes 1000` tries more o
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -17,6 +16,7 @@ from hypothesis import strategies as st
 from apc.runtime.analysis.analysis import lifted_groups
 from apc.runtime.eigen.modes import dense, split
 from tests import bruteforce
+from tests.bruteforce import common_period
 from tests.topologies import compiled
 
 MS = Fraction(1, 1000)
@@ -101,7 +101,7 @@ def scenes(draw: st.DrawFn) -> Drawn:
     periods = st.builds(Fraction, st.integers(1, 6), st.sampled_from([1, 1, 1, 2, 3]))
     haptic = draw(periods)
     network = draw(
-        periods.filter(lambda period: _frame(haptic, period) / min(haptic, period) <= MOST_TICKS)
+        periods.filter(lambda period: common_period(haptic, period) / min(haptic, period) <= MOST_TICKS)
         | st.integers(1, 8).map(lambda times: times * haptic)
     )
     parts = st.sampled_from([Fraction(0), Fraction(0), Fraction(1, 2), Fraction(1, 3), Fraction(7, 10)])
@@ -129,11 +129,6 @@ def scenes(draw: st.DrawFn) -> Drawn:
         draw(st.integers(0, 3)),
         draw(st.integers(0, 3)),
     )
-
-
-def _frame(one: Fraction, other: Fraction) -> Fraction:
-    numerator = math.lcm(one.numerator * other.denominator, other.numerator * one.denominator)
-    return Fraction(numerator, one.denominator * other.denominator)
 
 
 def check(drawn: Drawn) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apc.runtime.eigen.pseudospectrum import balance, cluster_radius, norms, pseudospectral_radius
+from apc.runtime.eigen.pseudospectrum import balance, norms, pseudospectral_radius
 
 
 def _reach(matrix: np.ndarray, error: float, angles: int = 720) -> float:
@@ -86,12 +86,3 @@ def test_the_radius_is_finite_whatever_the_matrix() -> None:
     assert pseudospectral_radius(np.zeros((3, 3)), 0.0) == 0.0
     assert pseudospectral_radius(np.zeros((3, 3)), 2.0) == 2.0
     assert np.isfinite(pseudospectral_radius(1e100 * np.eye(4, k=1), 1e80))
-
-
-def test_a_cluster_s_radius_is_henrici_s() -> None:
-    assert cluster_radius(1, 0.0, 1e-10) == 1e-10
-    assert cluster_radius(2, 0.0, 1e-10) == 1e-10
-    # ε (1/d + Δ/d²) = 1 for m = 2: d = (ε + √(ε² + 4 ε Δ))/2
-    error, departure = 1e-10, 0.3
-    exact = (error + np.sqrt(error**2 + 4 * error * departure)) / 2
-    assert exact * (1 - 1e-12) <= cluster_radius(2, departure, error) <= 1.5 * exact

@@ -12,11 +12,11 @@ from tests.bench.random_scenes import check, run
 from tests.sites import paper
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, 14, 15])
 def test_no_bound_fails_and_no_verdict_is_wrong(seed: int) -> None:
-    tally = run(30, seed=seed)
+    tally = run(16, seed=seed, draws=4)
     assert tally.wrong == []
-    assert tally.scenes + tally.refused == 30
+    assert tally.scenes + tally.refused == 16
     assert tally.tightest <= 1
 
 

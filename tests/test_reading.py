@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.nodes import Mapping, Node, Scalar
 from apc.compiler.reading import (
     add_unknown,
     brief,
@@ -15,7 +16,7 @@ from apc.compiler.reading import (
     read_name,
     read_text,
 )
-from apc.compiler.source import Mapping, Node, Scalar, parse_source
+from apc.compiler.source import parse_source
 
 HERE = Place("a.yaml", 1, 1)
 

@@ -180,14 +180,6 @@ def test_a_scene_linearized_at_its_start_has_a_region_too() -> None:
         assert found.contains(x, y) == analyze(apply(system, overrides)).stable
 
 
-def test_over_a_delay_the_boundary_is_known_to_a_cell(average: CompiledSystem) -> None:
-    axes = parse_axes(average, "lan.delay=0 ms:16 ms", "coordination.stiffness=10 N/m:2000 N/m")
-    found = region(average, axes, cells=4)
-    assert found.curves
-    assert not any(curve.smooth for curve in found.curves)
-    assert "right to a cell only" in str(found)
-
-
 def test_the_document_is_the_contract(paper: Region) -> None:
     document = json.loads(json.dumps(paper.to_dict(), allow_nan=False))
     assert document["x"] == {"parameter": "contact.stiffness", "unit": "N/m", "range": [10.0, 3000.0]}

@@ -93,3 +93,19 @@ def test_what_rounding_makes_of_a_zero_changes_nothing_that_is_printed() -> None
 def test_every_verdict_is_told_in_words(verdict: str, words: str) -> None:
     result = dataclasses.replace(analyze(compiled(ONE_MASS)), verdict=verdict)
     assert words in analysis_report(result)
+
+
+def test_what_dies_out_at_once_is_counted_and_has_no_empty_table() -> None:
+    result = analyze(compiled(AVERAGE))
+    dead = tuple(dataclasses.replace(mode, magnitude=1e-9) for mode in result.modes[:2])
+    text = analysis_report(dataclasses.replace(result, modes=dead))
+    assert "magnitude" not in text
+    assert text.endswith("  2 modes die out within a frame (--json lists all)")
+
+
+def test_a_share_that_would_show_as_zero_is_left_out() -> None:
+    result = analyze(compiled(AVERAGE))
+    first = dataclasses.replace(result.modes[0], participation=(("device.v", 0.9996), ("device.x", 0.0004)))
+    text = analysis_report(dataclasses.replace(result, modes=(first,)))
+    assert "device.v 100%" in text
+    assert " 0%" not in text

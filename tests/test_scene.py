@@ -6,8 +6,8 @@ from fractions import Fraction
 
 import pytest
 
+from apc.compiler.compiled import Experiment
 from apc.compiler.groups import LARGEST_COUNT
-from apc.compiler.studies import Experiment
 from tests.topologies import AVERAGE, MESH, ONE_MASS, replaced, scene, told
 
 GROUPS = replaced(

@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 
 from apc.__main__ import run
+from apc.compiler.instances import PART_KEYS
 from apc.compiler.library import Library
-from apc.compiler.scene import KEYS, PART_KEYS
+from apc.compiler.nodes import Mapping, Node, Scalar
+from apc.compiler.scene import KEYS
 from apc.compiler.schema import ABOUT, DIALECT, topology_schema
-from apc.compiler.source import Mapping, Node, Scalar, parse_source
+from apc.compiler.source import parse_source
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
 jsonschema = pytest.importorskip("jsonschema")

@@ -116,3 +116,12 @@ def test_a_damping_of_nothing_has_the_derivative_of_what_it_adds_up_with() -> No
     assert nothing.value == 0
     assert nothing.derivative == pytest.approx(whole.derivative, rel=1e-7)
     assert all(np.isfinite([row.derivative, row.error]).all() for row in found.values())
+
+
+def test_eigenvalues_that_change_alike_are_told_in_one_row() -> None:
+    text = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8").partition("\n")[2]
+    lines = str(sensitivities(compiled(text))).splitlines()
+    names = [line.split()[0] for line in lines[1:-1]]
+    assert len(names) == len(set(names))
+    assert not any("mode" in line or "+0.00e+00" in line for line in lines[1:-1])
+    assert lines[-1] == "  2 eigenvalues share the radius: the largest of their changes decides"

@@ -13,7 +13,9 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.diagram import Diagram, build_diagram
-from apc.compiler.picture import Box, Line, Picture, Text, draw_svg, place
+from apc.compiler.marks import Box, Line, Picture, Text
+from apc.compiler.picture import place
+from apc.compiler.svg import draw_svg
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, scene, told
 
 AVERAGE_FILE = SCENES / "three-users-average.yaml"

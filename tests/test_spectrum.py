@@ -102,13 +102,17 @@ def _arb(value: object) -> flint.arb:
 
 
 def _truth(scene: Scene) -> list[flint.acb]:
-    """Return the eigenvalues of the full map at 60 digits."""
-    before, flint.ctx.dps = flint.ctx.dps, 60
+    """Return the eigenvalues of the full map at 120 digits, of which four equal ones keep 30."""
+    before, flint.ctx.dps = flint.ctx.dps, 120
     try:
         rows = frame_matrix(scene, number=_arb, exp=lambda value: value.exp())
         return flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
     finally:
         flint.ctx.dps = before
+
+
+# What four equal eigenvalues of the truth, a Jordan block of zeros say, keep of its 120 digits.
+SCATTERED = 1e-30
 
 
 def _random(generator: np.random.Generator, number: int) -> dict:
@@ -134,7 +138,7 @@ def _check_against_truth(values: dict) -> Analysis:
     truth = _truth(Scene(peers=2, **values))
     for mode in found.modes:
         place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
-        assert min(float(abs(place - value).mid()) for value in truth) <= mode.error
+        assert min(float(abs(place - value).mid()) for value in truth) <= mode.error + SCATTERED
     apart = sorted(truth, key=lambda value: float(abs(value - 1).mid()))
     rigid = sum(float(abs(value - 1).mid()) < 1e-40 for value in truth)
     assert rigid == found.rigid_modes
@@ -145,7 +149,7 @@ def _check_against_truth(values: dict) -> Analysis:
     return found
 
 
-def test_the_truth_at_60_digits_is_within_every_bound() -> None:
+def test_the_truth_at_120_digits_is_within_every_bound() -> None:
     generator = np.random.default_rng(0)
     bounds = [_check_against_truth(_random(generator, number)).spectral_radius_error for number in range(200)]
     assert np.median(bounds) < 1e-10

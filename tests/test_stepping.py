@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
+from typing import Any
 
 import casadi
 import numpy as np
@@ -17,9 +19,9 @@ from tests.topologies import AVERAGE, compiled, replaced
 S = Fraction(1)
 
 
-def rate(expression: object, n: int = 1) -> casadi.Function:
+def rate(expression: Callable[[Any, Any, Any, Any], Any], n: int = 1) -> casadi.Function:
     x, u, p, t = (casadi.SX.sym(name, size) for name, size in (("x", n), ("u", 1), ("p", 1), ("t", 1)))
-    return casadi.Function("rate", [x, u, p, t], [casadi.densify(expression(x, u, p, t))])  # type: ignore[operator]
+    return casadi.Function("rate", [x, u, p, t], [casadi.densify(expression(x, u, p, t))])
 
 
 def test_rk4_is_exact_for_a_cubic_in_time_whatever_the_last_step() -> None:

@@ -10,7 +10,7 @@ import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apc.compiler.blocks import match_columns, strong_components
+from apc.compiler.matching import match_columns, strong_components
 from apc.compiler.structure import SortedKind, sort
 from apc.compiler.symbolic import symbol
 from tests.topologies import AVERAGE, MESH, ONE_MASS, clocked, library, ordered, replaced, told

@@ -234,7 +234,7 @@ def test_a_terminal_sees_progress_and_a_file_does_not(folder: Path) -> None:
         while chunk := _read(master):
             seen += chunk
     os.close(master)
-    assert b"200/200" in seen
+    assert b"200 of 200 points" in seen
     quiet = start(folder, "wall.apc", *WORDS, "--out", "s.csv", "--jobs", "1", "--json")
     out, err = quiet.communicate(timeout=30)
     assert err == ""

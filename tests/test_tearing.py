@@ -11,13 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apc.compiler.blocks import ImplicitBlock, Residual, match_columns, solve_blocks, strong_components
+from apc.compiler.blocks import solve_blocks
+from apc.compiler.casadi_writer import Writer
 from apc.compiler.compiled import Kind, SendPartition, State
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.expression import Name
 from apc.compiler.flatten import FlatEquation
-from apc.compiler.functions import _Writer
 from apc.compiler.grammar import parse_equation
+from apc.compiler.matching import match_columns, strong_components
+from apc.compiler.residuals import Residual
+from apc.compiler.solution import ImplicitBlock
 from apc.compiler.symbolic import no_derivative, symbol, to_sympy
 from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.linearize import linearize
@@ -55,8 +58,8 @@ def values(text: str, unknowns: str, **numbers: float) -> dict[str, float]:
     return dict(zip(unknowns.split(), map(float, found), strict=True))
 
 
-def _writer(known: dict[str, Any], definitions: dict[str, Any]) -> _Writer:
-    return _Writer(casadi.MX, known, definitions, {}, {})
+def _writer(known: dict[str, Any], definitions: dict[str, Any]) -> Writer:
+    return Writer(casadi.MX, known, definitions, {}, {})
 
 
 @pytest.mark.parametrize("x", [-20.0, -1.0, 0.0, 0.3, 2.0, 1e6])

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from apc.runtime.threads import single_threaded
+from apc.runtime.threads import POOLS, single_threaded, start_single_threaded
 
 
 def _threads() -> list[int]:
@@ -29,3 +33,33 @@ def test_the_old_number_is_back_after_an_error() -> None:
     with pytest.raises(ZeroDivisionError), single_threaded():
         _ = 1 / 0
     assert _threads() == before
+
+
+def _begun(environment: dict[str, str]) -> str:
+    """Start a process as a command does; return its numbers of threads and what its environment says."""
+    code = (
+        "import os\n"
+        "from apc.runtime.threads import POOLS, start_single_threaded\n"
+        "start_single_threaded()\n"
+        "import numpy, threadpoolctl\n"
+        "print({p['num_threads'] for p in threadpoolctl.threadpool_info()}, end=' ')\n"
+        "print([os.environ.get(name) for name in POOLS])"
+    )
+    kept = {name: value for name, value in os.environ.items() if name not in POOLS}
+    run = [sys.executable, "-c", code]
+    return subprocess.run(run, env=kept | environment, capture_output=True, text=True, check=True).stdout
+
+
+def test_a_command_of_small_matrices_makes_no_threads() -> None:
+    assert _begun({}).strip() == "{1} ['1', '1', '1']"
+
+
+def test_what_the_environment_says_of_threads_stays() -> None:
+    assert "['2', None, None]" in _begun({"OMP_NUM_THREADS": "2"})
+
+
+def test_the_environment_stays_once_the_libraries_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in POOLS:
+        monkeypatch.delenv(name, raising=False)
+    start_single_threaded()
+    assert not set(POOLS) & os.environ.keys()

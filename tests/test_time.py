@@ -17,7 +17,8 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.modes import ClosedSystem, dense
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.modes import dense
 from tests.topologies import compiled
 
 MS = Fraction(1, 1000)

@@ -9,8 +9,10 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.runtime.frame.channel_law import channel_law
 from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.packets import Listener, PacketSource, channel_law
+from apc.runtime.frame.listener import Listener
+from apc.runtime.frame.packets import PacketSource
 from apc.runtime.frame.parameters import resolve
 from apc.runtime.frame.timetable import Timetable
 from tests.sites import MS
@@ -44,10 +46,10 @@ def test_each_way_is_what_its_own_listener_hears() -> None:
     assert seen.packets.shape == (400, 6)
     law = channel_law(system, system.links[0], 8 * MS)
     for way, (sender, receiver) in enumerate(route.pairs.tolist()):
-        source = PacketSource(law, "lan", sender, receiver, seed=5, run=2)
+        source = PacketSource(law, "lan", [(sender, receiver)], seed=5, run=2)
         alone = Listener(source, phase=0, period=8, delay=8, quantum=MS, newest=True).hear(np.arange(400))
-        assert seen.packets[:, way].tolist() == alone.packets.tolist()
-        assert seen.missing[:, way].tolist() == alone.missing.tolist()
+        assert seen.packets[:, way].tolist() == alone.packets[:, 0].tolist()
+        assert seen.missing[:, way].tolist() == alone.missing[:, 0].tolist()
 
 
 def test_it_goes_on_where_it_ended() -> None:
@@ -100,7 +102,7 @@ def test_no_packet_arrives_later_than_the_longest_delay() -> None:
         system = system_of(more)
         [route] = timetable(system).routes
         law = channel_law(system, system.links[0], 8 * MS)
-        delays = PacketSource(law, "lan", 0, 1).take(200_000)
+        delays = PacketSource(law, "lan", [(0, 1)]).take(200_000)
         assert delays.max() <= route.longest
     assert route.longest == pytest.approx(0.008 + 4 * 0.009)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -44,27 +46,29 @@ def test_the_answer_is_within_its_bound_anywhere_in_the_disc(seed: int, reach: f
     space = _sites(seed)
     random = np.random.default_rng(seed)
     transfer = build_transfer(space, COUNTS)
-    value, doubt = respond([transfer], POINTS, np.full(len(POINTS), reach))
-    for point, centre, bound in zip(POINTS, value, doubt, strict=True):
+    found = respond([transfer], POINTS, np.full(len(POINTS), reach))
+    value, doubt = found.value, found.doubt
+    for point, centre, slope, bound in zip(POINTS, value, found.slope, doubt, strict=True):
         for _ in range(6):
             inside = point + reach * np.sqrt(random.random()) * np.exp(2j * np.pi * random.random())
             # The truth itself is computed in floats, far better than the bound but for reach 0.
-            assert np.all(np.abs(_answer(space, COUNTS, inside) - centre) <= bound + 1e-12 * np.abs(centre))
+            straight = centre + (inside - point) * slope
+            assert np.all(np.abs(_answer(space, COUNTS, inside) - straight) <= bound + 1e-12 * np.abs(centre))
     assert np.all(doubt <= 1e-7 * np.abs(value).max()) or reach
 
 
 def test_the_bound_covers_what_the_matrices_may_be_off_by() -> None:
     space = _sites(3, error=1e-9)
     random = np.random.default_rng(1)
-    value, doubt = respond([build_transfer(space, COUNTS)], POINTS, np.zeros(len(POINTS)))
+    found = respond([build_transfer(space, COUNTS)], POINTS, np.zeros(len(POINTS)))
     for _ in range(20):
-        off = {
+        off: dict[str, Any] = {
             name: getattr(space, name)
             + random.choice([-1, 1], getattr(space, name).shape) * getattr(space, f"{name}_error")
             for name in ("m", "b", "s", "d")
         }
-        moved = StateSpace(**off, m_error=0, b_error=0, s_error=0, d_error=0)  # type: ignore[arg-type]
-        for point, centre, bound in zip(POINTS, value, doubt, strict=True):
+        moved = StateSpace(**off, m_error=0, b_error=0, s_error=0, d_error=0)
+        for point, centre, bound in zip(POINTS, found.value, found.doubt, strict=True):
             assert np.all(np.abs(_answer(moved, COUNTS, point) - centre) <= bound)
 
 
@@ -80,5 +84,5 @@ def test_the_derivative_is_the_derivative() -> None:
 @pytest.mark.parametrize("chain", [0, 1, 5])
 def test_a_queue_of_any_length_does_not_spoil_the_bound(chain: int) -> None:
     transfer = build_transfer(_sites(4, chain=chain), COUNTS)
-    value, doubt = respond([transfer], POINTS, np.zeros(len(POINTS)))
-    assert np.all(doubt <= 1e-7 * np.abs(value).max())
+    found = respond([transfer], POINTS, np.zeros(len(POINTS)))
+    assert np.all(found.doubt <= 1e-7 * np.abs(found.value).max())

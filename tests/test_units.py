@@ -9,18 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apc.compiler import units
+from apc.compiler import unit_names
+from apc.compiler.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.units import (
-    DIMENSIONLESS,
-    NO_UNIT,
-    Dimension,
-    format_dimension,
-    format_si,
-    parse_quantity,
-    parse_unit,
-    quantity,
-)
+from apc.compiler.unit_text import format_dimension, format_si
+from apc.compiler.units import NO_UNIT, parse_quantity, parse_unit, quantity
 
 HERE = Place("a.yaml", 1, 1)
 LENGTH, TIME = Dimension((("m", 1),)), Dimension((("s", 1),))
@@ -220,6 +213,6 @@ def test_pint_is_imported_only_when_a_rare_unit_is_read() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize("name", sorted(units._OF_HAPTICS))
+@pytest.mark.parametrize("name", sorted(unit_names._OF_HAPTICS))
 def test_a_unit_known_without_pint_is_what_pint_says(name: str) -> None:
-    assert units._scaled(name) == units._OF_HAPTICS[name]
+    assert unit_names._scaled(name) == unit_names._OF_HAPTICS[name]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.analysis.needs import needs
+from apc.runtime.simulate.simulation import prepare
+from tests.bench.needs import Account, accounts
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 # Of every scene: motion, delayed forces and packets of a peer of each kind. Counted by hand: two masses or a
@@ -28,6 +33,19 @@ KEPT = {
     "three-users-mesh": [(4, 2, 2)],
     "users-table": [(4, 2, 2)],
 }
+# The equations of a peer: of masses (3 each), contact, coordination (4), hands (1 each), and of connections:
+# an equal position a flange that joins a mass, and a sum of forces a mass.
+PAPER, EXPERIMENT, ARMED = 6 + 3 + 4 + 3 + 2, 6 + 5 + 4 + 1 + 4 + 2, 6 + 3 + 4 + 1 + 4 + 2
+WRITTEN = {
+    "experiment-average": EXPERIMENT,
+    "experiment-mesh": EXPERIMENT,
+    "finger": 9 + 5 + 2 + 1 + 5 + 2,  # three masses, a wall, a pad, a hand
+    "star-lecture": ARMED,
+    "users-table": ARMED,
+}
+LATE = {"mixed-clocks": ("wan", 40), "ring-of-eight": ("ring", 8), "star-lecture": ("lecture", 20)}
+# What is left out beside what is the same as another, and why it is no loss.
+UNREAD = {"finger": ("finger.tip.flange.f", "device.flange.f")}  # forces within one rigid body
 
 
 def functions(system: CompiledSystem) -> list[Any]:
@@ -53,6 +71,17 @@ def test_a_scene_keeps_what_it_needs_and_no_more(name: str) -> None:
     found = needs(system)
     assert [(site.motion, site.remembered, site.packets) for site in found.sites] == KEPT[name]
     assert system.dropped == ()
+    listed = accounts(SCENES / f"{name}.yaml")
+    for one, site, kind in zip(listed, found.sites, system.kinds, strict=True):
+        assert len(one.motion) == site.motion
+        assert len(one.remembered) == site.remembered
+        assert len(one.packets) * _frames(one) == site.packets
+        assert one.unread == UNREAD.get(name, ())
+        assert one.written == WRITTEN.get(name, PAPER)
+        assert one.written == one.computed + len(one.same) + len(one.unread)
+        # The same as another is a position or a velocity at a joint, or the force on its other side.
+        assert all(signal.rpartition(".")[2] in ("x", "v", "f") for signal, _ in one.same)
+        assert {name for name, _ in one.without} <= {out for clock in kind.clocks for out in clock.outputs}
     # As many equations as states, outputs and channels, and each of them is read.
     for kind in system.kinds:
         assert kind.derivative.numel_out(0) == len(kind.states)
@@ -68,6 +97,28 @@ def test_a_scene_keeps_what_it_needs_and_no_more(name: str) -> None:
                 if receive.link == sending.link
             }
             assert heard == set(range(len(sending.channels)))
+
+
+def _frames(account: Account) -> int:
+    """Return of how many frames the packets are kept, as the account words it."""
+    found = {re.search(r"of (\d+) frames", signal) for signal, _ in account.packets}
+    assert len(found) < 2 or None not in found
+    return max((int(one.group(1)) if one else 1 for one in found), default=0)
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_whatever_is_kept_says_why(name: str) -> None:
+    link, late = LATE.get(name, ("lan", 8))
+    for place, one in enumerate(accounts(SCENES / f"{name}.yaml")):
+        tick = place + 1 if name == "mixed-clocks" else 1  # far from the others the forces tick every 2 ms
+        for signal, reason in one.remembered:
+            again = signal.startswith("wall.x")
+            assert reason == (
+                "is looked at again at the next tick" if again else f"acts {tick} ms after its tick"
+            )
+        assert {reason for _, reason in one.packets} <= {f"{link} is {late} ms late"}
+        assert {reason for _, reason in one.without} <= {"acts at once: nothing to remember"}
+        assert bool(one.without) == name.startswith("experiment")
 
 
 UNUSED = {
@@ -96,6 +147,43 @@ def test_an_unused_part_changes_nothing_and_costs_nothing(what: str) -> None:
     assert [why for _, why in more.dropped] == ([reason] if reason else [])
 
 
+@pytest.mark.parametrize("name", KEPT)
+def test_unused_parts_change_nothing_and_cost_nothing_in_any_scene(name: str, tmp_path: Path) -> None:
+    path = SCENES / f"{name}.yaml"
+    text = path.read_text(encoding="utf-8")
+    spare = {
+        "clocks": "spare_clock: 3 ms",
+        "parameters": "spare_number: 3 N/m",
+        "links": "spare_link: {clock: haptic, delay: 80 s}",
+        "couplers": "spare_force: {type: SampledSpringDamper, a: ground, b: ground, stiffness: 1 N/m, "
+        "clock: haptic, delay: 5 ms}",
+    }
+    for section, entry in spare.items():
+        text = _with(text, section, entry)
+    for table in SCENES.glob("*.csv"):
+        shutil.copy(table, tmp_path)
+    (tmp_path / path.name).write_text(text, encoding="utf-8")
+    more = compile_topology(tmp_path / path.name)
+    _same(compile_topology(path), more)
+    assert sorted({reason for _, reason in more.dropped}) == [
+        "nobody hears what it would carry",
+        "nobody reads this held value",
+        "nothing ticks with it",
+    ]
+
+
+def _with(text: str, section: str, entry: str) -> str:
+    """Return a topology with one more entry in a section, there or not, on one line or several."""
+    found = re.search(rf"^{section}:( *{{)?", text, re.MULTILINE)
+    if found is None:
+        return f"{text}\n{section}:\n  {entry}\n"
+    end = found.end()
+    if found.group(1):
+        return f"{text[:end]}{entry}, {text[end:]}"
+    end = text.index("\n", end)
+    return f"{text[:end]}\n  {entry}{text[end:]}"
+
+
 def test_a_variable_that_nothing_reads_costs_nothing(tmp_path: Path) -> None:
     """A component of our own that computes and sends what nobody asks for."""
     header = "component: {name}\nextends: SampledSpringDamper\nabout: The same{words}.\n"
@@ -112,11 +200,20 @@ def test_a_variable_that_nothing_reads_costs_nothing(tmp_path: Path) -> None:
     _same(one, other)
 
 
+def _instructions(function: Any) -> list[int]:
+    """Return how many instructions a function has, and each of those that it calls."""
+    every = [function, *function.find_functions(-1)]
+    return [one.n_instructions() for one in every if one.is_a("SXFunction") or one.is_a("MXFunction")]
+
+
 def _same(plain: CompiledSystem, more: CompiledSystem) -> None:
     """Assert that two models are the same functions, states and buffers, and the same answer."""
     assert [one.serialize() for one in functions(more)] == [one.serialize() for one in functions(plain)]
     counted = [[one.n_instructions() for one in functions(system)] for system in (plain, more)]
     assert counted[0] == counted[1]
     assert needs(more) == needs(plain)
+    played, alike = (prepare(system, Fraction(1, 20), jit=False).chunk for system in (plain, more))
+    assert alike.serialize() == played.serialize()
+    assert sum(_instructions(alike)) == sum(_instructions(played)) > 0
     assert [kind.states for kind in more.kinds] == [kind.states for kind in plain.kinds]
     assert analyze(more).to_dict() == analyze(plain).to_dict()

@@ -18,22 +18,19 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.analysis.plan import make_plan
-from apc.runtime.eigen.modes import Loop, close_loop
-from apc.runtime.eigen.peers import PeerGroup, peer_groups, states_of
+from apc.runtime.analysis.plan import cannot_serve, make_plan
+from apc.runtime.eigen.closing import close_loop
+from apc.runtime.eigen.loop import Loop
+from apc.runtime.eigen.peer_group import PeerGroup, states_of
+from apc.runtime.eigen.peers import peer_groups
 from apc.runtime.eigen.spectrum import Mode, Spectrum, solve_spectrum
+from apc.runtime.frame.channel_law import nominal_notes
 from apc.runtime.frame.discretize import TOO_LARGE
 from apc.runtime.frame.exchange import Exchange, build_exchange
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
-from apc.runtime.frame.packets import nominal_notes
 from apc.runtime.frame.parameters import Numbers, resolve
 from apc.runtime.frame.schedule import ORDER, Schedule
 from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.large.crowds import crowds
-from apc.runtime.large.determinant_spectrum import solve_crowds, solve_loops
-from apc.runtime.large.graph import deciding_loops, with_the_rest
-from apc.runtime.large.krylov import solve_sparse
-from apc.runtime.large.translation import common_translation, count_translations
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 
@@ -125,7 +122,8 @@ def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared
         The order of coincident events, see `schedule.ORDER`.
     """
     built = tuple(jacobians(kind) for kind in system.kinds)
-    return _scheduled(system, built, resolve(system).timings, tuple(order))
+    timings = {timing.name: timing.value for timing in system.timings}
+    return _scheduled(system, built, timings, tuple(order))
 
 
 def analyze(
@@ -168,9 +166,11 @@ def analyze(
         elif plan.ring:
             spectrum, notes = _solve_ring(system, plan.groups, exchange, certify=certify)
         elif plan.method == "determinant":
-            spectrum, notes = solve_loops(plan.loops), ()
+            spectrum, notes = _solve_determinant(plan.loops), ()
         else:
             spectrum, notes = _solve_closed(system, plan.loops, certify=certify), ()
+        if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
+            raise cannot_serve(system, method, "what a frame's ticks round hides the peers' own eigenvalues")
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
     return Analysis(
@@ -202,10 +202,20 @@ def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: boo
     return solve_spectrum(closed, certify=certify)
 
 
+def _solve_determinant(loops: Sequence[Loop]) -> Spectrum:
+    """Solve loops by the zeros of their characteristic functions."""
+    # What serves large scenes is imported when one comes: all of it would cost every scene 30 ms.
+    from apc.runtime.large.determinant_spectrum import solve_loops
+
+    return solve_loops(loops)
+
+
 def _solve_ring(
     system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, certify: bool
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve equal peers on a large ring: those of its loops that decide."""
+    from apc.runtime.large.graph import deciding_loops, with_the_rest
+
     ring = deciding_loops(groups, exchange)
     spectrum = _solve_closed(system, ring.arrangement.loops, certify=certify)
     return with_the_rest(spectrum, ring), ring.arrangement.notes
@@ -215,14 +225,16 @@ def _solve_crowds(
     system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange, method: str
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve peers that all differ."""
+    from apc.runtime.large.crowds import crowds
+    from apc.runtime.large.determinant_spectrum import solve_crowds
+    from apc.runtime.large.krylov import solve_sparse
+    from apc.runtime.large.translation import count_translations
+
     listed = crowds(system, prepared.jacobians, prepared.schedules, numbers)
     rounded = "what rounding does to the peers' own motion is estimated here, not bounded"
     notes = (rounded,) if any(crowd.lifted.estimated for crowd in listed) else ()
     if method == "krylov":
-        motions = common_translation(listed, exchange)
-        spectrum = solve_sparse(listed, exchange, motions)
-        free = "peers move freely one by one, or the first as not all others do: left open"
-        return spectrum, notes if motions is not None else (*notes, free)
+        return solve_sparse(listed, exchange), notes
     rigid = count_translations(listed, exchange)
     spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
     free = "the first peer moves freely in a way that not all others do: left open"

@@ -1,7 +1,7 @@
 """Which parameters a box leaves open, and how far: `contact.stiffness=±1%`.
 
 Takes: a `CompiledSystem` and ranges as text.
-Gives: `Range`, `parse_range`; `Box`, `open_box`.
+Gives: `parse_range`; `Box`, `open_box`.
 Guarantees: a site's matrices are exact quotients of polynomials in the open parameters, and what depends on
 these by an expression follows.
 Does not: prove anything (see `box_proof`).
@@ -10,6 +10,7 @@ Does not: prove anything (see `box_proof`).
 from __future__ import annotations
 
 import itertools
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -20,11 +21,15 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import with_unit
+from apc.compiler.evaluation import OPERATORS, Operation, compute
+from apc.compiler.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not
 from apc.runtime.analysis.analysis import lifted_groups, prepare
-from apc.runtime.eigen.modes import ClosedSystem, split
-from apc.runtime.eigen.peers import PeerGroup, Runs
+from apc.runtime.analysis.ranges import Range
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.modes import split
+from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.eigen.ratios import NotRational, Ratio, Ratios
+from apc.runtime.eigen.runs import Runs
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.linearize import site_of_row
 from apc.runtime.frame.names import find
@@ -36,26 +41,6 @@ _PLACE = Place("box")
 # Where in the box the peers are sorted into groups: a place that no two given values share, so that peers are
 # alike there only if they are alike all over the box. Three, in case one of them is met by chance.
 GENERIC = (Fraction(6180339887, 10**10), Fraction(4142135623, 10**10), Fraction(7320508075, 10**10))
-
-
-@dataclass(frozen=True, slots=True)
-class Range:
-    """A parameter, of one group or of all (`group` None), left open from `low` to `high` (SI)."""
-
-    name: str
-    group: str | None
-    unit: str
-    low: Fraction
-    high: Fraction
-
-    @property
-    def label(self) -> str:
-        """The parameter as a person writes it."""
-        return self.name if self.group is None else f"{self.group}.{self.name}"
-
-    def __str__(self) -> str:
-        low, high = (with_unit(f"{float(one):.9g}", self.unit) for one in (self.low, self.high))
-        return f"{self.label} from {low} to {high}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +162,7 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
         if any(other.group == one.group or None in (one.group, other.group) for other in same):
             raise ApcError(Mistake("E831", _PLACE, f"{one.label} is left open twice"))
     prepared = prepare(system)
-    if not all(site.affine and not site.edges for site in prepared.jacobians):
+    if not all(site.parameters_suffice for site in prepared.jacobians):
         what = f"{system.name} is not linear: where it is linearized may move with the parameters"
         raise ApcError(Mistake("E832", Place(system.name), what))
     field = Ratios.of(len(ranges))
@@ -252,7 +237,7 @@ def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field
         if not is_open:
             return Fraction(parameter.value)
         try:
-            return _evaluate(tree, lambda name: value_of(".".join(name)))
+            return compute(tree, _Quotients(value_of))
         except NotRational as reason:
             what = f"{parameter.name} = {parameter.expression[:60]} {reason}"
             raise ApcError(Mistake("E832", _PLACE, what)) from None
@@ -261,49 +246,43 @@ def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field
     return {name: value for name, value in found.items() if isinstance(value, Ratio)}
 
 
-def _evaluate(tree: Any, look_up: Callable[[tuple[str, ...]], Any]) -> Any:
-    """Return the value of an expression over rationals and quotients of polynomials."""
-    from apc.compiler.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not, Number
+@dataclass(frozen=True, slots=True)
+class _Quotients:
+    """Rationals and quotients of polynomials in the open parameters as an arithmetic."""
 
-    operators: dict[str, Callable[[Any, Any], Any]] = {
-        "+": lambda a, b: a + b,
-        "-": lambda a, b: a - b,
-        "*": lambda a, b: a * b,
-        "/": lambda a, b: a / b,
-        "^": _power,
-        "<": lambda a, b: a < b,
-        "<=": lambda a, b: a <= b,
-        ">": lambda a, b: a > b,
-        ">=": lambda a, b: a >= b,
-        "==": lambda a, b: a == b,
-        "!=": lambda a, b: a != b,
-    }
-    functions: dict[str, Callable[..., Any]] = {"abs": abs, "max": max, "min": min}
+    value_of: Callable[[str], Any]
 
-    def value(node: Any) -> Any:
+    def literal(self, value: Fraction) -> Any:
+        return value
+
+    def named(self, node: Name) -> Any:
+        return self.value_of(".".join(node.parts))
+
+    def operation(self, node: Operation) -> Callable[..., Any]:
         match node:
-            case Number():
-                return Fraction(node.value)
-            case Name():
-                return look_up(node.parts)
             case Negate():
-                return -value(node.operand)
-            case Binary() | Compare():
-                return operators[node.operator](value(node.left), value(node.right))
-            case Logic():
-                left = value(node.left)
-                return (left and value(node.right)) if node.operator == "and" else left or value(node.right)
+                return operator.neg
             case Not():
-                return not value(node.operand)
-            case Conditional():
-                return value(node.then if value(node.condition) else node.otherwise)
-            case Call() if node.function in functions:
-                return functions[node.function](*(value(one) for one in node.arguments))
+                return operator.not_
+            case Binary("^"):
+                return _power
+            case Binary() | Compare():
+                return OPERATORS[node.operator]
+            case Call() if node.function in _FUNCTIONS:
+                return _FUNCTIONS[node.function]
             case Call():
                 raise NotRational(f"takes {node.function}() of a parameter that is left open")
-        raise AssertionError(f"no such expression: {node!r}")
 
-    return value(tree)
+    def joined(self, node: Logic, left: Any, right: Callable[[], Any]) -> Any:
+        return left and right() if node.operator == "and" else left or right()
+
+    def chosen(
+        self, node: Conditional, condition: Any, then: Callable[[], Any], otherwise: Callable[[], Any]
+    ) -> Any:
+        return then() if condition else otherwise()
+
+
+_FUNCTIONS: dict[str, Callable[..., Any]] = {"abs": abs, "max": max, "min": min}
 
 
 def _power(base: Any, exponent: Any) -> Any:

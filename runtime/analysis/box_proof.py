@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import counted, with_unit, wrapped
-from apc.runtime.analysis.box import Box, Range, open_box
+from apc.runtime.analysis.box import Box, open_box
+from apc.runtime.analysis.ranges import Range
 from apc.runtime.eigen.balls import (
     Balls,
     compose,
@@ -37,8 +38,8 @@ from apc.runtime.eigen.balls import (
     square,
 )
 from apc.runtime.eigen.certify import schur_cohn
+from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.duals import Dual, mapped, slope_of, step_duals
-from apc.runtime.eigen.modes import ClosedSystem
 from apc.runtime.eigen.pseudospectrum import balance
 from apc.runtime.eigen.ratios import Ratio
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid

@@ -193,7 +193,7 @@ def conventions(
     first = _outcome(default, (ORDER,), {}, SENDER if matters else "")
     if quick and (why := _too_much(prepared, default, 1)):
         return Conventions(system.name, (first,), matters, why)
-    classes = _classes(system, prepared)
+    classes = _classes(system, prepared, pairs)
     readings = [SENDER, NOTHING] if matters else [""]
     if quick and (why := _too_much(prepared, default, len(classes) * len(readings) - 1)):
         return Conventions(system.name, (first,), matters, why)
@@ -216,15 +216,18 @@ def conventions(
 
 
 def _classes(
-    system: CompiledSystem, prepared: Prepared
+    system: CompiledSystem, prepared: Prepared, pairs: _Pairs
 ) -> list[tuple[tuple[tuple[str, ...], ...], tuple[Schedule, ...]]]:
-    """Return the orders that mean the same frame, with their schedules; the default's first."""
+    """Return the orders that mean the same frame, with their schedules; the default's first.
+
+    `pairs` are those whose order can matter here at all.
+    """
     patterns = [site.pattern for site in prepared.jacobians]
     built: dict[tuple[bool, ...], tuple[Hashable, tuple[Schedule, ...]]] = {}
     found: dict[Hashable, list[tuple[str, ...]]] = {}
     schedules: dict[Hashable, tuple[Schedule, ...]] = {}
     for order in [ORDER, *(one for one in itertools.permutations(ORDER) if one != ORDER)]:
-        key = tuple(order.index(a) < order.index(b) for a, b in DEPARTURES)
+        key = tuple(order.index(a) < order.index(b) for a, b in pairs)
         if key not in built:
             made = build_schedules(system, prepared.timings, patterns, order=order)
             kinds = [patterns[group.kind] for group in system.groups]
@@ -238,26 +241,35 @@ def _classes(
 def _meaning(schedule: Schedule, pattern: LinearSite) -> Hashable:
     """Return what a schedule does, whatever the order of events at one instant that commute."""
     acting: list[Value | None] = list(schedule.acting)
+    by_motion = _holds(pattern.b)
+    by_sends = [_holds(send.u) for send in pattern.sends]
+    by_ticks = [_holds(tick.u) for tick in pattern.ticks]
 
-    def reads(matrix: Any) -> Hashable:
-        return tuple(acting[h] for h in np.flatnonzero(np.asarray(matrix).any(axis=0)))
+    def reads(holds: Sequence[int]) -> Hashable:
+        return tuple(acting[h] for h in holds)
 
     course: list[Hashable] = []
     instant: set[Hashable] = set()
     for event in schedule.events:
         match event:
             case Propagate(duration):
-                course += [frozenset(instant), duration, reads(pattern.b)]
+                course += [frozenset(instant), duration, reads(by_motion)]
                 instant = set()
             case Act(hold, value):
                 acting[hold] = value
             case Send(partition, rows):
                 sent = tuple((channel, schedule.sent[row]) for channel, row in rows)
-                instant.add(("send", partition, sent, reads(pattern.sends[partition].u)))
+                instant.add(("send", partition, sent, reads(by_sends[partition])))
             case Tick(partition, index, heard):
                 names = tuple(tuple(schedule.heard[row] for row in rows) for rows in heard)
-                instant.add(("tick", partition, index, names, reads(pattern.ticks[partition].u)))
+                instant.add(("tick", partition, index, names, reads(by_ticks[partition])))
     return tuple(course), frozenset(instant)
+
+
+def _holds(reading: Any) -> list[int]:
+    """Return the holds that a matrix over them reads."""
+    found: list[int] = np.flatnonzero(np.asarray(reading).any(axis=0)).tolist()
+    return found
 
 
 def _hearing_matters(site: SiteJacobians) -> bool:

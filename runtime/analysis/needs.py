@@ -14,6 +14,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.compiler.words import counted
 from apc.runtime.analysis.analysis import prepare
 from apc.runtime.analysis.plan import make_plan
 from apc.runtime.frame.exchange import build_exchange
@@ -71,11 +72,11 @@ class Needs:
         whole = self.peers > 1 and sum(count for count, _ in self.systems) == 1
         noun = _NOUNS.get(self.method, "system" if whole else "mode")
         systems = " and ".join(
-            f"{count} {noun}{'' if count == 1 else 's'} of {size}" for count, size in self.systems
+            f"{counted(count, noun)} of {size}" for count, size in self.systems
         )
         analysed = f"not analysed: {self.refused}" if self.refused else f"analysed as {systems}"
         pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in self.pairs)
-        return f"{sites}, {self.peers} peer{'' if self.peers == 1 else 's'}; {analysed}{pairs}"
+        return f"{sites}, {counted(self.peers, 'peer')}; {analysed}{pairs}"
 
 
 def needs(system: CompiledSystem) -> Needs:

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.modes import ClosedSystem, dense
-from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.modes import dense
+from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.frame.discretize import discretize
 from apc.runtime.frame.schedule import Way
 
@@ -122,7 +123,7 @@ def open_loop(system: CompiledSystem, whole: ClosedSystem) -> OpenLoop:
     known: dict[int, Any] = {}
     for i, group in enumerate(sites):
         if id(group.site) not in known:
-            exact = group.exact()
+            exact = group.exact
             [known[id(group.site)]] = discretize(exact.a, exact.b, [period])
         found, own_rows = known[id(group.site)], slice(starts[i], starts[i + 1])
         n_x = starts[i + 1] - starts[i]

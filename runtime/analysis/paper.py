@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import Analysis
 from apc.runtime.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
-from apc.runtime.eigen.modes import ClosedSystem
+from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, independent_places
 from apc.runtime.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
 from apc.runtime.frame.discretize import UNIT

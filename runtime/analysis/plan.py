@@ -13,16 +13,10 @@ from dataclasses import dataclass
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.eigen.modes import Loop, arrange, dense_loop
-from apc.runtime.eigen.peers import (
-    MOST_STATES,
-    PeerGroup,
-    more_differ,
-    peer_groups,
-    states_of,
-    too_large,
-    used_ways,
-)
+from apc.runtime.eigen.loop import Loop
+from apc.runtime.eigen.modes import arrange, dense_loop
+from apc.runtime.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
+from apc.runtime.eigen.peers import more_differ, peer_groups
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.parameters import Numbers
@@ -109,7 +103,12 @@ def make_plan(
         loops, found, notes = arranged.loops, arranged.method, arranged.notes
         packets = max(sum(sum(group.schedule.depths) for group in loop.sites) for loop in loops)
         if method == "determinant":
+            from apc.runtime.large.twins import split_twins  # of no use to any other method
+
             found = method
+            whole, loops = loops, tuple(part for loop in loops for part in split_twins(loop))
+            if len(loops) > len(whole):
+                notes = (f"{len(loops)} systems, as peers that can change places move alike or apart",)
         elif method == "auto" and (
             max(sum(group.schedule.depths) for loop in loops for group in loop.sites) > LONG_LINES
             or (packets > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)
@@ -200,6 +199,8 @@ def _plan_crowds(
     if method == "determinant" and sparse:
         reason = f"the peers differ, and not all of them hear all others over {sparse[0]}"
         raise cannot_serve(system, method, reason)
+    if method == "krylov" and not links:
+        raise cannot_serve(system, method, "no peer hears another, so each is a small system by itself")
     if method == "krylov" and full and exchange.peers > MOST_FULL:
         reason = f"all of {exchange.peers:,} peers hear each other over {full[0]}: nothing is sparse"
         raise cannot_serve(system, method, reason)

@@ -10,18 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.runtime.analysis.box import Range
-from apc.runtime.analysis.box_proof import BoxProof, prove_box
 from apc.runtime.analysis.contact_modes import ContactModes, contact_modes
 from apc.runtime.analysis.conventions import Conventions, conventions
-from apc.runtime.analysis.paper import analyze_paper
 from apc.runtime.vary.margins import Margins, margins
 from apc.runtime.vary.sensitivity import Sensitivities, sensitivities
+
+if TYPE_CHECKING:
+    from apc.runtime.analysis.box_proof import BoxProof
+    from apc.runtime.analysis.ranges import Range
 
 # More peers than this, that differ or stand on a graph, are more than can be differentiated in passing.
 FEW_PEERS = 100
@@ -87,6 +88,8 @@ def judge(
     if certify:
         what = "method paper gives no proof: its matrices hold every sample of a frame, rounded"
         raise ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto --certify"))
+    from apc.runtime.analysis.paper import analyze_paper  # rarely asked for
+
     return analyze_paper(system)
 
 
@@ -131,8 +134,15 @@ def answer(
         contact_modes=modes,
         conventions=compared,
         detailed=every_convention,
-        box=prove_box(system, box) if box else None,
+        box=_prove_box(system, box) if box else None,
     )
+
+
+def _prove_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:
+    """Return the proof over a box; imported here, as few analyses ask for one."""
+    from apc.runtime.analysis.box_proof import prove_box
+
+    return prove_box(system, box)
 
 
 def _sensitivities(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:

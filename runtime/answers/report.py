@@ -7,26 +7,28 @@ Does not: compute.
 
 from __future__ import annotations
 
-import io
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.table import Table
-
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import WIDTH, counted, wrapped
-from apc.runtime.analysis.analysis import Analysis
-from apc.runtime.analysis.needs import Needs
-from apc.runtime.analysis.selfcheck import skipped
-from apc.runtime.answers.answer import Answer
-from apc.runtime.eigen.spectrum import Mode
+
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
+    from apc.runtime.analysis.analysis import Analysis
+    from apc.runtime.analysis.needs import Needs
+    from apc.runtime.answers.answer import Answer
+    from apc.runtime.eigen.spectrum import Mode
 
 MOST_ROWS = 16
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
 LARGE = 1e4  # a larger magnitude needs another notation to fit its column
-MOVES_WIDTH = 30  # what the other columns leave of 80
+MOVES_WIDTH = 30  # columns at most of what a mode moves, at least of what it is cut to
+LEAST_WIDTH = 12
+LEAST_SHARE = 0.005  # shows as zero
+HEADINGS = ("magnitude", "shape", "times", "frequency", "damping", "moves most")
 
 _WORDS = {
     "stable": "Every motion dies out.",
@@ -66,6 +68,8 @@ def compile_report(system: CompiledSystem, needs: Needs, target: Path, differenc
 
 
 def _self_check(system: CompiledSystem, difference: float) -> str:
+    from apc.runtime.analysis.selfcheck import skipped  # an analysis checks nothing
+
     left_out = skipped(system)
     compared = f"one frame event by event and lifted differ by {difference:.0e}"
     if not left_out:
@@ -143,29 +147,44 @@ def _mode_table(modes: tuple[Mode, ...]) -> str:
     alive = [mode for mode in modes if mode.magnitude > max(mode.error, LEAST_MAGNITUDE)]
     rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
     shown = rows[:MOST_ROWS]
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for heading in ("magnitude", "shape", "times", "frequency", "damping"):
-        table.add_column(heading, justify="left" if heading == "shape" else "right", no_wrap=True)
-    table.add_column("moves most", max_width=MOVES_WIDTH)
-    for mode in shown:
-        table.add_row(
-            f"{mode.magnitude:.6f}" if mode.magnitude < LARGE else f"{mode.magnitude:.6e}",
-            mode.shape,
-            str(mode.multiplicity),
-            f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–",
-            f"{mode.damping_ratio:.3g}",
-            _leading(mode),
-        )
-    stream = io.StringIO()
-    Console(file=stream, width=WIDTH - 2, color_system=None).print(table)
-    text = "\n".join("  " + line.rstrip() for line in stream.getvalue().splitlines())
     left = len(modes) - len(alive) + len(rows) - len(shown)
+    if not shown:
+        rest = f"{counted(left, 'mode')} die{'s' if left == 1 else ''} out within a frame (--json lists all)"
+        return f"  {rest}" if left else "  nothing moves but that"
+    text = "\n".join(_table_lines([HEADINGS, *(_cells(mode) for mode in shown)]))
     return f"{text}\n  and {left} faster-dying ones (--json lists all)" if left else text
+
+
+def _cells(mode: Mode) -> tuple[str, ...]:
+    return (
+        f"{mode.magnitude:.6f}" if mode.magnitude < LARGE else f"{mode.magnitude:.6e}",
+        mode.shape,
+        str(mode.multiplicity),
+        f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–",
+        f"{mode.damping_ratio:.3g}",
+        _leading(mode),
+    )
+
+
+def _table_lines(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
+    """Yield the lines of a table: numbers to the right, words to the left, the last column wrapped."""
+    widths = [max(len(row[place]) for row in rows) for place in range(len(HEADINGS) - 1)]
+    room = WIDTH - 2 - sum(widths) - 2 * len(widths)
+    last = max(min(MOVES_WIDTH, room), LEAST_WIDTH)
+    for row in rows:
+        cells = [
+            f"{cell:<{width}}" if heading == "shape" else f"{cell:>{width}}"
+            for heading, cell, width in zip(HEADINGS, row, widths, strict=False)
+        ]
+        start = f"  {'  '.join(cells)}  "
+        for line in textwrap.wrap(row[-1], last, break_on_hyphens=False) or [""]:
+            yield f"{start}{line}".rstrip()
+            start = " " * len(start)
 
 
 def _leading(mode: Mode) -> str:
     largest = sorted(mode.participation, key=lambda item: -item[1])[:2]
-    return ", ".join(f"{name} {share:.0%}" for name, share in largest)
+    return ", ".join(f"{name} {share:.0%}" for name, share in largest if share >= LEAST_SHARE)
 
 
 def _time(seconds: float) -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from apc.api import (
         analyze,
+        bench,
         compile,
         contact_modes,
         conventions,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from apc.runtime.analysis.contact_modes import ContactModes
     from apc.runtime.analysis.conventions import Conventions
     from apc.runtime.analysis.paper import PaperRoute
+    from apc.runtime.bench.bench import Bench
     from apc.runtime.region.region import Region
     from apc.runtime.simulate.trajectory import Trajectory
     from apc.runtime.sweep.sweep import Sweep
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "Analysis": "apc.runtime.analysis.analysis",
     "ApcError": "apc.compiler.errors",
+    "Bench": "apc.runtime.bench.bench",
     "BoxProof": "apc.runtime.analysis.box_proof",
     "CompiledSystem": "apc.compiler.compiled",
     "ContactModes": "apc.runtime.analysis.contact_modes",
@@ -62,6 +65,7 @@ _HOMES = {
     "Sweep": "apc.runtime.sweep.sweep",
     "Trajectory": "apc.runtime.simulate.trajectory",
     "analyze": "apc.api",
+    "bench": "apc.api",
     "compile": "apc.api",
     "contact_modes": "apc.api",
     "conventions": "apc.api",
@@ -83,6 +87,7 @@ _HOMES = {
 __all__ = [
     "Analysis",
     "ApcError",
+    "Bench",
     "BoxProof",
     "CompiledSystem",
     "ContactModes",
@@ -95,6 +100,7 @@ __all__ = [
     "Sweep",
     "Trajectory",
     "analyze",
+    "bench",
     "compile",
     "contact_modes",
     "conventions",

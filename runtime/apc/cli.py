@@ -23,6 +23,7 @@ from apc.cli_simulate import simulate_command
 from apc.cli_sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted
+from apc.runtime.threads import start_single_threaded
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -145,6 +146,7 @@ def compile_command(file: str | None, until: str, force: bool, timings: bool) ->
     and how large the systems are that decide its stability. Compiles nothing
     if the topology, every file it names and apc itself are as they were.
     """
+    start_single_threaded()
     from apc.inputs import compiled_already, find_input
 
     path = Path(file) if file else find_input(compiled_too=False)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import click
 
 from apc.options import json_option, print_result, set_option
+from apc.runtime.threads import start_single_threaded
 
 METHODS = ("auto", "modes", "dense", "determinant", "krylov", "paper")
 
@@ -62,6 +63,7 @@ def analyze_command(
     how far each coupler and delay may grow, and for contacts that push and
     never pull, which of them make it unstable.
     """
+    start_single_threaded()
     from apc.inputs import open_scene
     from apc.runtime.answers.answer import answer
 

@@ -90,13 +90,13 @@ def bench_command(
 
         system = apply(system, [parse_override(system, text) for text in settings])
     found = bench(system)
+    _print(found.to_dict(), bench_report(found), as_json)
     if plot is not None:
         from apc.runtime.bench.figure import save_bench
 
         save_bench(found, plot)
-    _print(found.to_dict(), bench_report(found), as_json)
-    if plot is not None and not as_json:
-        click.echo(f"  {plot} is written")
+        if not as_json:
+            click.echo(f"  {plot} is written")
 
 
 def _hard(folder: Path, as_json: bool) -> None:
@@ -108,9 +108,7 @@ def _hard(folder: Path, as_json: bool) -> None:
     _print(found.to_dict(), hard_report(found), as_json)
     if found.failures:
         names = ", ".join(case.name for case in found.failures)
-        raise ApcError(
-            Mistake("E922", Place(str(folder)), f"{len(found.failures)} hard cases failed: {names}")
-        )
+        raise ApcError(Mistake("E922", Place(str(folder)), f"not every hard case came out right: {names}"))
 
 
 def _scale(path: Path, counts: str, as_json: bool) -> None:
@@ -122,11 +120,13 @@ def _scale(path: Path, counts: str, as_json: bool) -> None:
         what = "is a compiled model, whose peers are counted"
         raise ApcError(Mistake("E921", Place(str(path)), what, hint=f"apc bench {path.with_suffix('.yaml')}"))
     try:
-        numbers = [int(float(text)) for text in counts.split(",")]
-    except (ValueError, OverflowError) as error:
-        place = Place("--scale")
-        raise ApcError(Mistake("E921", place, "the numbers", "like 3,30,300", counts[:80])) from error
-    found = scale(path, numbers)
+        numbers = [float(text) for text in counts.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(number.is_integer() for number in numbers):
+        expected = "numbers of peers like 3,30,300"
+        raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, counts[:80]))
+    found = scale(path, [int(number) for number in numbers])
     _print(found.to_dict(), scale_report(found), as_json)
 
 

@@ -1,7 +1,8 @@
 """The command `apc critical`.
 
 Takes: words of a command line. Gives: text on stdout.
-Guarantees: with --json, stdout holds one JSON document and nothing else.
+Guarantees: with --json, stdout holds one JSON document and nothing else; how far the search is goes to a
+terminal only.
 Does not: compute.
 """
 
@@ -10,6 +11,8 @@ from __future__ import annotations
 import click
 
 from apc.options import json_option, print_result, set_option
+from apc.progress import status_line
+from apc.runtime.threads import start_single_threaded
 
 
 @click.command("critical")
@@ -35,8 +38,11 @@ def critical_command(
     is printed, and on which side of it the scene is stable. FILE is a
     topology or a compiled model.
     """
+    start_single_threaded()
     from apc.inputs import open_scene
     from apc.runtime.vary.critical import critical
 
     system = open_scene(file, settings)
-    print_result(critical(system, path, lower=lower, upper=upper), as_json=as_json)
+    with status_line() as told:
+        found = critical(system, path, lower=lower, upper=upper, told=told)
+    print_result(found, as_json=as_json)

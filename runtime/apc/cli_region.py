@@ -14,6 +14,8 @@ import click
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.options import json_option, print_result, set_option
+from apc.progress import status_line
+from apc.runtime.threads import start_single_threaded
 
 
 @click.command("region")
@@ -83,6 +85,7 @@ def region_command(
                    --compare mesh.yaml --vary "lan.delay=0,8 ms" \\
                    --out regions.svg
     """
+    start_single_threaded()
     from apc.inputs import open_scene
     from apc.runtime.region.files import check_region_path, write_panels
     from apc.runtime.region.panels import compare_regions, parse_panel, parse_vary
@@ -94,9 +97,10 @@ def region_command(
         raise ApcError(Mistake("E907", Place("region"), what))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
     systems = [open_scene(one, settings) for one in (file, *compare)]
-    found = compare_regions(
-        systems, x=x, y=y, panels=listed, overlays=overlays, normalize=normalize, cells=cells
-    )
+    with status_line() as told:
+        found = compare_regions(
+            systems, x=x, y=y, panels=listed, overlays=overlays, normalize=normalize, cells=cells, told=told
+        )
     if out is not None:
         write_panels(out, found)
     print_result(found, as_json=as_json)

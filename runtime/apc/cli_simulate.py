@@ -8,17 +8,24 @@ Does not: compute.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from apc.compiler.errors import ApcError
 from apc.options import json_option, print_document, print_result, set_option
+from apc.progress import progress_bar
 
-LONG = 1.0  # seconds of work after which progress is shown
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
+    from apc.runtime.simulate.methods import Method
+    from apc.runtime.simulate.simulation import Simulation
+    from apc.runtime.simulate.summary import Summary
+    from apc.runtime.simulate.trajectory import Sink
 
 
 @click.command("simulate")
@@ -113,64 +120,131 @@ def simulate_command(
         apc simulate --method semi-implicit:1ms --error
     """
     from apc.inputs import open_scene
-    from apc.runtime.simulate.accuracy import compare_with
+    from apc.runtime.simulate.length import check_length
     from apc.runtime.simulate.methods import DEFAULT, parse_method
-    from apc.runtime.simulate.recording import open_recording
+    from apc.runtime.simulate.trajectory import duration_of, parse_duration
+
+    if runs is not None and (signals or out or plot or error):
+        raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
+    chosen = parse_method(method) if method is not None else DEFAULT
+    asked = parse_duration(duration) if duration is not None else None
+    _check_pictures(plot, still)
+    system = open_scene(file, settings)
+    seconds = duration_of(system, asked)
+    check_length(system, seconds, runs=runs or 1)
+    if still is not None:
+        from apc.runtime.simulate.still import save_still
+
+        save_still(system, still)
+    how = _How(seconds, chosen, seed, jit=not no_jit)
+    if runs is not None:
+        _play_many(system, how, runs, jobs, as_json=as_json)
+    else:
+        _play_one(system, how, _Kept(signals, out, plot, still, error), as_json=as_json)
+
+
+@dataclass(frozen=True, slots=True)
+class _How:
+    """How long a scene is played, in seconds, by which method, and with what luck."""
+
+    seconds: Fraction
+    method: Method
+    seed: int | None
+    jit: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """What is kept of a run: rows of which signals, a picture of them, and its error; `still` is drawn."""
+
+    signals: tuple[str, ...]
+    out: Path | None
+    plot: Path | None
+    still: Path | None
+    error: bool
+
+
+def _check_pictures(plot: Path | None, still: Path | None) -> None:
+    """Refuse a picture that can't be drawn before anything is computed."""
+    for path, option in ((plot, "--plot"), (still, "--still")):
+        if path is not None:
+            from apc.runtime.simulate.figures import check_format
+
+            check_format(path, option)
+
+
+def _play_many(system: CompiledSystem, how: _How, runs: int, jobs: int, *, as_json: bool) -> None:
+    """Play a scene many times and print what that amounts to."""
+    from apc.runtime.simulate.ensemble import play_many
+
+    with progress_bar("simulate", "runs") as show:
+        many = play_many(
+            system,
+            how.seconds,
+            runs=runs,
+            seed=how.seed,
+            jobs=jobs,
+            jit=how.jit,
+            method=how.method,
+            progress=lambda done: show(done, runs),
+        )
+    print_result(many, as_json=as_json)
+    if many.interrupted:
+        raise click.Abort
+
+
+def _play_one(system: CompiledSystem, how: _How, kept: _Kept, *, as_json: bool) -> None:
+    """Play a scene once, keep what is wanted of it, and print what it amounts to."""
+    from apc.runtime.simulate.accuracy import compare_with
     from apc.runtime.simulate.simulation import prepare
     from apc.runtime.simulate.trajectory import (
         Keeper,
-        duration_of,
-        parse_duration,
-        play,
         provenance_of,
         result_document,
         result_text,
         trajectory_of,
     )
 
-    if runs is not None and (signals or out or plot or error):
-        raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
-    chosen = parse_method(method) if method is not None else DEFAULT
-    if plot is not None:
-        from apc.runtime.simulate.figures import check_format
+    simulation = prepare(
+        system, how.seconds, signals=kept.signals, jit=how.jit, seed=how.seed, method=how.method
+    )
+    keeper = Keeper(simulation) if kept.plot is not None else None
+    comparison = compare_with(simulation, signals=kept.signals, jit=how.jit) if kept.error else None
+    sinks = [sink for sink in (keeper, comparison) if sink is not None]
+    summary, interrupted = _play_into(simulation, kept.out, sinks)
+    estimate = comparison.estimate() if comparison is not None else None
+    if kept.plot is not None and keeper is not None:
+        from apc.runtime.simulate.figures import save
 
-        check_format(plot)
-    if still is not None:
-        from apc.runtime.simulate.figures import check_format
+        save(trajectory_of(simulation, keeper, summary, interrupted), kept.plot)
+    provenance = provenance_of(simulation)
+    if as_json:
+        print_document(result_document(system.name, summary, provenance, interrupted, estimate))
+    else:
+        click.echo(result_text(system.name, summary, provenance, estimate))
+        for written in (kept.out, kept.plot, kept.still):
+            if written is not None:
+                click.echo(f"  {written} is written")
+    if interrupted:
+        until = f"{summary.end:g} s of {float(how.seconds):g} s"
+        click.echo(f"stopped at {until}; what was done is kept", err=True)
+        raise click.Abort
 
-        check_format(still, "--still")
-    system = open_scene(file, settings)
-    if still is not None:
-        from apc.runtime.simulate.still import save_still
 
-        save_still(system, still)
-    seconds = duration_of(system, parse_duration(duration) if duration is not None else None)
-    if runs is not None:
-        from apc.runtime.simulate.ensemble import play_many
+def _play_into(simulation: Simulation, out: Path | None, sinks: Sequence[Sink]) -> tuple[Summary, bool]:
+    """Play a simulation into sinks and a file; what was done is in the file even if the run can't go on."""
+    from apc.runtime.simulate.length import size_note
+    from apc.runtime.simulate.recording import open_recording
+    from apc.runtime.simulate.trajectory import play
 
-        with _progress(runs, "runs") as progress:
-            many = play_many(
-                system,
-                seconds,
-                runs=runs,
-                seed=seed,
-                jobs=jobs,
-                jit=not no_jit,
-                method=chosen,
-                progress=progress,
-            )
-        print_result(many, as_json=as_json)
-        if many.interrupted:
-            raise click.Abort
-        return
-    simulation = prepare(system, seconds, signals=signals, jit=not no_jit, seed=seed, method=chosen)
-    comparison = compare_with(simulation, signals=signals, jit=not no_jit) if error else None
     recording = open_recording(out, simulation) if out is not None else None
+    if out is not None and (note := size_note(simulation, decimal=out.suffix.lower() == ".csv")):
+        click.echo(f"{out} {note}", err=True)
+    total = float(simulation.duration)
     try:
-        keeper = Keeper(simulation) if plot is not None else None
-        sinks = [sink for sink in (recording, keeper, comparison) if sink is not None]
-        with _progress(float(seconds)) as progress:
-            summary, interrupted = play(simulation, sinks, progress=progress)
+        with progress_bar("simulate", "s") as show:
+            every = sinks if recording is None else [recording, *sinks]
+            found = play(simulation, every, progress=lambda done: show(done, total))
         if recording is not None:
             recording.close()
     except ApcError:  # the run can't go on: what was done is kept
@@ -181,51 +255,4 @@ def simulate_command(
         if recording is not None:
             recording.discard()
         raise
-    estimate = comparison.estimate() if comparison is not None else None
-    if plot is not None and keeper is not None:
-        from apc.runtime.simulate.figures import save
-
-        save(trajectory_of(simulation, keeper, summary, interrupted), plot)
-    if as_json:
-        document = result_document(system.name, summary, provenance_of(simulation), interrupted, estimate)
-        print_document(document)
-    else:
-        click.echo(result_text(system.name, summary, provenance_of(simulation), estimate))
-        for written in (out, plot, still):
-            if written is not None:
-                click.echo(f"  {written} is written")
-    if interrupted:
-        click.echo(f"stopped at {summary.end:g} s of {float(seconds):g} s; what was done is kept", err=True)
-        raise click.Abort
-
-
-@contextmanager
-def _progress(total: float, unit: str = "s") -> Iterator[Callable[[float], None]]:
-    """Give a function that shows on a terminal how much is done, once the work takes long."""
-    import time
-
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("simulate"),
-        BarColumn(),
-        TextColumn(f"{{task.completed:.4g}} of {{task.total:g}} {unit}"),
-        TimeRemainingColumn(),
-    )
-    bar = Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty())
-    task = bar.add_task("simulate", total=total)
-    begun, shown = time.monotonic(), False
-
-    def progress(done: float) -> None:
-        nonlocal shown
-        if not shown and time.monotonic() - begun > LONG:
-            bar.start()
-            shown = True
-        bar.update(task, completed=done)
-
-    try:
-        yield progress
-    finally:
-        if shown:
-            bar.stop()
+    return found

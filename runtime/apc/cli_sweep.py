@@ -8,19 +8,15 @@ Does not: compute.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.options import json_option, print_result, set_option
-
-if TYPE_CHECKING:
-    from apc.runtime.sweep.sweep import Progress
+from apc.progress import Bar, progress_bar
 
 
 @click.command("sweep")
@@ -105,27 +101,19 @@ def _values(over: tuple[str, ...]) -> dict[str, str]:
 
 
 @contextmanager
-def _progress(out: Path) -> Iterator[Progress]:
+def _progress(out: Path) -> Iterator[Bar]:
     """Give a function that shows progress on a terminal; say what is kept if the body doesn't end well."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    state = {"done": 0.0, "of": 0.0}
+    try:
+        with progress_bar("sweep", "points", after=0.0) as show:
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    state = {"done": 0, "of": 0}
-    shown = sys.stderr.isatty()
-    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
-        task = bar.add_task("sweep", total=None)
+            def progress(done: float, points: float) -> None:
+                state.update(done=done, of=points)
+                show(done, points)
 
-        def progress(done: int, points: int) -> None:
-            state.update(done=done, of=points)
-            bar.update(task, completed=done, total=points)
-
-        try:
             yield progress
-        except BaseException:
-            bar.stop()
-            if state["done"] > 0 and state["of"]:
-                kept = f"{state['done']:,} of {state['of']:,} points are kept in {out}.parts"
-                click.echo(f"{kept}; the same command takes up from there", err=True)
-            raise
+    except BaseException:
+        if state["done"] > 0:
+            kept = f"{state['done']:,.0f} of {state['of']:,.0f} points are kept in {out}.parts"
+            click.echo(f"{kept}; the same command takes up from there", err=True)
+        raise

@@ -13,17 +13,18 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.blocks import ImplicitBlock
 from apc.compiler.clocks import ClockedSystem
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.diagram import Diagram, build_diagram, common_period, draw_dot, one_of, seconds
+from apc.compiler.diagram import Diagram, build_diagram, common_period, one_of, seconds
 from apc.compiler.flatten import FlatKind, FlatSystem
+from apc.compiler.graphviz import draw_dot
 from apc.compiler.listing import plain, step_lines
-from apc.compiler.picture import draw_svg
 from apc.compiler.pipeline import each_stage, run_stages
 from apc.compiler.scene import Scene
+from apc.compiler.solution import ImplicitBlock
 from apc.compiler.structure import SortedKind, SortedSystem
-from apc.compiler.units import format_dimension
+from apc.compiler.svg import draw_svg
+from apc.compiler.unit_text import format_dimension
 from apc.compiler.words import counted, wrapped
 
 PAIRWISE = ("max", "min")

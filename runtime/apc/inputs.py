@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 from apc.compiler.cache import Record, changed, read_record
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.source import MAX_BYTES
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -56,6 +55,8 @@ def find_input(*, compiled_too: bool) -> Path:
 
 
 def _is_topology(path: Path) -> bool:
+    from apc.compiler.source import MAX_BYTES  # with a YAML parser, which a compiled model does without
+
     try:
         if not path.is_file():
             return False

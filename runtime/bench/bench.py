@@ -2,8 +2,8 @@
 
 Takes: a `CompiledSystem`.
 Gives: `Measured`, `Comparison`, `Bench`, `bench`; `pareto_front`.
-Guarantees: times are medians over rounds in which all methods take turns; an error is the distance from a
-reference of fifty digits, and is left out where there is none.
+Guarantees: times are the processor's, medians over rounds in which all methods take turns; an error is the
+distance from a reference of fifty digits, and is left out where there is none.
 Does not: draw (see `bench.figure`), or grow the scene (see `bench.scale`).
 """
 
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Analysis, analyze
+from apc.runtime.analysis.needs import needs
 from apc.runtime.analysis.paper import analyze_paper
 from apc.runtime.bench.reference import PRECISIONS, Truth, exact_course, spectral_truth
 from apc.runtime.eigen.balls import precision
@@ -39,16 +40,22 @@ from apc.runtime.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
-# Rounds in which every method takes its turn; a method gets fewer once its runs took so many seconds.
+# Rounds in which every method takes its turn; a method gets fewer once its runs took so many seconds, and
+# none after its first run if that alone did.
 ROUNDS, LEAST_ROUNDS, ENOUGH = 15, 3, 3.0
 
-# Errors below this many roundings of the largest value are one: which of two is smaller is luck.
+# Errors below this are one: which of two is smaller is luck. An eigenvalue of n states is computed to some n
+# roundings, a state after so many ticks to about as many as the root of their number; scenes have tens of
+# states and hundreds of ticks.
 SAME = 64 * UNIT
 
 # How long the scene is played: what balls can follow in a few seconds, and longer than any start-up.
 DURATION = Fraction(1, 4)
 MOST_PLAYED = 30  # peers: each of them is followed in balls
 MOVED = 0.01  # m: where the first peer starts in a scene that starts at rest
+
+# States of a matrix whose eigenvalues, with their bounds, take some ten seconds; of a larger one, minutes.
+MOST_WHOLE = 600
 
 FAILED = "FAILED, which is a bug"
 
@@ -178,9 +185,16 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
     calls[CERTIFIED] = partial(analyze, system, certify=True)
     calls[PAPER] = partial(analyze_paper, system)
     default = analyze(system)
+    too_large = [
+        (name, f"its matrix of {size:,} states takes minutes")
+        for name, size in _whole_matrices(system).items()
+        if size > MOST_WHOLE and name != default.method
+    ]
+    for name, _ in too_large:
+        del calls[name]
     truth = spectral_truth(system)
-    results, refused = _first(calls)
-    times = _take_turns({name: calls[name] for name in results}, rounds)
+    results, refused, slow = _first(calls)
+    times = slow | _take_turns({name: calls[name] for name in results if name not in slow}, rounds)
     measured = [
         _measured(
             name,
@@ -198,7 +212,22 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
         if found.stable is not None and found.verdict != default.verdict
     ]
     notes += [f"WRONG: the bound of {one.name} does not hold" for one in measured if one.fails]
-    return Comparison("analyze", "spectral radius", pareto_front(measured), said, refused, tuple(notes))
+    return Comparison(
+        "analyze", "spectral radius", pareto_front(measured), said, (*too_large, *refused), tuple(notes)
+    )
+
+
+def _whole_matrices(system: CompiledSystem) -> dict[str, int]:
+    """Return how many states the matrices hold that are of all peers at once; the paper stacks its ticks."""
+    found = needs(system)
+    most = max((ticks for _, ticks in found.ticks), default=1)
+    sites = [(group.count, found.sites[group.kind]) for group in system.groups]
+    states = sum(count * site.states for count, site in sites)
+    return {
+        "dense": states,
+        "krylov": states,  # a sparse one, whose bounds take longer
+        PAPER: sum(count * site.motion * most for count, site in sites),
+    }
 
 
 def _radius_error(found: Analysis, truth: Truth) -> float:
@@ -223,7 +252,7 @@ def bench_simulation(
     else:
         truth = exact_course(system, duration)
     calls = {str(method): partial(_ready, system, duration, method) for method in _methods(system)}
-    ready, refused = _first(calls)
+    ready, refused, _ = _first(calls)
     times = _take_turns({name: partial(_play, one) for name, one in ready.items()}, rounds)
     chosen = prepare(system, duration).how
     measured = [
@@ -304,17 +333,24 @@ def _course_error(simulation: Simulation, truth: tuple[tuple[str, ...], Floats])
     return worst
 
 
-def _first(calls: Mapping[str, Callable[[], Any]]) -> tuple[dict[str, Any], tuple[tuple[str, str], ...]]:
-    """Call everything once; return what came out, and what was refused and why."""
-    results, refused = {}, []
+def _first(
+    calls: Mapping[str, Callable[[], Any]],
+) -> tuple[dict[str, Any], tuple[tuple[str, str], ...], dict[str, list[float]]]:
+    """Call everything once; return what came out, what was refused and why, and the times of slow ones."""
+    results, refused, slow = {}, [], {}
     for name, call in calls.items():
+        began = time.process_time()
         try:
             results[name] = call()
         except ApcError as error:
             refused.append((name, error.mistakes[0].sentence))
         except Exception as error:  # a bug of one method is a result, and no reason to lose the others'
             refused.append((name, f"{FAILED}: {error!r}"))
-    return results, tuple(refused)
+        else:
+            taken = time.process_time() - began
+            if taken > ENOUGH:
+                slow[name] = [taken]
+    return results, tuple(refused), slow
 
 
 def _take_turns(calls: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
@@ -324,9 +360,9 @@ def _take_turns(calls: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str
         for name, call in calls.items():
             if number >= LEAST_ROUNDS and sum(times[name]) > ENOUGH:
                 continue
-            began = time.perf_counter()
+            began = time.process_time()
             call()
-            times[name].append(time.perf_counter() - began)
+            times[name].append(time.process_time() - began)
     return times
 
 
@@ -340,8 +376,10 @@ def _measured(
 def pareto_front(measured: Sequence[Measured]) -> tuple[Measured, ...]:
     """Mark what no other is better than in both ways, and sort by time.
 
-    Faster is what is faster by more than both spreads; more right, what errs less by more than luck (`SAME`).
-    Without errors there is no front.
+    One beats another if it is faster by more than both spreads together and not less right, or more right and
+    not slower. Half the distance between the quartiles is 0.67 of a normal deviation σ, the median of 15 runs
+    is certain to 0.32 σ, so that a difference of both spreads is three deviations of what luck makes. More
+    right is what errs less by more than luck (`SAME`). Without errors there is no front.
     """
     return tuple(
         replace(

@@ -23,11 +23,13 @@ import flint
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem, Kind
+from apc.runtime.bench.pushes import Push, impulse, in_the_way, push_of, switches
 from apc.runtime.eigen.balls import rational_ball
 from apc.runtime.frame.exact import evaluate_exact, is_rational
+from apc.runtime.frame.guards import guards_of
 from apc.runtime.frame.parameters import resolve
 
-Number = Any  # flint.arb, or an exact 0 or 1
+Number = Any  # flint.arb, an exact 0 or 1, or an array of these
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +37,8 @@ class Peer:
     """One peer: its functions over exact numbers, and what is needed of the past.
 
     `ticks` and `sends` give a list of numbers of (x, u, m, r) and of (x, u); `rate` is [A B c] (n_x, n_x +
-    n_u + 1), exact. `back` counts the ticks kept of each clock, `sent_back` the packets of each link.
+    n_u + 1), exact. `push` is what changes with time alone, instead of c. `back` counts the ticks kept of
+    each clock, `sent_back` the packets of each link.
     """
 
     kind: Kind
@@ -43,6 +46,7 @@ class Peer:
     ticks: tuple[Callable[..., list[Number]], ...]
     sends: tuple[Callable[..., list[Number]], ...]
     rate: Any  # flint.fmpq_mat, square
+    push: Push | None
     delays: tuple[Fraction, ...]
     back: tuple[int, ...]
     sent_back: tuple[int, ...]
@@ -85,8 +89,8 @@ def refusal(system: CompiledSystem, *, in_time: bool) -> str:
         For a run in time; else for the eigenvalues of a frame.
     """
     for kind in system.kinds:
-        functions = [kind.derivative, *(c.tick for c in kind.clocks), *(s.send for s in kind.sends)]
-        if not all(function.is_a("SXFunction") and is_rational(function) for function in functions):
+        functions = [*(c.tick for c in kind.clocks), *(s.send for s in kind.sends)]
+        if not all(map(is_rational, functions)) or not _has_exact_slopes(kind.derivative):
             return f"the equations of {kind.name} hold functions whose values are rounded"
         if any(receive.edge is not None for clock in kind.clocks for receive in clock.receives):
             return f"{kind.name} looks at each sender by itself"
@@ -94,8 +98,10 @@ def refusal(system: CompiledSystem, *, in_time: bool) -> str:
             return f"{kind.name} hears a maximum or minimum"
         if not _is_affine(kind.derivative):
             return f"between its ticks {kind.name} is not linear"
-        if in_time and _changes(kind.derivative):
-            return f"a force on {kind.name} changes between its ticks"
+        if in_time and (reason := in_the_way(kind)):
+            return reason
+        if in_time and any(_switches_by_time(function) for function in functions):
+            return f"at a tick {kind.name} asks whether a moment has come, which a rounding decides"
         # What is heard at the start is not looked up: slopes must not depend on it.
         if not in_time and not all(_is_affine(one.tick, slice(3, 4)) for one in kind.clocks):
             return f"{kind.name} is not linear in what it hears"
@@ -111,10 +117,19 @@ def _is_affine(function: Any, arguments: slice = slice(-2)) -> bool:
     return not (slopes.nnz() and casadi.depends_on(slopes, casadi.vertcat(*symbols[arguments], symbols[-1])))
 
 
-def _changes(function: Any) -> bool:
-    """Say whether a function looks at the time."""
+def _has_exact_slopes(function: Any) -> bool:
+    """Say whether nothing rounds what a function multiplies its first arguments by."""
     symbols = function.sx_in()
-    return bool(casadi.depends_on(casadi.densify(function(*symbols)), symbols[-1]))
+    if not function.is_a("SXFunction"):
+        return False
+    slopes = casadi.jacobian(function(*symbols), casadi.vertcat(*symbols[:-2]))
+    return is_rational(casadi.Function("slopes", symbols, [slopes]))
+
+
+def _switches_by_time(function: Any) -> bool:
+    """Say whether a function compares the time with something."""
+    symbols = function.sx_in()
+    return bool(guards_of(casadi.densify(function(*symbols)), symbols[-1]))
 
 
 def _rule(
@@ -174,8 +189,11 @@ def _slopes(
     return lambda time, *parts: [sum((parts[i][j] * k for i, j, k in row), 0) for row in rows]
 
 
-def _rate(kind: Kind, parameters: Sequence[Fraction], *, linear: bool) -> Any:
-    """Return [A B c; 0 0 0] of the continuous equations, exact; c = 0 when `linear`."""
+def _rate(kind: Kind, parameters: Sequence[Fraction], *, linear: bool) -> tuple[Any, Push | None]:
+    """Return [A B c; 0 0 0] of the continuous equations, exact, and what pushes if it is not c.
+
+    When `linear` nothing does.
+    """
     n_x, n_u = len(kind.states), len(kind.holds)
     symbols = kind.derivative.sx_in()
     dense = casadi.Function("dense", symbols, [casadi.densify(kind.derivative(*symbols))])
@@ -187,10 +205,17 @@ def _rate(kind: Kind, parameters: Sequence[Fraction], *, linear: bool) -> Any:
 
     still = speed(-1)
     columns = [[a - b for a, b in zip(speed(i), still, strict=True)] for i in range(n_x + n_u)]
-    columns.append([Fraction(0)] * n_x if linear else still)
+    a = _rationals([[columns[c][r] for c in range(n_x)] for r in range(n_x)])
+    push = None if linear else push_of(kind, parameters, a)
+    columns.append([Fraction(0)] * n_x if linear or push else still)
     size = n_x + n_u + 1
     rows = [[columns[c][r] if r < n_x else Fraction(0) for c in range(size)] for r in range(size)]
-    return flint.fmpq_mat(size, size, [flint.fmpq(e.numerator, e.denominator) for row in rows for e in row])
+    return _rationals(rows), push
+
+
+def _rationals(rows: Sequence[Sequence[Fraction]]) -> Any:
+    entries = [flint.fmpq(entry.numerator, entry.denominator) for row in rows for entry in row]
+    return flint.fmpq_mat(len(rows), len(rows), entries)
 
 
 def build_peers(
@@ -222,6 +247,7 @@ def build_peers(
         start_x = tuple(value[state.start] for state in kind.states)
         start_m = tuple(tuple(value[name] for name in clock.starts) for clock in kind.clocks)
         still = [list(start_x), [Fraction(0)] * len(kind.holds)]
+        rate, push = _rate(kind, parameters, linear=linear)
         found.append(
             Peer(
                 kind=kind,
@@ -235,7 +261,8 @@ def build_peers(
                     for clock, m in zip(kind.clocks, start_m, strict=True)
                 ),
                 sends=tuple(_rule(send.send, parameters, still if linear else None) for send in kind.sends),
-                rate=_rate(kind, parameters, linear=linear),
+                rate=rate,
+                push=push,
                 delays=delays,
                 back=tuple(
                     max(
@@ -292,7 +319,7 @@ class Happening:
                     self.delay[link.name, h, g] = self.seconds[late.get((h, g), link.delay)]
 
     def instants(self, start: Fraction, end: Fraction) -> list[Fraction]:
-        """Return all instants in [start, end) at which something ticks or acts, and both ends."""
+        """Return all instants in [start, end) at which something ticks acts or switches, and both ends."""
         found = {start, end}
         for phase, period in self.clocks.values():
             found |= ticks_between(phase, period, start, end)
@@ -300,6 +327,8 @@ class Happening:
             for hold, delay in zip(site.kind.holds, site.delays, strict=True):
                 phase, period = self.clocks[hold.clock]
                 found |= ticks_between((phase + delay) % period, period, start, end)
+            if site.push is not None:
+                found |= switches(site.push, start, end)
         return sorted(found)
 
     def play(self, play: Play, start: Fraction, end: Fraction) -> None:
@@ -320,7 +349,7 @@ class Happening:
                         before.append((now, site.ticks[place](now, play.x[i], held[i], m, r)))
             for i, site in enumerate(self.sites):
                 u = self._held(play, i, now, before=False)
-                play.x[i] = _move(site, play.x[i], u, following - now)
+                play.x[i] = _move(site, play.x[i], u, now, following - now)
 
     def _ticks_now(self, clock: str, now: Fraction) -> bool:
         phase, period = self.clocks[clock]
@@ -364,8 +393,10 @@ def ticks_between(phase: Fraction, period: Fraction, start: Fraction, end: Fract
     return {phase + k * period for k in range(first, math.ceil((end - phase) / period))}
 
 
-def _move(site: Peer, x: Sequence[Number], u: Sequence[Number], duration: Fraction) -> list[Number]:
-    """Let the continuous states run with held inputs."""
+def _move(
+    site: Peer, x: Sequence[Number], u: Sequence[Number], start: Fraction, duration: Fraction
+) -> list[Number]:
+    """Let the continuous states run with held inputs, and whatever else pushes."""
     if duration not in site.steps:
         length = flint.fmpq(duration.numerator, duration.denominator)
         site.steps[duration] = [
@@ -373,4 +404,7 @@ def _move(site: Peer, x: Sequence[Number], u: Sequence[Number], duration: Fracti
             for row in flint.arb_mat(site.rate * length).exp().tolist()[: len(x)]
         ]
     both = [*x, *u, 1]
-    return [sum((both[place] * entry for place, entry in row), 0) for row in site.steps[duration]]
+    moved = [sum((both[place] * entry for place, entry in row), 0) for row in site.steps[duration]]
+    if site.push is None:
+        return moved
+    return [one + more for one, more in zip(moved, impulse(site.push, start, duration), strict=True)]

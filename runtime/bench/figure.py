@@ -13,15 +13,25 @@ from pathlib import Path
 from typing import Any
 
 from apc.runtime.bench.bench import SAME, Bench, Comparison
+from apc.runtime.optional import need
 from apc.runtime.simulate.figures import write_figure
-from apc.runtime.simulate.trajectory import need
+
+Box = tuple[float, ...]  # left, bottom, right, top, in pixels
 
 WIDTH, HEIGHT = 4.6, 3.6  # inches, of a panel
 LEAST = 1e-17  # where an error of zero is drawn
 FRONT, OTHER, CHOSEN = "#0072B2", "#555555", "#D55E00"  # distinct for colour-blind eyes (Okabe and Ito, 2008)
 ROOM = 0.12  # of an axis: kept free at its ends for names
-NEAR = 0.2  # of the axis: names of points nearer than this could touch
-SIDE = 0.6  # of the axis: points right of it have their names on the left
+# Where a name may stand beside its point, the first that is free: (right, up) in points, and what of the name
+# is there.
+PLACES = tuple(
+    (right * (6 if right else 0), up, {1: "left", -1: "right", 0: "center"}[right])
+    for up in (3, -7, 9, -13, 15, -19, 21, -25)
+    for right in (1, -1, 0)
+    if right or abs(up) > 3
+)
+SPAN = 12.0  # from end to end of an axis at the least: one power of ten is named on it
+CLEAR = 3.0  # points: about a mark, where no name may stand
 
 
 def draw_bench(found: Bench) -> Any:
@@ -38,6 +48,9 @@ def draw_bench(found: Bench) -> Any:
     for ax, one in zip(axes, found.comparisons, strict=True):
         _panel(ax, one)
     figure.suptitle(f"{found.topology}: error against time", fontsize=11)
+    figure.draw_without_rendering()  # names are placed where the panels will be
+    for ax, one in zip(axes, found.comparisons, strict=True):
+        _name_points(ax, one)
     return figure
 
 
@@ -91,27 +104,41 @@ def _panel(ax: Any, found: Comparison) -> None:
             fontsize=7,
         )
     ax.margins(ROOM)
-    _name_points(ax, found)
+    for low, high, set_limits in ((*ax.get_xlim(), ax.set_xlim), (*ax.get_ylim(), ax.set_ylim)):
+        more = max(SPAN * low / high, 1.0) ** 0.5
+        set_limits(low / more, high * more)
+    ax.xaxis.set_minor_formatter("")
+    ax.yaxis.set_minor_formatter("")
 
 
 def _name_points(ax: Any, found: Comparison) -> None:
-    """Write each point's name beside it, over no other name: the lower of two near ones goes down."""
-    taken: list[tuple[float, float]] = []
-    ax.figure.draw_without_rendering()
-    for one in found.measured:
-        if one.error is None:
-            continue
-        x, y = ax.transAxes.inverted().transform(ax.transData.transform((one.seconds, max(one.error, LEAST))))
-        left = x > SIDE
-        shift = 4.0
-        while any(abs(y + shift / 200 - other) < 0.05 and abs(x - at) < NEAR for at, other in taken):
-            shift -= 9.0
-        taken.append((x, y + shift / 200))
-        ax.annotate(
+    """Write each point's name beside it, over no mark and no other name, within the axes."""
+    points = [one for one in found.measured if one.error is not None]
+    marks = [ax.transData.transform((one.seconds, max(one.error or 0.0, LEAST))) for one in points]
+    clear = CLEAR * ax.figure.dpi / 72
+    taken = [(x - clear, y - clear, x + clear, y + clear) for x, y in marks]
+    taken += [tuple(text.get_window_extent().extents) for text in ax.texts]
+    frame = tuple(ax.get_window_extent().extents)
+    for one in points:
+        name = ax.annotate(
             one.name + (" (default)" if one.chosen else ""),
-            (one.seconds, max(one.error, LEAST)),
-            xytext=(-6 if left else 6, shift),
+            (one.seconds, max(one.error or 0.0, LEAST)),
+            xytext=(0, 0),
             textcoords="offset points",
-            ha="right" if left else "left",
             fontsize=7,
         )
+        for right, up, side in PLACES:
+            name.set_position((right, up))
+            name.set_horizontalalignment(side)
+            box = tuple(name.get_window_extent().extents)
+            if _within(box, frame) and not any(_overlap(box, other) for other in taken):
+                break
+        taken.append(tuple(name.get_window_extent().extents))
+
+
+def _within(box: Box, frame: Box) -> bool:
+    return frame[0] < box[0] and frame[1] < box[1] and box[2] < frame[2] and box[3] < frame[3]
+
+
+def _overlap(one: Box, other: Box) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]

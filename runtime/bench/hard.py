@@ -179,8 +179,11 @@ def _truths(folder: Path) -> dict[str, Any]:
     listed: list[tuple[str, Any]] = list(found.items()) if isinstance(found, dict) else [("", None)]
     for name, truth in listed:
         try:
-            Fraction(truth["spectral_radius"]), int(truth["rigid_modes"]), str(truth["verdict"])
-        except (TypeError, KeyError, ValueError) as error:
+            Fraction(truth["spectral_radius"])
+            whole = isinstance(truth["rigid_modes"], int) and isinstance(truth["verdict"], str)
+            if not whole:
+                raise TypeError
+        except (TypeError, KeyError, ValueError, ArithmeticError) as error:
             expected = "spectral_radius (digits), rigid_modes and verdict of each scene"
             raise ApcError(
                 Mistake("E920", place, name or "the truths", expected, "something else")

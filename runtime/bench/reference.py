@@ -30,6 +30,7 @@ from apc.runtime.bench.events import (
 from apc.runtime.eigen.balls import precision, rational_ball
 from apc.runtime.frame.exchange import arcs
 from apc.runtime.frame.parameters import resolve
+from apc.runtime.simulate.simulation import ROW
 
 # What is asked of a reference, relative to the largest: far beyond what floats can be wrong by.
 DIGITS = 50
@@ -149,21 +150,18 @@ def _difference_whom(sites: Sequence[Peer], classes: Classes, place: int) -> Who
 
 def _map(scene: Happening) -> Any:
     """Return the map of one frame, without the states that nobody reads: a matrix of balls."""
-    sizes = [len(site.names) for site in scene.sites]
-    n = sum(sizes)
-    columns = []
-    for column in range(n):
-        state = [int(column == row) for row in range(n)]
-        play = _from_state(scene, state)
-        scene.play(play, Fraction(0), scene.frame)
-        columns.append(_to_state(scene, play))
+    n = sum(len(site.names) for site in scene.sites)
+    # Every number of the state is a row: what it is of each number of the state at the frame's start.
+    play = _from_state(scene, list(np.eye(n, dtype=int).astype(object)))
+    scene.play(play, Fraction(0), scene.frame)
+    rows = [np.broadcast_to(np.asarray(row, dtype=object), n) for row in _to_state(scene, play)]
     kept = list(range(n))
     while True:  # what nobody reads adds an eigenvalue 0 and nothing else
-        read = [c for c in kept if any(not _is_zero(columns[c][r]) for r in kept)]
+        read = [c for c in kept if any(not _is_zero(rows[r][c]) for r in kept)]
         if len(read) == len(kept):
             break
         kept = read
-    return flint.arb_mat(len(kept), len(kept), [flint.arb(columns[c][r]) for r in kept for c in kept])
+    return flint.arb_mat(len(kept), len(kept), [flint.arb(rows[r][c]) for r in kept for c in kept])
 
 
 def _is_zero(entry: Number) -> bool:
@@ -327,7 +325,8 @@ def _course(system: CompiledSystem, duration: Fraction) -> tuple[tuple[str, ...]
         )
         nothing: list[Number] = [flint.arb(0)] * len(site.kind.holds)
         play.packets.append([[(long_ago, rule(Fraction(0), play.x[-1], nothing))] for rule in site.sends])
-    phase, period = min(scene.clocks.values(), key=lambda one: one[1])
+    nothing_ticks = Fraction(0), ROW
+    phase, period = min(scene.clocks.values(), key=lambda one: one[1], default=nothing_ticks)
     rows, now = [], Fraction(0)
     instants = sorted({Fraction(0), *ticks_between(phase, period, Fraction(0), duration + period)})
     for instant in (one for one in instants if one <= duration):

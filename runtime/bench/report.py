@@ -8,19 +8,18 @@ Does not: compute.
 from __future__ import annotations
 
 import math
-import textwrap
 
+from apc.compiler.words import counted, wrapped
 from apc.runtime.bench.bench import Bench, Comparison, Measured
 from apc.runtime.bench.hard import HardReport
 from apc.runtime.bench.scale import Scale
 
-WIDTH = 80
 NOTHING = "–"
 
 
 def bench_report(found: Bench) -> str:
     """Return a table a task, the methods sorted by time."""
-    peers = f"{found.peers:,} peer{'' if found.peers == 1 else 's'}"
+    peers = counted(found.peers, "peer", ",")
     where = ", ".join(f"{name} {value}" for name, value in found.machine.items() if value)
     parts = [f"{found.topology}: {peers}", *(_task(one) for one in found.comparisons), _filled(where)]
     return "\n\n".join(parts)
@@ -67,7 +66,7 @@ def _choice(found: Comparison) -> str:
 def hard_report(found: HardReport) -> str:
     """Return a line a hard case, and what failed."""
     lines = [
-        f"{found.folder}: {len(found.cases)} scenes with a known truth",
+        f"{found.folder}: {counted(len(found.cases), 'scene')} with a known truth",
         "",
         "  scene                     error     bound  bound÷error        time  verdict",
     ]
@@ -121,4 +120,4 @@ def _size(value: float | None) -> str:
 
 
 def _filled(text: str) -> str:
-    return textwrap.fill(text, WIDTH, initial_indent="  ", subsequent_indent="    ")
+    return "\n".join(wrapped(text, "  ", "    "))

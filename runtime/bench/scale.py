@@ -22,8 +22,10 @@ from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.groups import LARGEST_COUNT
+from apc.compiler.nodes import Mapping, Scalar
 from apc.compiler.pipeline import stages_of
-from apc.compiler.source import Mapping, Scalar, parse_source, read_source
+from apc.compiler.source import parse_source, read_source
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.bench.reference import Truth, spectral_truth
 from apc.runtime.threads import single_threaded
@@ -78,10 +80,9 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
     ApcError
         E921 no group has a written count, or a number is none; and those of compiling.
     """
-    if not counts or min(counts) < 1:
-        raise ApcError(
-            Mistake("E921", Place("--scale"), "the numbers", "1 or more, as 3,30,300", str(counts))
-        )
+    if not counts or min(counts) < 1 or max(counts) > LARGEST_COUNT:
+        expected = f"numbers from 1 to {LARGEST_COUNT:,}, like 3,30,300"
+        raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, str(counts)[:80]))
     name, _ = _largest(path)
     rows, refused = [], []
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:

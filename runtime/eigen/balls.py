@@ -22,7 +22,8 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.modes import ClosedSystem, Packet, packet_places
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.loop import Packet, packet_places
 from apc.runtime.frame.discretize import step_balls
 from apc.runtime.frame.exact import is_rational
 from apc.runtime.frame.exchange import Surd
@@ -73,7 +74,7 @@ def site_balls(system: ClosedSystem) -> list[LinearSite]:
     found = []
     for group in system.sites:
         if id(group.site) not in known:
-            known[id(group.site)] = entrywise(group.exact(), rational_ball)
+            known[id(group.site)] = entrywise(group.exact, rational_ball)
         found.append(known[id(group.site)])
     return found
 

@@ -1,19 +1,20 @@
 """Proof in ball arithmetic that a closed system is stable, or that it is not.
 
 Takes: a `ClosedSystem` and its rigid modes.
-Gives: `Proof`, `prove`; `schur_cohn`, `root_discs`.
+Gives: `Proof`, `prove`; `schur_cohn`; `MOST_PROVED`.
 Guarantees: a verdict True or False is proved: every rounding since the sites' exact numbers is inside a ball.
 What is too near the circle for the last precision is left open, and so is what lies on it.
 Does not: prove what its numbers can't be had exactly for (see `balls.unprovable`).
 
-The characteristic polynomial of the relative coordinates comes in balls; Schur and Cohn's recursion decides
-it without an eigenvalue being known. Smith's discs then enclose the eigenvalues.
+The characteristic polynomial of the relative coordinates comes in balls, for each part (see `components`) its
+own; Schur and Cohn's recursion decides it without an eigenvalue being known. Smith's discs then enclose the
+eigenvalues.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import flint
@@ -21,12 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.eigen.balls import Balls, frame_balls, precision, rational_ball, reduced_balls, square
-from apc.runtime.eigen.modes import ClosedSystem
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.components import components
+from apc.runtime.eigen.enclosure import discs
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, independent_places
-from apc.runtime.frame.discretize import UNIT
+from apc.runtime.eigen.roots import approach_roots, root_discs
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+Places = NDArray[np.intp]
 
 # Bits tried in turn. A frame of a thousand ticks loses some 150 of them; what lies on the circle is left
 # undecided at the last.
@@ -39,11 +43,21 @@ DOUBTFUL = 512
 # More states than this aren't proved: the characteristic polynomial costs n⁴ or so, seconds at this size.
 MOST_PROVED = 120
 
-# More states than this aren't enclosed: the eigenvectors in hundreds of bits cost as much.
-MOST_ENCLOSED = 60
+# Of more states than this no vectors are computed: they cost n⁴, too, seconds at this size.
+MOST_VECTORS = 80
+
+# Bits of the vectors: what is hidden beneath the largest entry by 1e-24 still has 30 digits.
+VECTOR_BITS = 256
+
+# What floats may be off by when they add up a disc.
+ROUNDED = 2.0**-50
 
 # A radius known so well needs no more bits: floats can't tell it better.
 SHARP = 2.0**-50
+
+# Multiples of it, whole numbers left out, are spread evenly and favour no symmetry (Weyl): what inverse
+# iteration starts from.
+GOLDEN = (5**0.5 - 1) / 2
 
 # What the characteristic polynomial at 1 is known to before its vanishing is taken for a drift to look for.
 SETTLED = 2.0**-40
@@ -55,18 +69,19 @@ class Proof:
 
     `inside` says whether all eigenvalues but the rigid ones lie inside the unit circle, None if that is left
     open; `bits` with how many bits it was decided, or left open. `free` are the rigid modes, drifts included
-    if there are any. Of the matrix in relative coordinates, `values` (m,) are eigenvalues, `right` (m, m)
-    their vectors as columns, `left` as rows, and `radii` (m,) those of discs about the values: k discs that
-    hang together hold k eigenvalues. `values` is None when these were not looked for or not found.
+    if there are any. Of the matrix in relative coordinates, `values` (m,) are eigenvalues, and `radii` (m,)
+    those of discs about them: k discs that hang together hold k eigenvalues. `right` (m, m) are their vectors
+    as columns, `left` as rows; None where these are too many. Without rigid modes each is that of the part
+    its eigenvalue belongs to: the products of right and left ones are zero elsewhere.
     """
 
     inside: bool | None
     bits: int
     free: RigidModes
-    values: Complexes | None
-    right: Complexes
-    left: Complexes
+    values: Complexes
     radii: Floats
+    right: Complexes | None
+    left: Complexes | None
 
 
 def prove(system: ClosedSystem, free: RigidModes, held: Sequence[int]) -> Proof:
@@ -86,26 +101,94 @@ def prove(system: ClosedSystem, free: RigidModes, held: Sequence[int]) -> Proof:
     for bits in PRECISIONS:
         with precision(bits):
             matrix = frame_balls(system)
-            reduced = square(_relative(matrix, free, held))
-            polynomial = reduced.charpoly()
-            at_one = polynomial(1)
-            if not searched and at_one.contains(0) and float(at_one.rad()) < SETTLED:
+            reduced = _relative(matrix, free, held)
+            parts = _parts(reduced)
+            if not searched and any(_may_be_one(part.polynomial) for part in parts):
                 free, searched = find_rigid_modes(system), True
                 if free.drifts:
                     held = independent_places(free.basis.T).tolist()
-                    reduced = square(_relative(matrix, free, held))
-                    polynomial = reduced.charpoly()
-            inside = schur_cohn(polynomial.coeffs()) if _stands_still(matrix, free) else None
+                    reduced = _relative(matrix, free, held)
+                    parts = _parts(reduced)
+            roots = [approach_roots(part.polynomial, part.guesses, bits) for part in parts]
+            values, radii = _enclosed(parts, roots, bits)
+            inside = _inside(parts, values, radii) if _stands_still(matrix, free) else None
             settled = settled or (bits if inside is not None else 0)
             if best is not None and inside is None and bits != PRECISIONS[-1]:
                 continue
-            best = replace(_enclosed(reduced, polynomial, inside, bits, free), bits=settled or bits)
-        if inside is not None and (best.values is None or _sharp(best)):
+            right, left = _vectors_of(parts, roots, reduced if free.exact else None)
+            best = Proof(inside, settled or bits, free, values, radii, right, left)
+        if inside is not None and _sharp(best):
             break
         if any(doubt for way, doubt in system.doubts.items() if way not in system.surds) and bits >= DOUBTFUL:
             break
     assert best is not None
     return best
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """States that drive each other: their `places` among n, their `block` in balls, its polynomial.
+
+    `guesses` are its eigenvalues in floats.
+    """
+
+    places: Places
+    block: Any  # flint.arb_mat
+    polynomial: Any  # flint.arb_poly
+    guesses: Complexes
+
+
+def _relative(matrix: Balls, free: RigidModes, held: Sequence[int]) -> Balls:
+    rest = [place for place in range(len(matrix)) if place not in set(held)]
+    return reduced_balls(matrix, free.exact, held, rest)[0]
+
+
+def _parts(reduced: Balls) -> list[_Part]:
+    """Return the parts of the matrix in relative coordinates."""
+    vanishing = np.array([[bool(entry == 0) for entry in row] for row in reduced], dtype=np.bool_)  # exactly
+    found = []
+    for places in components(~vanishing.reshape(reduced.shape)):
+        block = square(reduced[np.ix_(places, places)])
+        found.append(_Part(places, block, block.charpoly(), _guesses(block)))
+    return found
+
+
+def _guesses(block: Any) -> Complexes:
+    """Return the eigenvalues in floats; entries beyond their range count for nothing."""
+    n = block.nrows()
+    middle = np.array([float(entry.mid()) for entry in block.entries()], dtype=np.float64).reshape(n, n)
+    return np.linalg.eigvals(np.where(np.isfinite(middle), middle, 0.0)).astype(np.complex128)
+
+
+def _may_be_one(polynomial: Any) -> bool:
+    """Say whether an eigenvalue 1 is left, as far as the balls tell, and they tell much."""
+    at_one = polynomial(1)
+    return bool(at_one.contains(0)) and float(at_one.rad()) < SETTLED
+
+
+def _enclosed(parts: Sequence[_Part], roots: Sequence[Sequence[Any]], bits: int) -> tuple[Complexes, Floats]:
+    """Return the centres and radii of discs about the eigenvalues of all parts."""
+    n = sum(len(part.places) for part in parts)
+    values, radii = np.zeros(n, dtype=np.complex128), np.zeros(n)
+    for part, own in zip(parts, roots, strict=True):
+        values[part.places], radii[part.places] = root_discs(part.polynomial, own, bits)
+    return values, radii
+
+
+def _inside(parts: Sequence[_Part], values: Complexes, radii: Floats) -> bool | None:
+    """Say whether all eigenvalues of all parts lie inside the unit circle, None if that is open.
+
+    The discs tell, unless one reaches over the circle; then Schur and Cohn, who need more bits where there
+    are many eigenvalues, but come as near to the circle as the balls allow.
+    """
+    if len(values):
+        found = discs(values, values, radii)
+        if found.high < 1 - ROUNDED:
+            return True
+        if found.low > 1 + ROUNDED:
+            return False
+    verdicts = [schur_cohn(part.polynomial.coeffs()) for part in parts]
+    return False if False in verdicts else None if None in verdicts else True
 
 
 def _stands_still(matrix: Balls, free: RigidModes) -> bool:
@@ -120,11 +203,6 @@ def _stands_still(matrix: Balls, free: RigidModes) -> bool:
             if not flint.arb(moved - own).contains(0):
                 return False
     return True
-
-
-def _relative(matrix: Balls, free: RigidModes, held: Sequence[int]) -> Balls:
-    rest = [place for place in range(len(matrix)) if place not in set(held)]
-    return reduced_balls(matrix, free.exact, held, rest)[0]
 
 
 def schur_cohn(coefficients: Sequence[Any]) -> bool | None:
@@ -154,95 +232,60 @@ def schur_cohn(coefficients: Sequence[Any]) -> bool | None:
     return True
 
 
-def _enclosed(reduced: Any, polynomial: Any, inside: bool | None, bits: int, free: RigidModes) -> Proof:
-    """Return the proof with enclosed eigenvalues, if the matrix is not too large and they are found."""
-    n = reduced.nrows()
-    nothing = np.zeros((0, 0), dtype=np.complex128)
-    without = Proof(inside, bits, free, None, nothing, nothing, np.zeros(0))
-    if n == 0:
-        return Proof(inside, bits, free, np.zeros(0, dtype=np.complex128), nothing, nothing, np.zeros(0))
-    if n > MOST_ENCLOSED:
-        return without
-    try:
-        values, left, right = flint.acb_mat(reduced.mid()).eig(left=True, right=True, algorithm="approx")
-    except ValueError:  # no convergence
-        return without
-    centres, radii = root_discs(polynomial, values, bits)
-    rights = _vectors(right.transpose().tolist()).T
-    return Proof(inside, bits, free, centres, rights, _vectors(left.tolist()), radii)
+def _vectors_of(
+    parts: Sequence[_Part], roots: Sequence[Sequence[Any]], whole: Balls | None
+) -> tuple[Complexes | None, Complexes | None]:
+    """Return the right vectors of all eigenvalues as columns, the left ones as rows; None if too many.
+
+    `whole` is the matrix whose vectors are asked for; without it they are the parts'.
+    """
+    n = sum(len(part.places) for part in parts)
+    within = [part.places if whole is None else np.arange(n) for part in parts]
+    if any(len(places) > MOST_VECTORS for places in within):
+        return None, None
+    right, left = np.zeros((n, n), dtype=np.complex128), np.zeros((n, n), dtype=np.complex128)
+    with precision(VECTOR_BITS):
+        everything = None if whole is None else square(whole)
+        for part, places, values in zip(parts, within, roots, strict=True):
+            block = part.block if everything is None else everything
+            right[np.ix_(places, part.places)] = _vectors(block, values).T
+            left[np.ix_(part.places, places)] = _vectors(block.transpose(), values)
+    return right, left
 
 
-def _vectors(rows: Sequence[Sequence[Any]]) -> Complexes:
-    """Return vectors as rows in floats, each divided by its largest entry."""
-    found = np.zeros((len(rows), len(rows)), dtype=np.complex128)
-    for line, row in enumerate(rows):
+def _vectors(matrix: Any, values: Sequence[Any]) -> Complexes:
+    """Return right vectors of k eigenvalues of a real matrix as rows (k, n), the largest entry of each one.
+
+    One step of inverse iteration a third of the bits beside the eigenvalue. Equal ones get the same vector, a
+    conjugate its partner's conjugate.
+    """
+    n = matrix.nrows()
+    size = max((float(abs(entry).mid()) for entry in matrix.entries()), default=0.0) or 1.0
+    aside = flint.arb(2) ** (-VECTOR_BITS // 3)
+    start = flint.acb_mat(n, 1, [flint.acb(one) for one in (np.arange(1, n + 1) * GOLDEN % 1 + 0.5).tolist()])
+    middle = flint.acb_mat(matrix.mid())
+    found = np.zeros((len(values), n), dtype=np.complex128)
+    rough = np.array([complex(value) for value in values], dtype=np.complex128)
+    for line, value in enumerate(values):
+        before = np.flatnonzero((rough[:line] == rough[line]) | (rough[:line] == rough[line].conjugate()))
+        if len(before):
+            partner = int(before[0])
+            found[line] = found[partner] if rough[partner] == rough[line] else found[partner].conjugate()
+            continue
+        near = (value + aside * max(abs(value).mid(), aside * size)).mid()
+        shifted = middle - flint.acb_mat([[near if i == j else 0 for j in range(n)] for i in range(n)])
+        try:
+            row = shifted.solve(start, algorithm="approx").entries()
+        except ZeroDivisionError:
+            continue
         largest = max(row, key=lambda entry: abs(entry).mid()).mid()
         if not largest.contains(0) and largest.is_finite():
             found[line] = [complex(entry.mid() / largest) for entry in row]
     return found
 
 
-def root_discs(polynomial: Any, roots: Sequence[Any], bits: int) -> tuple[Complexes, Floats]:
-    """Enclose the roots of a polynomial in discs about approximate ones.
-
-    Parameters
-    ----------
-    polynomial
-        A `flint.arb_poly`, monic, degree n.
-    roots
-        Its roots (n,), approximately, as `flint.acb`.
-    bits
-        How many bits the roots were computed with.
-
-    Returns
-    -------
-    Centres and radii (n,), the rounding of the centres to floats included. All roots are in the discs; k
-    discs that hang together hold k of them.
-
-    Notes
-    -----
-    |z − z_i| ≤ n |p(z_i)| / Π_{j≠i} |z_i − z_j| (Smith, Error bounds for zeros of a polynomial based upon
-    Gerschgorin's theorems, J. ACM 17, 1970), for any n different z_i.
-    """
-    exact = flint.acb_poly(polynomial)
-    points = _spread([root.mid() for root in roots], bits)
-    n = len(points)
-    centres = np.array([complex(point) for point in points], dtype=np.complex128)
-    radii = np.empty(n)
-    for i, point in enumerate(points):
-        apart = flint.acb(1)
-        for j, other in enumerate(points):
-            if j != i:
-                apart *= point - other
-        radius = abs(exact(point) / apart) * n
-        radii[i] = float(radius.upper()) * (1 + 4 * UNIT) if radius.is_finite() else np.inf
-    return centres, radii + 4 * UNIT * np.abs(centres)
-
-
-def _spread(points: Sequence[Any], bits: int) -> list[Any]:
-    """Move roots that are one within the precision apart, so far that rounding can't swallow what is between.
-
-    The m-fold root of a polynomial known to 2^(−bits) is known to the m-th root of that.
-    """
-    near = flint.arb(2) ** (-bits // 4)
-    moved = list(points)
-    left = list(range(len(points)))
-    while left:
-        first = left[0]
-        cluster = [i for i in left if i == first or not abs(points[i] - points[first]) > near]
-        left = [i for i in left if i not in cluster]
-        count = len(cluster)
-        if count > 1:
-            radius = flint.arb(2) ** (-(3 * bits) // (4 * count))
-            for turn, i in enumerate(cluster):
-                angle = flint.acb(flint.fmpq(2 * turn, count)).exp_pi_i()
-                moved[i] = (points[first] + radius * angle).mid()
-    return moved
-
-
 def _sharp(proof: Proof) -> bool:
     """Say whether the largest eigenvalues are known as well as floats can tell."""
-    assert proof.values is not None
     sizes = np.abs(proof.values)
     largest = sizes.max(initial=0.0)
     reaching = sizes + proof.radii >= largest - proof.radii.min(initial=np.inf)

@@ -3,31 +3,27 @@
 Takes: a square matrix and a bound on what each entry may be off by.
 Gives: `Enclosure`, `enclose_eigenvalues`, `discs`.
 Guarantees: the bounds hold for every matrix within the error, whatever their conditioning; rounding in the
-bounds themselves is charged. LAPACK's results are checked by their residuals, not believed;
-the one constant taken on trust is `EIGEN_ROUNDINGS` (see `certify` for a proof).
+bounds themselves is charged. LAPACK's results are checked by their residuals, not believed.
 Does not: know where the matrix comes from, or what is rigid (see `spectrum`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.pseudospectrum import (
-    PRODUCT_ROUNDINGS,
-    balance,
-    cluster_radius,
-    norms,
-    pseudospectral_radius,
-)
+from apc.runtime.eigen.components import components
+from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
 from apc.runtime.eigen.rigid import independent_places
 from apc.runtime.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
 
 # Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
@@ -42,10 +38,6 @@ SPLITS_TRIED = 8
 # two.
 CLOSE = 1e-6
 
-# Backward error of LAPACK's eigenvalues of a small block, in units of n·UNIT·‖block‖_F: 'a modest constant'
-# (LAPACK Users' Guide, 3rd ed., section 4.8); measured below 1.
-EIGEN_ROUNDINGS = 10
-
 
 @dataclass(frozen=True, slots=True)
 class Enclosure:
@@ -57,16 +49,49 @@ class Enclosure:
 
 
 def enclose_eigenvalues(
-    matrix: Matrix, error: Floats
+    matrix: Matrix, error: Floats, *, whole: bool = False
 ) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
     """Compute eigenvalues, right vectors (columns), left vectors (rows), errors, and the radius's bounds.
 
-    The eigenvalues are split by magnitude, large from small, see `_enclose`. A chain of packets or forces
-    that nobody answers is a Jordan block at zero, scattered by rounding over a ring that may reach far out:
-    when the first split leaves the radius uncertain, the widest gaps between magnitudes are tried as well.
-    What any split proves holds.
+    Parameters
+    ----------
+    matrix, error
+        The matrix (n, n), and a bound on what each entry is off by.
+    whole
+        Whether the vectors must be those of the whole matrix. Else they are those of the part (see
+        `components`) that the eigenvalue belongs to: the products of right and left ones are zero elsewhere.
     """
     n = len(matrix)
+    parts = [np.arange(n)] if whole or not n else components(~(np.abs(matrix) + error == 0))
+    values, errors = np.zeros(n, dtype=np.complex128), np.zeros(n)
+    right, left = np.zeros((n, n), dtype=np.complex128), np.zeros((n, n), dtype=np.complex128)
+    alone = np.array([part[0] for part in parts if len(part) == 1], dtype=np.intp)
+    values[alone], errors[alone] = matrix[alone, alone], error[alone, alone]
+    right[alone, alone] = left[alone, alone] = 1.0
+    size, near = np.abs(values[alone]), errors[alone]
+    low = max(0.0, float(((size - near) * (1 - 4 * UNIT)).max(initial=0.0)))
+    high = float(((size + near) * (1 + 4 * UNIT)).max(initial=0.0))
+    for part in parts:
+        if len(part) > 1:
+            block = np.ix_(part, part)
+            values[part], right[block], left[block], errors[part], inner, outer = _enclose_part(
+                matrix[block], error[block]
+            )
+            low, high = float(np.maximum(low, inner)), float(np.maximum(high, outer))  # NaN stays
+    order = np.lexsort((-values.imag, values.real, -np.abs(values)))
+    return values[order], right[:, order], left[order], errors[order], low, high
+
+
+def _enclose_part(
+    matrix: Matrix, error: Floats
+) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
+    """Enclose the eigenvalues of a matrix whose states all drive each other.
+
+    The eigenvalues are split by magnitude, large from small, see `_enclose`. A chain of packets or forces
+    that hardly anybody answers is nearly a Jordan block at zero, scattered by rounding over a ring that may
+    reach far out: when the first split leaves the radius uncertain, the widest gaps between magnitudes are
+    tried as well. What any split proves holds.
+    """
     scale = balance(np.abs(matrix) + error)
     matrix, error = matrix / scale[:, None] * scale, error / scale[:, None] * scale
     values, right = (part.astype(np.complex128) for part in np.linalg.eig(matrix))
@@ -88,9 +113,7 @@ def enclose_eigenvalues(
     low, high = max(one.low for one in tried), min(one.high for one in tried)
     # No estimate is farther from its eigenvalue than both are from zero.
     errors = np.minimum(np.min([one.errors for one in tried], axis=0), sizes + high)
-    if n:
-        low = min(low, high)
-    return values, right * scale[:, None], left / scale, errors, low, high
+    return values, right * scale[:, None], left / scale, errors, min(low, high), high
 
 
 def _left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
@@ -117,75 +140,20 @@ def _enclose(
     X⁻¹(M + E)X = diag(T₁, …, T_k, T) + G, |G| ≤ |X⁻¹| (|residual| + |E| |X|), one block T_c a cluster of
     large eigenvalues that are nearly equal, and T for all that are small. Every eigenvalue z then has
     ‖(z − T_c)⁻¹‖ Σ_b ‖G_cb‖ ≥ 1 for some block c (Feingold and Varga, Block diagonally dominant matrices,
-    1962): it is in a disc of `cluster_radius` about an eigenvalue of T_c, or within `pseudospectral_radius`
+    1962): it is in a disc of `_blockdiscs` about an eigenvalue of T_c, or within `pseudospectral_radius`
     of T about zero. Discs that touch hold together as many eigenvalues as there are of them.
     """
     n = len(matrix)
-    worst = Enclosure(0.0, np.inf, np.full(n, np.inf))
     clusters = _close(values[:large])
-    basis: Matrix = np.zeros((n, n), dtype=np.complex128)
-    free = np.arange(n)
-    for cluster in clusters:
-        span = right[:, cluster]
-        basis[:, cluster] = np.linalg.qr(span)[0] if len(cluster) > 1 else span
-    if large:
-        rows = left[:large].copy()
-        for cluster in clusters:
-            if len(cluster) > 1:
-                rows[cluster] = np.linalg.qr(rows[cluster].T)[0].T
-        held = independent_places(rows)
-        free = np.delete(free, held)
-        if len(free) != n - large:  # vectors too alike to tell apart
-            return worst
-        try:
-            basis[np.ix_(held, np.arange(large, n))] = -np.linalg.solve(rows[:, held], rows[:, free])
-        except np.linalg.LinAlgError:
-            return worst
-    basis[free, np.arange(large, n)] = 1.0
-    if not basis.imag.any():
-        basis = basis.real
-    try:
-        inverse = np.linalg.inv(basis)
-    except np.linalg.LinAlgError:
-        return worst
     blocks = [*clusters, np.arange(large, n)] if large < n else clusters
-
-    # The block diagonal form as it came out, and all that it leaves; the products' roundings are included.
-    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
-    moved = matrix @ basis
-    product = inverse @ moved
-    form = np.zeros_like(product)
-    for block in blocks:
-        form[np.ix_(block, block)] = product[np.ix_(block, block)]
+    basis = _basis(right, left, clusters, large)
+    found = None if basis is None else _block_diagonal(matrix, error, basis, blocks, large)
+    if found is None:
+        return Enclosure(0.0, np.inf, np.full(n, np.inf))
+    form, left_over = found
     real = np.isrealobj(matrix)
-    if real:  # the large ones are whole conjugate pairs, so what is left is real
-        form[large:, large:] = form[large:, large:].real
-    size, weight = np.abs(basis), np.abs(inverse)
-    doubt = np.abs(moved - basis @ form) + error @ size
-    doubt += charge * (np.abs(matrix) @ size + size @ np.abs(form))
-    # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
-    wrong = (np.abs(np.eye(n) - inverse @ basis) + charge * (weight @ size)).sum(axis=1)
-    defect = float(wrong.max(initial=0.0))
-    if not defect < 0.5:
-        return worst
-    left_over = weight @ doubt * (1 + charge)
-    left_over += wrong[:, None] / (1 - defect) * left_over.max(axis=0, initial=0.0)
-    if not np.isfinite(left_over).all():
-        return worst
-
-    # Σ_b ‖G_cb‖ in the Frobenius norm; relative to the largest entry, so that no square is lost.
-    member = np.zeros((n, len(blocks)))
-    for place, block in enumerate(blocks):
-        member[block, place] = 1.0
-    peak = float(left_over.max(initial=0.0))
-    squares = np.square(left_over / peak) if peak > 0 else left_over
-    sizes = peak * (1 + charge) * (np.sqrt(member.T @ squares @ member) + 1e-150)
-    if large < n:
-        sizes[-1, -1] = norms(left_over[large:, large:])  # often much less: many entries, few in a row
-    totals = sizes.sum(axis=1)
-
     centres, radii = np.zeros(n, dtype=np.complex128), np.zeros(n)
-    for block, total in zip(blocks, totals, strict=True):
+    for block, total in zip(blocks, _totals(left_over, blocks, large), strict=True):
         own = form[np.ix_(block, block)]
         if block[0] >= large:
             radii[block] = pseudospectral_radius(own.real if real else own, float(total))
@@ -194,19 +162,109 @@ def _enclose(
     return discs(values, centres, radii)
 
 
+def _basis(right: Complexes, left: Complexes, clusters: Sequence[Places], large: int) -> Matrix | None:
+    """Return X = [X₁ X₂] (n, n), or None where vectors are too alike to tell apart."""
+    n = len(right)
+    basis: Matrix = np.zeros((n, n), dtype=np.complex128)
+    free = np.arange(n)
+    rows = left[:large].copy()
+    for cluster in clusters:
+        span = right[:, cluster]
+        basis[:, cluster] = np.linalg.qr(span)[0] if len(cluster) > 1 else span
+        if len(cluster) > 1:
+            rows[cluster] = np.linalg.qr(rows[cluster].T)[0].T
+    if large:
+        held = independent_places(rows)
+        free = np.delete(free, held)
+        if len(free) != n - large:
+            return None
+        try:
+            basis[np.ix_(held, np.arange(large, n))] = -np.linalg.solve(rows[:, held], rows[:, free])
+        except np.linalg.LinAlgError:
+            return None
+    basis[free, np.arange(large, n)] = 1.0
+    return basis if basis.imag.any() else basis.real
+
+
+def _block_diagonal(
+    matrix: Matrix, error: Floats, basis: Matrix, blocks: Sequence[Places], large: int
+) -> tuple[Matrix, Floats] | None:
+    """Return diag(T₁, …, T_k, T) and a bound on |G|, the products' roundings included; None without X⁻¹."""
+    n = len(matrix)
+    try:
+        inverse = np.linalg.inv(basis)
+    except np.linalg.LinAlgError:
+        return None
+    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    moved = matrix @ basis
+    product = inverse @ moved
+    form = np.zeros_like(product)
+    for block in blocks:
+        form[np.ix_(block, block)] = product[np.ix_(block, block)]
+    if np.isrealobj(matrix):  # the large ones are whole conjugate pairs, so what is left is real
+        form[large:, large:] = form[large:, large:].real
+    size, weight = np.abs(basis), np.abs(inverse)
+    doubt = np.abs(moved - basis @ form) + error @ size
+    doubt += charge * (np.abs(matrix) @ size + size @ np.abs(form))
+    # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
+    wrong = (np.abs(np.eye(n) - inverse @ basis) + charge * (weight @ size)).sum(axis=1)
+    defect = float(wrong.max(initial=0.0))
+    if not defect < 0.5:
+        return None
+    left_over = weight @ doubt * (1 + charge)
+    left_over += wrong[:, None] / (1 - defect) * left_over.max(axis=0, initial=0.0)
+    return (form, left_over) if np.isfinite(left_over).all() else None
+
+
+def _totals(left_over: Floats, blocks: Sequence[Places], large: int) -> Floats:
+    """Return Σ_b ‖G_cb‖ for every block c, each norm that of Frobenius."""
+    n = len(left_over)
+    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    member = np.zeros((n, len(blocks)))
+    for place, block in enumerate(blocks):
+        member[block, place] = 1.0
+    peak = float(left_over.max(initial=0.0))  # relative to it no square is lost
+    squares = np.square(left_over / peak) if peak > 0 else left_over
+    sizes = peak * (1 + charge) * (np.sqrt(member.T @ squares @ member) + 1e-150)
+    if large < n:
+        sizes[-1, -1] = norms(left_over[large:, large:])  # often much less: many entries, few in a row
+    return np.asarray(sizes.sum(axis=1))
+
+
 def _blockdiscs(block: Matrix, error: float) -> tuple[Complexes, float]:
-    """Return the centres and the radius of discs that hold the eigenvalues of a block known up to `error`."""
-    if len(block) == 1:
+    """Return the centres and the radius of discs that hold the eigenvalues of a block known up to `error`.
+
+    Notes
+    -----
+    Either discs about its own eigenvalues Λ with vectors V, T = V Λ V⁻¹ + R: nothing is farther from one of
+    them than ‖V⁻¹‖ ‖V‖ (‖R‖ + error) (Bauer and Fike, Numerische Mathematik 2, 1960). Or, where these are
+    hardly vectors of their own, one disc about their mean c that holds the pseudospectrum of T − c.
+    """
+    m = len(block)
+    if m == 1:
         return block[0].astype(np.complex128), error
-    own = np.linalg.eigvals(block).astype(np.complex128)
-    norm = float(np.linalg.norm(block))
-    rounding = EIGEN_ROUNDINGS * len(block) * UNIT
-    departure = norm**2 - float((np.abs(own) ** 2).sum())
-    departure = np.sqrt(max(departure, 0.0) + 4 * rounding * norm**2)
-    return own, cluster_radius(len(block), float(departure), error + rounding * norm)
+    values, vectors = (part.astype(np.complex128) for part in np.linalg.eig(block))
+    charge = PRODUCT_ROUNDINGS * (m + 2) * UNIT
+    size = float(norms(vectors))
+    try:
+        inverse = np.linalg.inv(vectors)
+        wrong = float(norms(np.eye(m) - inverse @ vectors)) + charge * float(norms(inverse)) * size
+    except np.linalg.LinAlgError:
+        inverse, wrong = vectors, np.inf
+    centre = complex(np.mean(values))
+    shifted = block - centre * np.eye(m)
+    rounded = charge * (float(norms(block)) + abs(centre))
+    around = pseudospectral_radius(shifted, error + rounded)
+    if wrong < 0.5:
+        weight = float(norms(inverse)) / (1 - wrong)
+        residual = float(norms(block @ vectors - vectors * values)) + rounded * size
+        radius = weight * (residual + size * error) * (1 + charge)
+        if radius < around:
+            return values, radius
+    return np.full(m, centre), around
 
 
-def _close(values: Complexes) -> list[NDArray[np.intp]]:
+def _close(values: Complexes) -> list[Places]:
     """Return the places of eigenvalues that are nearly equal, chain by chain."""
     near = np.abs(values[:, None] - values[None, :]) <= CLOSE * np.abs(values)[:, None]
     label = _connected(near)

@@ -1,7 +1,7 @@
-"""Which peers move alike: the groups of equal peers of a scene, each linearized and lifted once.
+"""Which peers move alike: the groups of equal peers of a scene.
 
 Takes: a `CompiledSystem`, its numbers, Jacobians and schedules, and the exchange.
-Gives: `PeerGroup`, `peer_groups`, `more_differ`, `group_of_row`.
+Gives: `peer_groups`, `more_differ`, `group_of_row`.
 Guarantees: as few groups as there are peers of different dynamics, found in a time that grows with the number
 of peers, not with its square. A site that is not affine is linearized at its own start values, hearing the
 others at theirs.
@@ -10,10 +10,7 @@ Does not: close the loop between them (see `modes`).
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,99 +18,27 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.jacobians import SiteJacobians, edge_name
-from apc.runtime.frame.lift import LiftedSite, lift
-from apc.runtime.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
+from apc.runtime.eigen.listening import StartClasses
+from apc.runtime.eigen.peer_group import PeerGroup, build_group, check_size, used_ways
+from apc.runtime.eigen.runs import Peers, Runs, joined
+from apc.runtime.frame.exchange import Exchange
+from apc.runtime.frame.jacobians import SiteJacobians
+from apc.runtime.frame.linearize import linearize, linearize_rows, site_of_row
 from apc.runtime.frame.parameters import Numbers
-from apc.runtime.frame.schedule import Schedule, Way
-from apc.runtime.frame.site import LinearSite, rational_floats
-from apc.runtime.frame.start import Listening, start_sends, start_values
+from apc.runtime.frame.schedule import Schedule
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class Runs:
-    """Peers by number, in runs that follow one another: a billion equal peers take no memory."""
-
-    ranges: tuple[range, ...]
-
-    def __len__(self) -> int:
-        return sum(len(one) for one in self.ranges)
-
-    def __iter__(self) -> Iterator[int]:
-        return itertools.chain.from_iterable(self.ranges)
-
-    def __getitem__(self, place: int | slice) -> Any:
-        if isinstance(place, slice):
-            return list(itertools.islice(self, place.start, place.stop, place.step))
-        return next(itertools.islice(self, place, None))
-
-    def shifted(self, by: int) -> Runs:
-        """Return the peers counted from another start."""
-        return Runs(tuple(range(one.start + by, one.stop + by) for one in self.ranges))
-
-
-# Some peers of a group, or of the scene, by number.
-Peers = Integers | Runs
 
 # More different peers than this are refused where each has to be looked at with each other: the slopes of
 # edge functions and the start values of what is heard cost their square.
 MOST_DIFFERENT = 400
 
-# More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
-# their error bounds would decide nothing.
-MOST_STATES = 1000
-
 # Peers looked at together for whether they differ: mostly, the first ones tell.
 PEEK = 1024
 
-# Names of peers written out in the name of a group that is part of a scene's group.
-MOST_NAMED = 4
-
-# What a receive weighs each sender's channel by, by (edge, channel): one for all senders, or one a group.
-Gains = Mapping[tuple[str, str], tuple[Fraction, ...]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PeerGroup:
-    """`count` peers that move alike; `parameters` is the vector (n_p,) of the first of them.
-
-    `peers` are their numbers in the scene, from 0; `role` is the scene's group where it has delays of its own
-    (see `Exchange.role`); `place` is what `gains` calls the group.
-    """
-
-    name: str
-    count: int
-    parameters: Floats
-    jacobians: SiteJacobians
-    site: LinearSite
-    schedule: Schedule
-    lifted: LiftedSite
-    peers: Peers
-    role: int
-    place: int
-    listening: Listening | None
-    gains: Gains
-
-    def exact(self) -> LinearSite:
-        """The site's matrices in exact rationals; where they can't be had, its floats taken at their word."""
-        exact = _rational(self.jacobians, self.parameters, self.listening)
-        return rational_floats(self.site) if exact is None else exact
-
-    def sends(self, link: str) -> bool:
-        """Say whether these peers send over a link."""
-        return any(sending.link == link for sending in self.jacobians.kind.sends)
-
-    def gain(self, way: Way, sender: PeerGroup) -> Fraction:
-        """Return what a peer weighs a sender's packets on a way by, beside the link's own weights."""
-        if not way.edge:
-            return Fraction(1)
-        listed = self.gains[way.edge, way.channel]
-        return listed[0] if len(listed) == 1 else listed[sender.place]
+# What equal peers have in common: their kind, their role in the exchange, their numbers as bytes.
+_Key = tuple[int, int, bytes]
 
 
 def peer_groups(
@@ -145,14 +70,9 @@ def peer_groups(
         minimum that is not smooth at the start, E804 more different peers than one system can hold.
     """
     used = [jacobians[group.kind] for group in system.groups]
-    if all(site.affine and not site.edges for site in used):
+    if all(site.parameters_suffice for site in used):
         return _by_matrices(system, jacobians, schedules, numbers, exchange)
     return _by_start(system, jacobians, schedules, numbers, exchange)
-
-
-def used_ways(schedules: Iterable[Schedule]) -> tuple[Way, ...]:
-    """Return every way on which something is heard, in order."""
-    return tuple(sorted({one.way for schedule in schedules for one in schedule.heard}))
 
 
 def _by_matrices(
@@ -175,14 +95,73 @@ def _by_matrices(
             rows.setdefault(keys[-1], (place, vector, matrices))
         for key, peers in _split(keys, numbers.rows[place]):
             members.setdefault(key, []).append((place, peers))
-    _check_size([jacobians[key[0]] for key in members], exchange)
+    check_size([jacobians[key[0]] for key in members], exchange)
     found = []
     for number, (key, parts) in enumerate(members.items()):
         place, vector, matrices = rows[key]
         built = jacobians[key[0]]
         site = site_of_row(built, matrices)
-        found.append(_group(number, parts, vector, built, site, schedules[place], exchange))
+        found.append(build_group(number, parts, vector, built, site, schedules[place], exchange))
     return tuple(found)
+
+
+def _by_start(
+    system: CompiledSystem,
+    jacobians: Sequence[SiteJacobians],
+    schedules: Sequence[Schedule],
+    numbers: Numbers,
+    exchange: Exchange,
+) -> tuple[PeerGroup, ...]:
+    """Group peers that start alike among others that start alike, and linearize them there."""
+    links = {way.link for way in used_ways(schedules)}
+    complete = all(exchange.is_complete(link) for link in links)
+    members: dict[tuple[Any, ...], list[tuple[int, Peers]]] = {}
+    for place, group in enumerate(system.groups):
+        role, vectors = exchange.role(place), numbers.parameters[place]
+        keys = [(group.kind, role, (vector + 0.0).tobytes()) for vector in vectors]
+        for key, peers in _split(keys, numbers.rows[place]):
+            if complete:
+                members.setdefault(key, []).append((place, peers))
+            else:  # who hears whom may differ from peer to peer
+                members |= {
+                    (*key, place, int(peer)): [(place, np.array([peer]))]
+                    for peer in peers[: MOST_DIFFERENT + 1]
+                }
+    if len(members) > MOST_DIFFERENT:
+        what = f"more than {MOST_DIFFERENT} peers that differ, in their place in a graph or at the start,"
+        raise ApcError(Mistake("E804", Place(exchange.scene), f"{what} can't be linearized pair by pair"))
+    parts = sorted(members.values(), key=lambda part: (part[0][0], int(part[0][1][0])))
+    sites = StartClasses(system, jacobians, schedules, numbers, exchange, parts)
+    listened = [sites.listen(g) for g in range(len(parts))]
+
+    # Peers apart in the graph are one group if they turned out alike, and weigh all others alike.
+    merged: dict[tuple[Any, ...], int] = {}
+    alike = all(len(listed) == 1 for _, gains in listened for listed in gains.values())
+    joined: dict[int, list[tuple[int, Peers]]] = {}
+    for g, (listening, gains) in enumerate(listened):
+        own = parts[g][0][0]
+        same = (
+            *(system.groups[own].kind, exchange.role(own), sites.vectors[g].tobytes()),
+            *(listening, tuple(gains.items()), g if not alike else 0),
+        )
+        joined.setdefault(merged.setdefault(same, g), []).extend(parts[g])
+    first = list(joined)
+    built = [jacobians[system.groups[parts[g][0][0]].kind] for g in first]
+    check_size(built, exchange)
+    return tuple(
+        build_group(
+            g,
+            _together(joined[g]),
+            sites.vectors[g],
+            site,
+            linearize(site, sites.vectors[g], listened[g][0]),
+            schedules[parts[g][0][0]],
+            exchange,
+            listening=listened[g][0],
+            gains=listened[g][1],
+        )
+        for g, site in zip(first, built, strict=True)
+    )
 
 
 def more_differ(
@@ -234,11 +213,7 @@ def group_of_row(
     """
     site = site_of_row(built, linearize_rows(built, vector[None])[0])
     parts = [(group, Runs((range(count),)))]
-    return _group(group, parts, vector, built, site, schedule, exchange)
-
-
-# What equal peers have in common: their kind, their role in the exchange, their numbers as bytes.
-_Key = tuple[int, int, bytes]
+    return build_group(group, parts, vector, built, site, schedule, exchange)
 
 
 def _split(keys: Sequence[_Key], row_of: Integers) -> list[tuple[_Key, Peers]]:
@@ -253,295 +228,9 @@ def _split(keys: Sequence[_Key], row_of: Integers) -> list[tuple[_Key, Peers]]:
     return list(zip(different, np.split(order, ends), strict=True))
 
 
-def _check_size(sites: Sequence[SiteJacobians], exchange: Exchange) -> None:
-    """Refuse more different peers than are worth an object each."""
-    states = sum(len(site.kind.states) for site in sites)
-    if states > MOST_STATES:
-        raise too_large(exchange, f"{len(sites):,} different peers", states)
-
-
-def states_of(schedule: Schedule, site: SiteJacobians) -> int:
-    """Return how many states a peer keeps from frame to frame."""
-    return len(site.kind.states) + len(schedule.carried) + sum(schedule.depths)
-
-
-def too_large(exchange: Exchange, what: str, states: int) -> ApcError:
-    """Return the refusal of a system of too many states."""
-    return ApcError(
-        Mistake(
-            "E804",
-            Place(exchange.scene),
-            f"{what} make one system of {states:,} states; the matrix of one may have {MOST_STATES:,}",
-            hint="--method auto: linear peers without edge functions need no such matrix",
-        )
-    )
-
-
-def _group(
-    place: int,
-    parts: Sequence[tuple[int, Peers]],
-    vector: Floats,
-    built: SiteJacobians,
-    site: LinearSite,
-    schedule: Schedule,
-    exchange: Exchange,
-    *,
-    listening: Listening | None = None,
-    gains: Gains | None = None,
-) -> PeerGroup:
-    """Lift a site and put it together with what is known of its peers, `parts` of the scene's groups."""
-    counts = np.diff(exchange.starts)
-    names = []
-    for group, peers in parts:
-        name = exchange.groups[group]
-        if len(peers) < counts[group]:
-            more = ["…"] if len(peers) > MOST_NAMED else []
-            name += f"[{','.join([*(str(int(peer) + 1) for peer in peers[:MOST_NAMED]), *more])}]"
-        names.append(name)
-    if len(names) > MOST_NAMED:
-        names = [*names[:MOST_NAMED], "…"]
-    peers = _joined([_shifted(peers, int(exchange.starts[group])) for group, peers in parts])
-    return PeerGroup(
-        name="+".join(names),
-        count=len(peers),
-        parameters=vector,
-        jacobians=built,
-        site=site,
-        schedule=schedule,
-        lifted=lift(site, schedule, exact=_rational(built, vector, listening)),
-        peers=peers,
-        role=exchange.role(parts[0][0]),
-        place=place,
-        listening=listening,
-        gains=gains or {},
-    )
-
-
-def _rational(built: SiteJacobians, vector: Floats, listening: Listening | None) -> LinearSite | None:
-    """Return the site's matrices in rationals, or None where its functions can't be walked one by one."""
-    return linearize_exact(built, vector, listening) if built.walkable else None
-
-
-def _by_start(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    numbers: Numbers,
-    exchange: Exchange,
-) -> tuple[PeerGroup, ...]:
-    """Group peers that start alike among others that start alike, and linearize them there."""
-    links = {way.link for way in used_ways(schedules)}
-    complete = all(exchange.is_complete(link) for link in links)
-    members: dict[tuple[Any, ...], list[tuple[int, Peers]]] = {}
-    for place, group in enumerate(system.groups):
-        role, vectors = exchange.role(place), numbers.parameters[place]
-        keys = [(group.kind, role, (vector + 0.0).tobytes()) for vector in vectors]
-        for key, peers in _split(keys, numbers.rows[place]):
-            if complete:
-                members.setdefault(key, []).append((place, peers))
-            else:  # who hears whom may differ from peer to peer
-                members |= {
-                    (*key, place, int(peer)): [(place, np.array([peer]))]
-                    for peer in peers[: MOST_DIFFERENT + 1]
-                }
-    if len(members) > MOST_DIFFERENT:
-        what = f"more than {MOST_DIFFERENT} peers that differ, in their place in a graph or at the start,"
-        raise ApcError(Mistake("E804", Place(exchange.scene), f"{what} can't be linearized pair by pair"))
-    parts = sorted(members.values(), key=lambda part: (part[0][0], int(part[0][1][0])))
-    sites = _Sites(system, jacobians, schedules, numbers, exchange, parts)
-    listened = [sites.listen(g) for g in range(len(parts))]
-
-    # Peers apart in the graph are one group if they turned out alike, and weigh all others alike.
-    merged: dict[tuple[Any, ...], int] = {}
-    alike = all(len(listed) == 1 for _, gains in listened for listed in gains.values())
-    joined: dict[int, list[tuple[int, Peers]]] = {}
-    for g, (listening, gains) in enumerate(listened):
-        own = parts[g][0][0]
-        same = (
-            *(system.groups[own].kind, exchange.role(own), sites.vectors[g].tobytes()),
-            *(listening, tuple(gains.items()), g if not alike else 0),
-        )
-        joined.setdefault(merged.setdefault(same, g), []).extend(parts[g])
-    first = list(joined)
-    built = [jacobians[system.groups[parts[g][0][0]].kind] for g in first]
-    _check_size(built, exchange)
-    return tuple(
-        _group(
-            g,
-            _together(joined[g]),
-            sites.vectors[g],
-            site,
-            linearize(site, sites.vectors[g], listened[g][0]),
-            schedules[parts[g][0][0]],
-            exchange,
-            listening=listened[g][0],
-            gains=listened[g][1],
-        )
-        for g, site in zip(first, built, strict=True)
-    )
-
-
 def _together(parts: Sequence[tuple[int, Peers]]) -> list[tuple[int, Peers]]:
     """Join the parts of each group of the scene."""
     found: dict[int, list[Peers]] = {}
     for group, peers in parts:
         found.setdefault(group, []).append(peers)
-    return [(group, _joined(listed)) for group, listed in found.items()]
-
-
-def _shifted(peers: Peers, by: int) -> Peers:
-    """Return peers counted from another start."""
-    return peers.shifted(by) if isinstance(peers, Runs) else peers + by
-
-
-def _joined(listed: Sequence[Peers]) -> Peers:
-    """Return peers together, in order."""
-    runs = [one for one in listed if isinstance(one, Runs)]
-    if len(runs) == len(listed):
-        return Runs(tuple(sorted((run for one in runs for run in one.ranges), key=lambda run: run.start)))
-    return np.sort(np.concatenate([np.fromiter(one, np.int64, len(one)) for one in listed]))
-
-
-class _Sites:
-    """Classes of peers at the start of time, each hearing the others where they start."""
-
-    def __init__(
-        self,
-        system: CompiledSystem,
-        jacobians: Sequence[SiteJacobians],
-        schedules: Sequence[Schedule],
-        numbers: Numbers,
-        exchange: Exchange,
-        parts: Sequence[Sequence[tuple[int, Peers]]],
-    ) -> None:
-        self.exchange = exchange
-        self.counts = [sum(len(peers) for _, peers in part) for part in parts]
-        self.groups = [part[0][0] for part in parts]
-        self.peers = [int(exchange.starts[part[0][0]] + part[0][1][0]) for part in parts]
-        self.vectors = [
-            numbers.parameters[group][numbers.rows[group][int(part[0][1][0])]]
-            for group, part in zip(self.groups, parts, strict=True)
-        ]
-        self.sites = [jacobians[system.groups[group].kind] for group in self.groups]
-        self.schedules = [schedules[group] for group in self.groups]
-        exact: dict[tuple[int, bytes], tuple[list[Fraction], dict[str, list[Fraction]]]] = {}
-        self.parameters: list[list[Fraction]] = []
-        self.sent: list[dict[str, list[Fraction]]] = []
-        for site, vector in zip(self.sites, self.vectors, strict=True):
-            key = (id(site), vector.tobytes())
-            if key not in exact:
-                parameters = [Fraction(value) for value in vector.tolist()]
-                exact[key] = parameters, start_sends(site, parameters)
-            self.parameters.append(exact[key][0])
-            self.sent.append(exact[key][1])
-        class_of = {peer: g for g, peer in enumerate(self.peers)}
-        self.arcs: dict[str, dict[int, list[tuple[int, Fraction]]]] = {}
-        for name in exchange.links:
-            if not exchange.is_complete(name) and len(class_of) == exchange.peers:
-                hears: dict[int, list[tuple[int, Fraction]]] = {}
-                pairs, weights = exchange.arcs(name)
-                for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
-                    hears.setdefault(class_of[receiver], []).append((class_of[sender], Fraction(weight)))
-                self.arcs[name] = hears
-        self._edges: dict[tuple[Any, ...], list[Fraction]] = {}
-
-    def senders(self, link: str, g: int) -> list[tuple[int, Fraction, int]]:
-        """Return the classes a peer of class g hears over a link: (class, weight together, number)."""
-        if link in self.arcs:
-            return [(h, weight, 1) for h, weight in self.arcs[link].get(g, ()) if link in self.sent[h]]
-        counts = [count - (1 if g == h else 0) for h, count in enumerate(self.counts)]
-        return [(h, Fraction(n), n) for h, n in enumerate(counts) if n and link in self.sent[h]]
-
-    def listen(self, g: int) -> tuple[Listening, Gains]:
-        """Return what class g hears at the start, and what its edge functions weigh each sender by."""
-        site, schedule = self.sites[g], self.schedules[g]
-        values: list[Fraction] = []
-        own: list[tuple[Fraction, ...] | None] = []
-        gains: dict[tuple[str, str], tuple[Fraction, ...]] = {}
-        for p, partition in enumerate(site.kind.clocks):
-            for place, receive in enumerate(partition.receives):
-                senders = self.senders(receive.link, g)
-                ways = schedule.ways(p, place)
-                name = edge_name(partition, receive)
-                if not name:
-                    heard = [
-                        (weight, self.sent[h][receive.link][receive.channel]) for h, weight, _ in senders
-                    ]
-                    norm = self.norm(receive.operator, g, receive.link, senders) if ways else Fraction(1)
-                    values.append(sum((weight * value for weight, value in heard), Fraction(0)) / norm)
-                    own.append(None)
-                elif not ways:  # nothing that matters depends on it
-                    values.append(Fraction(0))
-                    own.append(None)
-                else:
-                    value, part, slopes = self.over_edges(g, p, place, senders)
-                    values.append(value)
-                    own.append(part)
-                    channels = list(dict.fromkeys(channel for _, channel in ways))
-                    rows = site.pattern.ticks[p].channels[place]
-                    for row, channel in zip(rows, channels, strict=True):
-                        listed = tuple(
-                            slopes[h][row] if h in slopes else Fraction(0) for h in range(len(self.counts))
-                        )
-                        heard_ones = {listed[h] for h, _, _ in senders}
-                        gains[name, channel] = tuple(heard_ones) if len(heard_ones) == 1 else listed
-        return Listening(tuple(values), tuple(own)), gains
-
-    def norm(
-        self, operator: str, g: int, link: str, senders: Sequence[tuple[int, Fraction, int]]
-    ) -> Fraction:
-        """Return what a mean is divided by, 1 for all else."""
-        if operator != "mean":
-            return Fraction(1)
-        total = sum((weight for _, weight, _ in senders), Fraction(0))
-        check_mean(self.exchange, self.peers[g], link, operator, bool(senders), total)
-        return total
-
-    def over_edges(
-        self, g: int, p: int, place: int, senders: Sequence[tuple[int, Fraction, int]]
-    ) -> tuple[Fraction, tuple[Fraction, ...], dict[int, list[Fraction]]]:
-        """Return a receive's value, its slopes over its own (x, u, m), and over each sender's channels."""
-        site = self.sites[g]
-        receive, edge = site.kind.clocks[p].receives[place], site.edges[p, place]
-        x, u, m = start_values(site, self.parameters[g])
-        inside = len(x) + len(u) + len(m[p])
-        found = {}
-        for h, _, _ in senders:
-            sent = self.sent[h][receive.link][: edge.function.numel_in(3)]
-            key = (id(edge), self.vectors[g].tobytes(), tuple(sent))
-            if key not in self._edges:
-                arguments = [x, u, m[p], sent, self.parameters[g], [Fraction(0)]]
-                self._edges[key] = [Fraction(value) for value in evaluate_exact(edge.function, arguments)[0]]
-            found[h] = self._edges[key]
-        norm = self.norm(receive.operator, g, receive.link, senders)
-        if receive.operator in ("sum", "mean"):
-            taken = [(h, weight / norm) for h, weight, _ in senders]
-        else:
-            taken = [
-                (self.extreme(g, receive.name, receive.operator, receive.link, senders, found), Fraction(1))
-            ]
-        value = sum((weight * found[h][0] for h, weight in taken), Fraction(0))
-        own = tuple(
-            sum((weight * found[h][1 + i] for h, weight in taken), Fraction(0)) for i in range(inside)
-        )
-        return value, own, {h: found[h][1 + inside :] for h, _ in taken}
-
-    def extreme(
-        self,
-        g: int,
-        name: str,
-        operator: str,
-        link: str,
-        senders: Sequence[tuple[int, Fraction, int]],
-        found: Mapping[int, Sequence[Fraction]],
-    ) -> int:
-        """Return the class of the one sender that is the largest, or smallest."""
-        check_mean(self.exchange, self.peers[g], link, operator, bool(senders), Fraction(1))
-        best = (max if operator == "max" else min)(found[h][0] for h, _, _ in senders)
-        winners = [(h, number) for h, _, number in senders if found[h][0] == best]
-        if sum(number for _, number in winners) > 1:
-            peer = self.exchange.peer_name(self.peers[g])
-            what = f"{name} of {peer}: {operator} over equal peers has no linearization"
-            hint = "start values that differ from peer to peer"
-            raise ApcError(Mistake("E803", Place(self.exchange.scene), what, hint=hint))
-        return winners[0][0]
+    return [(group, joined(listed)) for group, listed in found.items()]

@@ -1,9 +1,9 @@
 """How far out the eigenvalues of an uncertain matrix can be, whether or not it has a set of eigenvectors.
 
 Takes: square matrices, real or complex, and bounds on what they may be off by.
-Gives: `balance`, `pseudospectral_radius`, `cluster_radius`, `norms`.
-Guarantees: `pseudospectral_radius` and `cluster_radius` are bounds, rounding included, and finite whenever
-the matrix is; neither asks for diagonalizability.
+Gives: `balance`, `pseudospectral_radius`, `norms`.
+Guarantees: `pseudospectral_radius` is a bound, rounding included, and finite whenever the matrix is; it does
+not ask for diagonalizability.
 Does not: find eigenvalues, or the smallest bound there is.
 
 The ε-pseudospectrum holds the eigenvalues of all matrices within ε (in the 2-norm): the z with
@@ -179,36 +179,3 @@ def _frobenius(stack: Matrix) -> Floats:
     peak = size.max(axis=(-2, -1), keepdims=True)
     peak = np.where(peak > 0, peak, 1.0)
     return np.asarray(np.sqrt(np.square(size / peak).sum(axis=(-2, -1))) * peak[..., 0, 0])
-
-
-def cluster_radius(count: int, departure: float, error: float) -> float:
-    """Return how far from the nearest eigenvalue of a block an eigenvalue of a block within `error` can be.
-
-    Parameters
-    ----------
-    count
-        Order m of the block.
-    departure
-        Departure from normality Δ, the norm of the strict upper triangle of its Schur form.
-    error
-        Bound on the change in the 2-norm.
-
-    Notes
-    -----
-    The d with Σ_{k<m} Δ^k d^(−k−1) = 1/error (Henrici, Numerische Mathematik 4, 1962): the error itself for
-    m = 1 or Δ = 0, its m-th root for a Jordan block.
-    """
-    if count == 1 or departure == 0.0 or error == 0.0:
-        return error
-
-    def passing(distance: float) -> bool:
-        ratio = departure / distance
-        return error / distance * sum(ratio**k for k in range(count)) <= 1
-
-    # One of the m terms is at least the m-th part: an upper bound to start from.
-    high = max(float((count * error * departure**k) ** (1 / (k + 1))) for k in range(count))
-    low = error
-    for _ in range(8):
-        middle = float(np.sqrt(low * high))
-        low, high = (low, middle) if passing(middle) else (middle, high)
-    return high

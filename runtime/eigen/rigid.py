@@ -28,8 +28,9 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.modes import ClosedSystem, Loop
-from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.loop import Loop
+from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.frame.exchange import QUICK_PRIME
 from apc.runtime.frame.schedule import Act, Propagate, Send, Tick, Value
 from apc.runtime.frame.site import LinearSite
@@ -75,7 +76,7 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     with_drifts
         Whether to look for drifts, which is most of the work.
     """
-    exact = _exact_sites(system.sites)
+    exact = [group.exact for group in system.sites]
     numbering = _Numbering(system.sites)
     still = _standing_solutions(system, exact, numbering)
     vectors = [_standing_state(system, exact, numbering, solution) for solution in still]
@@ -103,7 +104,7 @@ def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bo
         Matrices of each site, over rationals or quotients of polynomials: then for all values of these.
     """
     numbering = _Numbering(system.sites)
-    exact = _exact_sites(system.sites)
+    exact = [group.exact for group in system.sites]
     for solution in _standing_solutions(system, exact, numbering):
         if any(_value(form, solution) for form in _standing(system, others, numbering)):
             return False
@@ -177,12 +178,6 @@ class _Numbering:
                 starts.append(self.size)
                 self.size += len(partition.outputs)
             self.outputs.append(starts)
-
-
-def _exact_sites(sites: Sequence[PeerGroup]) -> list[LinearSite]:
-    """Return every site's exact matrices; equal sites are worked out once."""
-    known: dict[int, LinearSite] = {}
-    return [known.setdefault(id(group.site), group.exact()) for group in sites]
 
 
 def _add(form: Form, weight: Any, other: Mapping[int, Fraction]) -> None:

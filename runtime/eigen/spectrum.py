@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from apc.runtime.eigen.balls import unprovable
 from apc.runtime.eigen.certify import MOST_PROVED, prove
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.components import components
 from apc.runtime.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
-from apc.runtime.eigen.modes import ClosedSystem
 from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, independent_places, relative_places
 from apc.runtime.frame.discretize import UNIT
@@ -111,8 +112,8 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
         if not (certify or drifting or _is_open(one, lowest)):
             continue
         reason = unprovable(system)
-        if not reason and len(system.names) > MOST_PROVED:
-            reason = f"it has {len(system.names)} states, more than the {MOST_PROVED} that are proved"
+        if not reason and (states := _tied(system)) > MOST_PROVED:
+            reason = f"it has {states} states, more than the {MOST_PROVED} that are proved"
         if not reason:
             solved[place] = _prove(system, one)
             continue
@@ -122,9 +123,10 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
             solved[place] = _solve(system, free)
     found = [mode for one in solved for mode in one.modes]
     found.sort(key=lambda mode: (-mode.magnitude, mode.shape, mode.eigenvalue.real, -mode.eigenvalue.imag))
-    radius = found[0].magnitude if found else 0.0
     low = max((one.low for one in solved), default=0.0)
     high = max((one.high for one in solved), default=0.0)
+    # A proof can know better than the vectors of floats.
+    radius = min(max(found[0].magnitude, low), high) if found else 0.0
     rigid = drifts = 0
     for system, one in zip(systems, solved, strict=True):
         rigid += system.multiplicity * one.free.directions.shape[1]
@@ -157,6 +159,11 @@ class _Solved:
     high: float
     inside: bool | None
     bits: int
+
+
+def _tied(system: ClosedSystem) -> int:
+    """Return how many states drive each other at most."""
+    return max((len(part) for part in components(~(np.abs(system.matrix) + system.error == 0))), default=0)
 
 
 def _clear_of_one(one: _Solved) -> bool:
@@ -220,7 +227,7 @@ def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
     rounded = np.abs(weights) @ size[np.ix_(held, rest)]
     reduced_error += (PRODUCT_ROUNDINGS * (count + 2) * UNIT) * (rounded + np.abs(reduced) * (count > 0))
 
-    values, right, left, errors, low, high = enclose_eigenvalues(reduced, reduced_error)
+    values, right, left, errors, low, high = enclose_eigenvalues(reduced, reduced_error, whole=count > 0)
     inside = False if low > 1 else True if high < 1 else None  # NaN decides nothing
     return _Solved(free, _modes(system, free, values, right, left, errors), low, high, inside, 0)
 
@@ -230,14 +237,19 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     proof = prove(system, estimate.free, independent_places(estimate.free.basis.T).tolist())
     if proof.free.drifts != estimate.free.drifts:
         estimate = _solve(system, proof.free)
-    if proof.values is None or not len(proof.values):
-        return replace(estimate, inside=proof.inside, bits=proof.bits)
+    inside, bits = proof.inside, proof.bits
+    if inside is None and not estimate.free.names:
+        # Weights known as floats only can cost balls more than floats: their bound counts these, too.
+        inside, bits = estimate.inside, 0 if estimate.inside is not None else bits
+    if not len(proof.values):
+        return replace(estimate, inside=inside, bits=bits)
     found = discs(proof.values, proof.values, proof.radii)
     modes = estimate.modes
-    if not found.high - found.low > estimate.high - estimate.low:
+    known = not found.high - found.low > estimate.high - estimate.low
+    if known and proof.right is not None and proof.left is not None:
         modes = _modes(system, proof.free, proof.values, proof.right, proof.left, found.errors)
     low, high = max(estimate.low, found.low), min(estimate.high, found.high)
-    return _Solved(proof.free, modes, low, high, proof.inside, proof.bits)
+    return _Solved(proof.free, modes, low, high, inside, bits)
 
 
 def _modes(

@@ -8,6 +8,7 @@ Does not: evaluate MX functions; transcendental operations over `Fraction` are r
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -15,6 +16,10 @@ from fractions import Fraction
 from typing import Any
 
 import casadi
+
+# Functions whose instructions are kept: an analysis walks the same few of a scene's kinds many times over, and
+# asking CasADi for them takes longer than the arithmetic.
+KEPT = 16
 
 _UNARY: dict[int, Callable[[Any], Any]] = {
     casadi.OP_ASSIGN: lambda a: a,
@@ -97,16 +102,13 @@ def evaluate_exact(
         function_of = _ROUNDED[code]
         return rounded(function_of.__name__, a) if rounded else number(function_of(float(a)))
 
-    for index in range(function.n_instructions()):
-        code = function.instruction_id(index)
-        inputs = function.instruction_input(index)
-        outputs = function.instruction_output(index)
+    for code, inputs, outputs, constant in _instructions(function):
         if code == casadi.OP_INPUT:
             work[outputs[0]] = arguments[inputs[0]][inputs[1]]
         elif code == casadi.OP_OUTPUT:
             results[outputs[0]][outputs[1]] = work[inputs[0]]
         elif code == casadi.OP_CONST:
-            work[outputs[0]] = number(function.instruction_constant(index))
+            work[outputs[0]] = number(constant)
         elif code in (casadi.OP_POW, casadi.OP_CONSTPOW):
             work[outputs[0]] = _power(work[inputs[0]], work[inputs[1]], number)
         elif code in _UNARY:
@@ -125,14 +127,12 @@ def is_rational(function: Any) -> bool:
     if not function.is_a("SXFunction"):
         return False
     constants: dict[int, float] = {}
-    for index in range(function.n_instructions()):
-        code = function.instruction_id(index)
-        outputs = function.instruction_output(index)
+    for code, inputs, outputs, constant in _instructions(function):
         if code == casadi.OP_CONST:
-            constants[outputs[0]] = function.instruction_constant(index)
+            constants[outputs[0]] = constant
             continue
         if code in (casadi.OP_POW, casadi.OP_CONSTPOW):
-            exponent = constants.get(function.instruction_input(index)[1], 0.5)
+            exponent = constants.get(inputs[1], 0.5)
             if exponent != int(exponent):
                 return False
         elif code in _ROUNDED:
@@ -140,6 +140,17 @@ def is_rational(function: Any) -> bool:
         if code != casadi.OP_OUTPUT:
             constants.pop(outputs[0], None)
     return True
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _instructions(function: Any) -> tuple[tuple[int, list[int], list[int], float], ...]:
+    """Return each instruction of an SX function: its code, where it reads and writes, and its constant."""
+    listed = []
+    for index in range(function.n_instructions()):
+        code = function.instruction_id(index)
+        constant = function.instruction_constant(index) if code == casadi.OP_CONST else 0.0
+        listed.append((code, function.instruction_input(index), function.instruction_output(index), constant))
+    return tuple(listed)
 
 
 def _power(base: Any, exponent: Any, number: Callable[[float], Any]) -> Any:

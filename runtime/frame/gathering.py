@@ -1,7 +1,7 @@
 """Unreliable links within the frame of all peers: each way's packet is picked by a number that comes in.
 
 Takes: the routes of a `Timetable`, the members of a population.
-Gives: `Gate`, `build_gates`, `kept_links`; `Gathering`, their part of the frame's function; `Places`, the
+Gives: `Gate`, `build_gates`, `kept_links`; `Gathering`, their part of the frame's function; `Arrivals`, the
 numbers that come in.
 Guarantees: what a tick hears on a way is the packet its timetable says, at a cost of one step a way; the
 memory kept is that of the longest delay, however long a packet stays in effect.
@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.packets import START
+from apc.runtime.frame.listener import START, Seen
 from apc.runtime.frame.schedule import Heard, Kept, Schedule, Sent
-from apc.runtime.frame.timetable import Route, Seen, Timetable
+from apc.runtime.frame.timetable import Route, Timetable
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -243,7 +243,7 @@ class Gathering:
         return casadi.DM(whole)
 
 
-class Places:
+class Arrivals:
     """The numbers that come in, frame by frame; time only goes forward."""
 
     def __init__(self, gates: Sequence[Gate], table: Timetable, frame: int) -> None:

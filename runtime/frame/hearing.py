@@ -28,7 +28,22 @@ def ears_of(
     group: int,
     read: Sequence[frozenset[tuple[int, int]]],
 ) -> Ears:
-    """Return what the receives of a group hear."""
+    """Return what the receives of a group hear.
+
+    Parameters
+    ----------
+    system, exchange
+        The compiled scene, and who hears whom.
+    patterns, read
+        The structural pattern of each kind, and its receives that matter (see `liveness`).
+    group
+        The group's place in the scene.
+
+    Raises
+    ------
+    ApcError
+        E801 a mean, maximum or minimum over nobody.
+    """
     pattern = patterns[system.groups[group].kind]
     everybody: list[tuple[tuple[tuple[Way, str], ...], ...]] = []
     for p, (partition, tick) in enumerate(zip(pattern.kind.clocks, pattern.ticks, strict=True)):

@@ -1,7 +1,7 @@
 """Exact time: the quantum that all times are multiples of, and the hyperperiod of the clocks, the frame.
 
 Takes: a `CompiledSystem`, its timings as exact rationals, what matters of its kinds.
-Gives: `Times`, `Grid`, `times_in_use`; `common_divisor`.
+Gives: `Times`, `ClockGrid`, `times_in_use`; `common_divisor`.
 Guarantees: every period, phase and delay in use is a whole number of quanta; what nobody uses takes no part.
 Does not: say what happens at an instant (see `scheduling`).
 """
@@ -23,13 +23,14 @@ MOST_TICKS = 20_000  # in a frame: each is a step of the lifting
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class ClockGrid:
     """A clock in quanta: ticks at phase + k*period for every integer k, 0 <= phase < period."""
 
     phase: int
     period: int
 
     def at(self, index: int) -> int:
+        """Return the instant of a tick."""
         return self.phase + index * self.period
 
     def newest(self, limit: int, *, strictly: bool = False) -> int:
@@ -44,7 +45,7 @@ class Times:
 
     quantum: Fraction
     frame: int
-    clocks: Mapping[str, Grid]
+    clocks: Mapping[str, ClockGrid]
     delays: Mapping[str, int]
 
 
@@ -55,7 +56,22 @@ def times_in_use(
     live: Sequence[frozenset[tuple[int, int]]],
     ears: Sequence[Ears],
 ) -> Times:
-    """Find the quantum of which every period, phase and delay in use is a multiple, and the frame."""
+    """Find the quantum of which every period, phase and delay in use is a multiple, and the frame.
+
+    Parameters
+    ----------
+    system, timings
+        The compiled scene, and seconds by the name of the timing.
+    patterns, live
+        The structural pattern of each kind, and its outputs that matter (see `liveness`).
+    ears
+        What the receives of each group hear.
+
+    Raises
+    ------
+    ApcError
+        E805 too many ticks in a frame.
+    """
     clock_of = {clock.name: clock for clock in system.clocks}
     link_of = {link.name: link for link in system.links}
     clocks: dict[str, Clock] = {}
@@ -84,7 +100,7 @@ def times_in_use(
     return Times(
         quantum=quantum,
         frame=frame,
-        clocks={name: Grid(int(phase[name] / quantum), count[name]) for name in clocks},
+        clocks={name: ClockGrid(int(phase[name] / quantum), count[name]) for name in clocks},
         delays={name: int(value / quantum) for name, value in delays.items()},
     )
 

@@ -8,7 +8,7 @@ Does not: evaluate them (see `linearize`).
 
 A receive over an edge function, r = op_j e(x, u, m, s_j), is linear in what the site hears and in its own x,
 u and m: its own part, ∂r/∂x and so on, is part of the tick's X, U and M; ∂e/∂s weighs what it hears (see
-`modes`).
+`coupling`).
 """
 
 from __future__ import annotations
@@ -52,6 +52,14 @@ class SiteJacobians:
     pattern: LinearSite
     affine: bool
     edges: Mapping[tuple[int, int], Edge]
+
+    @property
+    def parameters_suffice(self) -> bool:
+        """Whether its matrices follow from its parameters alone, wherever it starts and whoever it hears.
+
+        Peers of equal parameters then move alike, and a population of them splits in modes.
+        """
+        return self.affine and not self.edges
 
     @property
     def walkable(self) -> bool:

@@ -15,8 +15,8 @@ sent.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -165,16 +165,12 @@ def follow(
     -------
     z⁺ (n_z, columns), and the continuous states at the schedule's marks (marks, n_x, columns).
     """
-    kind = site.kind
-    n_x, n_u = len(kind.states), len(kind.holds)
+    n_x = len(site.kind.states)
     nothing = np.zeros(start.shape[1], dtype=start.dtype)
     value: dict[Value, Matrix] = {one: start[n_x + row] for row, one in enumerate(schedule.carried)}
-
     # The continuous states above what the holds put out: a step multiplies both at once.
-    moving = np.zeros((n_x + n_u, start.shape[1]), dtype=start.dtype)
-    moving[:n_x] = start[:n_x]
-    for hold, one in enumerate(schedule.acting):
-        moving[n_x + hold] = value.get(one, nothing) if one is not None else nothing
+    acting = [nothing if one is None else value.get(one, nothing) for one in schedule.acting]
+    moving = np.vstack([start[:n_x], *acting])
     sends = [np.hstack([send.x, send.u]) for send in site.sends]
     ticks = [np.hstack([tick.x, tick.u, tick.m, tick.r]) for tick in site.ticks]
     inside = np.zeros((len(schedule.marks), n_x, start.shape[1]), dtype=start.dtype)
@@ -194,22 +190,27 @@ def follow(
                 for channel, row in rows:
                     yield row, everything[channel]
             case Tick(partition, index, rows_heard):
-                memories = kind.clocks[partition].memories
+                memories = site.kind.clocks[partition].memories
                 before = [value.get(Value(partition, o, index - 1), nothing) for o in memories]
-                received = []
-                for places in rows_heard:
-                    total = nothing
-                    for place in places:
-                        while (packet := hear(place)) is None:
-                            yield -1, nothing
-                        total = total + packet
-                    received.append(total)
+                received = yield from _received(rows_heard, hear, nothing)
                 inputs = np.vstack([moving, *before, *received])
                 for output, row_of in enumerate(multiply(ticks[partition], inputs)):
                     value[Value(partition, output, index)] = row_of
     inside[-1] = moving[:n_x]
-    after = [
-        value[Value(one.partition, one.output, one.index + schedule.ticks[one.partition])]
-        for one in schedule.carried
-    ]
-    return np.vstack([moving[:n_x], *after]), inside
+    later = [replace(one, index=one.index + schedule.ticks[one.partition]) for one in schedule.carried]
+    return np.vstack([moving[:n_x], *(value[one] for one in later)]), inside
+
+
+def _received(
+    rows_heard: Sequence[Sequence[int]], hear: Callable[[int], Matrix | None], nothing: Matrix
+) -> Generator[tuple[int, Matrix], None, list[Matrix]]:
+    """Add up what each receive hears; yield (−1, nothing) while something isn't sent yet."""
+    received = []
+    for places in rows_heard:
+        total = nothing
+        for place in places:
+            while (packet := hear(place)) is None:
+                yield -1, nothing
+            total = total + packet
+        received.append(total)
+    return received

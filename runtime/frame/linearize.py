@@ -80,7 +80,7 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
 
     The rows (k, …) hold what `site_of_row` makes a site of.
     """
-    assert site.affine and not site.edges, "the start matters"
+    assert site.parameters_suffice, "the start matters"
     zeros = [np.zeros(site.function.numel_in(argument)) for argument in range(4)]
     rows = np.empty((len(parameters), site.function.numel_out(0)))
     many = None

@@ -43,6 +43,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     """
     known = {parameter.name for parameter in system.parameters} | {timing.name for timing in system.timings}
     groups = {group.name for group in system.groups}
+    written = name[:80].strip() or "an empty name"
     first, _, rest = name.partition(".")
     if first in SECTIONS and name not in known:
         name = rest
@@ -50,13 +51,16 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     group = None
     if name not in known and first in groups and rest in {parameter.name for parameter in system.parameters}:
         name, group = rest, first
+    if group is not None and name in {timing.name for timing in system.timings}:
+        what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
+        raise ApcError(Mistake("E622", place, what, hint=name))
     if name == PEERS:
         raise ApcError(
             Mistake("E623", place, "peers is the number of peers: change a count and compile again")
         )
     if name not in known:
         near = nearest(name, sorted(known - {PEERS}))
-        raise ApcError(Mistake("E622", place, f"{name[:80]} is no parameter of {system.name}", hint=near))
+        raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
     return name, group
 
 

@@ -10,9 +10,7 @@ Does not: check bounds; change what everybody shares (`overrides`, in exact rati
 
 from __future__ import annotations
 
-import functools
-import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,49 +21,6 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.names import OVERRIDE, Free
 
 Floats = NDArray[np.float64]
-
-# The language's operators and functions of a parameter, over the values of all peers at once.
-_OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "/": np.true_divide,
-    "^": lambda base, exponent: _power(base, exponent),
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-    "==": operator.eq,
-    "!=": operator.ne,
-}
-
-_EXTREMES: dict[str, Callable[[Any, Any], Any]] = {"max": np.maximum, "min": np.minimum}
-
-_FUNCTIONS: dict[str, Callable[[Any], Any]] = {
-    # Of a complex step, the imaginary part is a derivative and follows the real part.
-    "abs": lambda value: np.where(np.real(value) < 0, -value, value),
-    "sign": lambda value: np.sign(np.real(value)),
-    "floor": lambda value: np.floor(np.real(value)),
-    "sqrt": np.sqrt,
-    "exp": np.exp,
-    "log": np.log,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tanh": np.tanh,
-}
-
-
-def _power(base: Any, exponent: Any) -> Any:
-    """Return base^exponent; of a complex step, with the derivative as imaginary part."""
-    value = np.float_power(np.real(base), np.real(exponent))
-    if not (np.iscomplexobj(base) or np.iscomplexobj(exponent)):
-        return value
-    b, e = np.real(base), np.real(exponent)
-    slope = e * np.float_power(b, e - 1) * np.imag(base)
-    growing = np.imag(exponent)
-    if np.any(growing):
-        slope = slope + value * np.log(b) * growing
-    return value + 1j * slope
 
 
 class Columns:
@@ -88,20 +43,19 @@ class Columns:
     def _evaluated(self, name: str, text: str) -> Floats | None:
         from apc.compiler.expression import names
         from apc.compiler.grammar import parse_expression
+        from apc.runtime.frame.row_arithmetic import compute_rows
 
         tree = parse_expression(text, Place(name, 1, 1, text))
         if all(self.of(".".join(node.parts)) is None for node in names(tree)):
             return None
-        with np.errstate(all="ignore"):
-            values = np.asarray(_evaluate_rows(tree, self._look_up), dtype=np.float64)
+        values = np.asarray(compute_rows(tree, self._look_up), dtype=np.float64)
         wrong = np.flatnonzero(~np.isfinite(values))
         if len(wrong):
             peer = f"{self._group}[{int(wrong[0]) + 1}]"
             raise ApcError(Mistake("E331", OVERRIDE, f"{name} = {text[:80]} has no finite value for {peer}"))
         return values
 
-    def _look_up(self, parts: tuple[str, ...]) -> Any:
-        name = ".".join(parts)
+    def _look_up(self, name: str) -> Any:
         column = self.of(name)
         if column is not None:
             return column
@@ -166,12 +120,12 @@ def free_rows(
         if parameter.expression and name not in given:
             from apc.compiler.expression import names
             from apc.compiler.grammar import parse_expression
+            from apc.runtime.frame.row_arithmetic import compute_rows
 
             tree = parse_expression(parameter.expression, Place(name, 1, 1, parameter.expression))
             reached = [value_of(".".join(node.parts)) for node in names(tree)]
             if any(np.ndim(one) for one in reached):
-                with np.errstate(all="ignore"):
-                    return _evaluate_rows(tree, lambda parts: value_of(".".join(parts)))
+                return compute_rows(tree, value_of)
         column = columns.of(name)
         return parameter.value if column is None else float(column[peer])
 
@@ -182,34 +136,3 @@ def free_rows(
     for place, one in enumerate(listed):
         rows[:, place] = one
     return rows
-
-
-def _evaluate_rows(expr: Any, lookup: Callable[[tuple[str, ...]], Any]) -> Any:
-    """Return an expression's value for all peers at once, in floats (or truth values)."""
-    from apc.compiler.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not, Number
-
-    def value(node: Any) -> Any:
-        match node:
-            case Number():
-                return float(node.value)
-            case Name():
-                return lookup(node.parts)
-            case Negate():
-                return -value(node.operand)
-            case Binary() | Compare():
-                return _OPERATORS[node.operator](value(node.left), value(node.right))
-            case Logic():
-                join = np.logical_and if node.operator == "and" else np.logical_or
-                return join(value(node.left), value(node.right))
-            case Not():
-                return np.logical_not(value(node.operand))
-            case Conditional():
-                return np.where(value(node.condition), value(node.then), value(node.otherwise))
-            case Call():
-                arguments = [value(argument) for argument in node.arguments]
-                if node.function in _EXTREMES:
-                    return functools.reduce(_EXTREMES[node.function], arguments)
-                return _FUNCTIONS[node.function](*arguments)
-        raise AssertionError(f"no such expression: {node!r}")
-
-    return value(expr)

@@ -1,5 +1,6 @@
 """What one frame of a peer is made of: its events in their order, and what is remembered between frames.
 
+Takes: what `scheduling` found out.
 Gives: `Schedule` and its events, `Event`; the names of what is computed, sent and heard; `ORDER`.
 Guarantees: exact time (integers of one quantum).
 Does not: find out what happens when (see `scheduling`).

@@ -19,7 +19,7 @@ from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import Exchange, build_exchange
 from apc.runtime.frame.hearing import Ears, ears_of
-from apc.runtime.frame.hyperperiod import Grid, Times, times_in_use
+from apc.runtime.frame.hyperperiod import ClockGrid, Times, times_in_use
 from apc.runtime.frame.liveness import live_holds, live_outputs, live_receives
 from apc.runtime.frame.schedule import (
     ORDER,
@@ -239,7 +239,7 @@ def _computations(
 
 
 def _sendings(
-    pattern: LinearSite, grid_of: Mapping[str, Grid | None], sent: Sequence[Sent], frame: int, rank: int
+    pattern: LinearSite, grid_of: Mapping[str, ClockGrid | None], sent: Sequence[Sent], frame: int, rank: int
 ) -> Iterator[_Happening]:
     """Yield when a site sends what in a frame."""
     for p, sending in enumerate(pattern.kind.sends):
@@ -277,7 +277,7 @@ def _switches(
     return acting, happenings
 
 
-def _slot_time(sent: Sent, grid_of: Mapping[str, Grid | None]) -> int:
+def _slot_time(sent: Sent, grid_of: Mapping[str, ClockGrid | None]) -> int:
     """Return when a slot is sent, in quanta from the frame's start."""
     grid = grid_of[sent.link]
     assert grid is not None
@@ -299,6 +299,13 @@ def _carried(
     kind = pattern.kind
     now = list(acting)
     demanded: set[Value] = set()
+    felt = np.flatnonzero(pattern.b.any(axis=0)).tolist()
+    sent = [[channel.nonzero()[0].tolist() for channel in send.u] for send in pattern.sends]
+    computed, remembered = [], []
+    for partition, tick in enumerate(pattern.ticks):
+        outputs = sorted(o for p, o in live if p == partition)
+        computed.append(np.flatnonzero(tick.u[outputs].any(axis=0)).tolist())
+        remembered.append(np.flatnonzero(tick.m[outputs].any(axis=0)).tolist())
 
     def read(row: Iterable[int]) -> None:
         demanded.update(value for h in row if (value := now[h]) is not None)
@@ -308,15 +315,14 @@ def _carried(
             case Act(hold, value):
                 now[hold] = value
             case Propagate():
-                read(np.flatnonzero(pattern.b.any(axis=0)).tolist())
+                read(felt)
             case Send(partition, rows):
                 for channel, _ in rows:
-                    read(pattern.sends[partition].u[channel].nonzero()[0].tolist())
+                    read(sent[partition][channel])
             case Tick(partition, index, _):
-                for output in (o for p, o in live if p == partition):
-                    read(pattern.ticks[partition].u[output].nonzero()[0].tolist())
-                    for m in pattern.ticks[partition].m[output].nonzero()[0]:
-                        demanded.add(Value(partition, kind.clocks[partition].memories[m], index - 1))
+                read(computed[partition])
+                memories = kind.clocks[partition].memories
+                demanded.update(Value(partition, memories[m], index - 1) for m in remembered[partition])
     carried: set[Value] = set()
     for value in demanded:
         while value.index < 0:

@@ -1,5 +1,6 @@
 """The linear equations of one site as matrices, and what can be done to all of them alike.
 
+Takes: a kind, and matrices of floats, exact rationals, truth values or any other kind of number.
 Gives: `LinearSite`, `LinearTick`, `LinearSend`; `matrices_of`, `assemble`, `cut`; `every_matrix`,
 `entrywise`, `magnitudes`, `rational_floats`, `with_own_parts`.
 Guarantees: every matrix says what its rows and columns are, whatever kind of number it holds.

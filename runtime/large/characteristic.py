@@ -34,7 +34,7 @@ Complexes = NDArray[np.complex128]
 POWER_STEPS, FLOOR, TINY = 4, 1e-12, 1e-300
 
 # Steps of Newton's method, none longer than this share of |ζ|; the relative step at which it has arrived, and
-# that from which on rounding alone moves it. Nobody looks for a zero beyond the last.
+# that from which on rounding alone moves it. Nobody looks for a zero so many times beyond the largest pole.
 STEPS, LONGEST, ARRIVED, NEAR, FARTHEST = 40, 0.1, 1e-15, 1e-6, 1e6
 
 
@@ -62,22 +62,44 @@ def weights_at(function: Characteristic, points: Complexes) -> Complexes:
     return np.asarray(np.einsum("zl,lrs->zrs", powers, function.weights))
 
 
-def _bounded(function: Characteristic, points: Complexes, reach: Floats) -> tuple[Complexes, Floats]:
-    """Return I − T W (z, n, n) at the centres of discs, and a bound on its change in each."""
+@dataclass(frozen=True, slots=True)
+class _Matrices:
+    """I − T W at ζ + h: `value` + h · `slope`, but for what `doubt` bounds in the disc (z, n, n)."""
+
+    value: Complexes
+    slope: Complexes
+    doubt: Floats
+
+
+def _weight_slopes(function: Characteristic, points: Complexes) -> Complexes:
+    """Return dW/dζ (z, n_r, n_s)."""
     lags = np.array(function.lags)
-    value, doubt = respond(function.transfers, points, reach)
-    weight = weights_at(function, points)
-    # |ζ^−l − ζ₀^−l| ≤ l·reach/(|ζ₀| − reach)^(l+1); a power by way of logarithms loses a rounding a turn.
+    return np.asarray(np.einsum("zl,lrs->zrs", -lags * points[:, None] ** (-lags - 1), function.weights))
+
+
+def _bounded(function: Characteristic, points: Complexes, reach: Floats) -> _Matrices:
+    """Return I − T W at the centres of discs, its slope there, and a bound on the rest in each."""
+    lags = np.array(function.lags)
+    answer = respond(function.transfers, points, reach)
+    weight, weight_slope = weights_at(function, points), _weight_slopes(function, points)
+    # Taylor's remainder of ζ^−l; a power by way of logarithms loses a rounding a turn.
     near = np.maximum(np.abs(points) - reach, np.finfo(np.float64).tiny)[:, None]
+    share = reach[:, None] / near
     largest = near**-lags
-    wander = largest * (lags * reach[:, None] / near + (8 + 8 * lags) * UNIT)
-    off = np.einsum("zl,lrs->zrs", wander, np.abs(function.weights))
-    off += np.einsum("zl,lrs->zrs", largest, function.weight_errors)
+    wander = largest * (share**2 * lags * (lags + 1) / 2 + (1 + lags * share) * (16 + 8 * lags) * UNIT)
+    weight_doubt = np.einsum("zl,lrs->zrs", wander, np.abs(function.weights))
+    weight_doubt += np.einsum("zl,lrs->zrs", largest, function.weight_errors)
     size = np.einsum("zl,lrs->zrs", np.abs(points[:, None]) ** -lags, np.abs(function.weights))
-    n_s, n_r = value.shape[1:]
-    total = np.abs(value) @ off + doubt @ (size + off)
-    total += PRODUCT_ROUNDINGS * (n_s + n_r + 2) * UNIT * (np.abs(value) @ size + np.eye(n_s))
-    return np.eye(n_s) - value @ weight, total
+    n_s, n_r = answer.value.shape[1:]
+    moved = reach[:, None, None]
+    value_size, slope_size = np.abs(answer.value), moved * np.abs(answer.slope)
+    weight_moved = moved * np.abs(weight_slope)
+    total = (value_size + slope_size) @ weight_doubt + slope_size @ weight_moved
+    total += answer.doubt @ (size + weight_moved + weight_doubt)
+    rounded = value_size @ (size + weight_moved) + slope_size @ size + np.eye(n_s)
+    total += PRODUCT_ROUNDINGS * (n_s + n_r + 2) * UNIT * rounded
+    slope = -(answer.slope @ weight + answer.value @ weight_slope)
+    return _Matrices(np.eye(n_s) - answer.value @ weight, slope, total)
 
 
 def characteristic_ball(function: Characteristic, points: Complexes, reach: Floats) -> Ball:
@@ -92,28 +114,32 @@ def characteristic_ball(function: Characteristic, points: Complexes, reach: Floa
 
     Notes
     -----
-    With |E| ≤ V entry by entry and F the Frobenius norm of D⁻¹ |A⁻¹| V D, for any scaling D > 0,
-    det(A + E)/det A = Π (1 + λ_i) with Σ |λ_i|² ≤ F² (Schur), so it differs from 1 by at most
-    (1 + F/√n)^n − 1.
+    With A + h A₁ + E in the disc, |E| ≤ V entry by entry, and F the Frobenius norm of
+    D⁻¹ (ρ |A⁻¹ A₁| + |A⁻¹| V) D, for any scaling D > 0, det(A + h A₁ + E)/det A = Π (1 + λ_i) with
+    Σ |λ_i|² ≤ F² (Schur), so it differs from 1 by at most (1 + F/√n)^n − 1.
     """
     with np.errstate(all="ignore"):
-        matrix, doubt = _bounded(function, points, reach)
+        found = _bounded(function, points, reach)
+        matrix, slope, doubt = found.value, found.slope, found.doubt
         n = matrix.shape[-1]
         fine = np.asarray(np.isfinite(doubt).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2)))
         matrix = np.where(fine[:, None, None], matrix, np.eye(n))
         sign, logarithm = np.linalg.slogdet(matrix)
         fine &= np.isfinite(logarithm)
         matrix = np.where(fine[:, None, None], matrix, np.eye(n))
-        inverse, wrong = _inverse(matrix)
+        inverse, size, wrong = _inverse(matrix)
         fine &= wrong < 0.5
-        doubt = np.where(fine[:, None, None], doubt, 0.0)
-        share = _scaled_norm(inverse @ doubt)
-        change = np.where(fine, np.expm1(n * np.log1p(share / np.sqrt(n))) * (1 + 1e-9), np.inf)
+        doubt, slope = (np.where(fine[:, None, None], part, 0.0) for part in (doubt, slope))
+        doubt += PRODUCT_ROUNDINGS * (n + 2) * UNIT * reach[:, None, None] * np.abs(slope)
+        turned = np.abs(inverse @ slope)
+        turned += 2 * wrong[:, None, None] * turned.max(axis=1, keepdims=True, initial=0.0)
+        share = _scaled_norm(reach[:, None, None] * turned + size @ doubt)
+        change = np.where(fine, np.expm1(n * np.log1p(share / np.sqrt(max(n, 1)))) * (1 + 1e-9), np.inf)
     return Ball(sign, change)
 
 
-def _inverse(matrix: Complexes) -> tuple[Floats, Floats]:
-    """Return bounds on |A⁻¹| (z, n, n), good while the computed inverse Y is: F = I − Y A, ‖F‖ (z,) < 1/2.
+def _inverse(matrix: Complexes) -> tuple[Complexes, Floats, Floats]:
+    """Return Y ≈ A⁻¹ and a bound on |A⁻¹| (z, n, n), good while F = I − Y A has ‖F‖ (z,) < 1/2.
 
     A⁻¹ = (I − F)⁻¹ Y, and |(I − F)⁻¹| is at most I + 2‖F‖ in every entry.
     """
@@ -122,8 +148,9 @@ def _inverse(matrix: Complexes) -> tuple[Floats, Floats]:
     size = np.abs(inverse)
     off = np.abs(np.eye(n) - inverse @ matrix)
     off += PRODUCT_ROUNDINGS * (n + 2) * UNIT * (size @ np.abs(matrix))
-    wrong = off.sum(axis=2).max(axis=1)
-    return size + 2 * wrong[:, None, None] * size.max(axis=1, keepdims=True), wrong
+    wrong = off.sum(axis=2).max(axis=1, initial=0.0)
+    largest = size.max(axis=1, keepdims=True, initial=0.0)
+    return inverse, size + 2 * wrong[:, None, None] * largest, wrong
 
 
 def _scaled_norm(matrices: Floats) -> Floats:
@@ -136,15 +163,15 @@ def _scaled_norm(matrices: Floats) -> Floats:
     for _ in range(POWER_STEPS):
         right = (matrices @ right[..., None])[..., 0]
         left = (left[:, None, :] @ matrices)[:, 0]
-        right = np.maximum(right / np.maximum(right.max(axis=1, keepdims=True), TINY), FLOOR)
-        left = np.maximum(left / np.maximum(left.max(axis=1, keepdims=True), TINY), FLOOR)
+        right = np.maximum(right / np.maximum(right.max(axis=1, keepdims=True, initial=0.0), TINY), FLOOR)
+        left = np.maximum(left / np.maximum(left.max(axis=1, keepdims=True, initial=0.0), TINY), FLOOR)
     scale = np.sqrt(right / left)
     scaled = matrices / scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.norm(scaled, axis=(1, 2)))
 
 
 def count_around(
-    function: Characteristic, centre: float | complex, radius: float, *, arcs: int, most: int
+    function: Characteristic, centre: float | complex, radius: float, *, arcs: int, most: int | None = None
 ) -> int | None:
     """Return zeros less poles of f within a circle, None if that can't be told.
 
@@ -188,6 +215,7 @@ def refine(
     points = np.array(starts, dtype=np.complex128)
     steps = np.full(len(points), np.inf)
     active = np.flatnonzero(np.isfinite(points))
+    farthest = FARTHEST * float(np.abs(poles).max(initial=1.0))
     out, known = (_whole(np.zeros(0, np.complex128) if one is None else one) for one in (poles, found))
     with np.errstate(all="ignore"):
         for _ in range(STEPS):
@@ -201,7 +229,7 @@ def refine(
             step = np.where(np.abs(step) > longest, step / np.abs(step) * longest, step)
             moved = now + step
             size = np.abs(moved)
-            lost = ~np.isfinite(size) | (size <= function.innermost) | (size > FARTHEST)
+            lost = ~np.isfinite(size) | (size <= function.innermost) | (size > farthest)
             before, steps[active] = steps[active], np.abs(step) / size
             points[active] = np.where(lost, np.nan, moved)
             # Far below what is `NEAR`, steps that no longer shrink are rounding.
@@ -220,10 +248,9 @@ def _whole(upper: Complexes) -> Complexes:
 
 def _log_rate(function: Characteristic, points: Complexes) -> Complexes:
     """Return f′/f = tr((I − T W)⁻¹ (I − T W)′), infinite at a zero."""
-    lags = np.array(function.lags)
     value, slope = differentiate(function.transfers, points)
     weight = weights_at(function, points)
-    weight_slope = np.einsum("zl,lrs->zrs", -lags * points[:, None] ** (-lags - 1), function.weights)
+    weight_slope = _weight_slopes(function, points)
     matrix = np.eye(value.shape[1]) - value @ weight
     change = -(slope @ weight + value @ weight_slope)
     sign, _ = np.linalg.slogdet(matrix)

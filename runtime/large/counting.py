@@ -38,8 +38,10 @@ Bounded = Callable[[Complexes, Floats], Ball]
 # Arcs to begin with, all around.
 FIRST_ARCS = 32
 
-# Evaluations after which a cover is given up: a thousand frames of delay need some thousand.
-MOST_POINTS = 60_000
+# Evaluations after which a cover is given up, beside those an arc: where rounding leaves f open along a
+# stretch of the circle, cutting the arcs there would never end. Zeros however near to the circle cost some
+# hundred.
+MOST_POINTS, POINTS_AN_ARC = 3000, 4
 
 # An arc narrower than this many radians has a zero as good as on it: given up.
 NARROWEST = 1e-14
@@ -51,7 +53,7 @@ def wind(
     radius: float,
     *,
     arcs: int = FIRST_ARCS,
-    most: int = MOST_POINTS,
+    most: int | None = None,
 ) -> int | None:
     """Return how often a function goes around 0 along a circle, counter-clockwise; None if it can't be told.
 
@@ -64,9 +66,10 @@ def wind(
     arcs
         How many arcs to begin with.
     most
-        Evaluations after which to give up.
+        Evaluations after which to give up, or as many as serve.
     """
     half = not complex(centre).imag
+    most = MOST_POINTS + POINTS_AN_ARC * arcs if most is None else most
     edges = np.linspace(0.0, np.pi if half else 2 * np.pi, (arcs // 2 if half else arcs) + 1)
     starts, ends = edges[:-1], edges[1:]
     settled: list[tuple[Floats, Complexes]] = []

@@ -20,8 +20,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.modes import Coupling
-from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.eigen.loop import Coupling
+from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange, check_mean
 from apc.runtime.frame.schedule import Heard, Sent, Way

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.modes import Loop
+from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.rigid import find_rigid_modes
 from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation, turned_along
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.lift import LiftedSite
 from apc.runtime.large.characteristic import Characteristic, null_vectors, weights_at
-from apc.runtime.large.crowds import Crowd, hear_themselves, lift_one, lines_of, some_rows
+from apc.runtime.large.crowds import Crowd, hear_roughly, lift_one, lines_of, some_rows
 from apc.runtime.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
 from apc.runtime.large.transfer import CHUNK, differentiate
 from apc.runtime.large.zeros import Zero, Zeros, find_zeros, near_poles
@@ -43,6 +43,9 @@ LEAST_START, SAME_START = 0.5, 1e-9
 
 # Zeros of a loop that Newton's method starts from, the largest by their estimate.
 STARTS = 64
+
+# How far aside of an eigenvalue, relatively, its vectors are looked for by inverse iteration.
+BESIDE = 1e-10
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +102,7 @@ def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spect
     )
     low = max(one.zeros.low for one in solved)
     high = max(one.zeros.high for one in solved)
-    radius = modes[0].magnitude if modes else 0.0
+    radius = max(one.zeros.radius for one in solved)
     rigid = sum(one.rigid * many for one, many in zip(solved, multiplicities, strict=True))
     drifts = sum(one.drifts * many for one, many in zip(solved, multiplicities, strict=True))
     inside = [False if one.zeros.low > 1 else True if one.zeros.high < 1 else None for one in solved]
@@ -118,7 +121,12 @@ def _solve_loop(loop: Loop) -> _Solved:
     rigid, drifts = find_rigid_modes(prompt, with_drifts=False).directions.shape[1], 0
     starts = _delay_starts(function)
     zeros = find_zeros(function, starts, rigid=rigid, listed=LISTED, near=0)
-    if rigid and not zeros.rigid_counted and (drifts := find_rigid_modes(prompt).drifts):
+    if (
+        rigid
+        and np.isfinite(zeros.high)
+        and not zeros.rigid_counted
+        and (drifts := find_rigid_modes(prompt).drifts)
+    ):
         zeros = find_zeros(function, starts, rigid=rigid + drifts, listed=LISTED, near=0)
     modes = _with_conjugates(_loop_mode(function, loop, zero) for zero in zeros.found)
     return _Solved(zeros, rigid, drifts, modes)
@@ -139,7 +147,7 @@ def _delay_starts(function: Characteristic) -> Complexes:
     Where k is an eigenvalue of T(ζ) W(ζ) ζ^d, f has a zero if ζ^d = k(ζ): near the unit circle ζ is
     |k|^(1/d) times a d-th root of 1, turned by what k is turned.
     """
-    delay = max(*function.lags, 1)
+    delay = max((1, *function.lags))
     turns = np.arange(delay // 2 + 1)
     on_circle = np.exp(2j * np.pi * turns / delay) * (1 + 1e-9)
     value, _ = differentiate(function.transfers, on_circle)
@@ -160,8 +168,8 @@ def _common_starts(listed: Sequence[Crowd], exchange: Exchange) -> Complexes:
     for crowd, (weight, senders) in zip(listed, weights, strict=True):
         few = np.unique(np.linspace(0, len(crowd.parameters) - 1, SAMPLES).astype(np.int64))
         own = np.tile(weight * senders, (len(few), 1))
-        alike = hear_themselves(some_rows(crowd.lifted, few), crowd.schedule, own, 0 * own)
-        values = np.linalg.eigvals(alike.m).astype(np.complex128).ravel()
+        alike, *_ = hear_roughly(some_rows(crowd.lifted, few), crowd.schedule, own, 0 * own)
+        values = np.linalg.eigvals(alike).astype(np.complex128).ravel()
         kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
         found.append(values[kept])
     return np.concatenate(found)
@@ -169,20 +177,10 @@ def _common_starts(listed: Sequence[Crowd], exchange: Exchange) -> Complexes:
 
 def _loop_mode(function: Characteristic, loop: Loop, zero: Zero) -> Mode:
     """Describe a zero of a loop; the packets of a channel on their way count together."""
-    value = zero.value
-    sent, weight = null_vectors(function, value)
-    heard = weights_at(function, np.array([value]))[0] @ sent
-    motions, felt = [], []
-    s_start = r_start = 0
-    for group in loop.sites:
-        one = group.lifted
-        rows = slice(s_start, s_start + len(one.s))
-        lines = slice(r_start, r_start + one.q.shape[1])
-        s_start, r_start = rows.stop, lines.stop
-        blocks = (one.p[None], one.q[None], one.s[None], one.d[None])
-        motions.append(_move(blocks, value, heard[None, lines], weight[rows]))
-        felt.append(motions[-1].felt[0])
-    waiting = _waiting(function, value, np.concatenate(felt), max(function.lags))
+    value = zero.value * (1 + BESIDE)
+    motions, sent = _nearly_free(function, loop, value)
+    felt = np.concatenate([one.felt[0] for one in motions])
+    waiting = _waiting(function, value, felt, max(function.lags, default=0))
     lags = np.arange(1, len(waiting) + 1)[:, None]
     on_the_way = np.abs(waiting * sent * value ** -lags.astype(np.float64))
     shares: dict[str, float] = {}
@@ -201,6 +199,40 @@ def _loop_mode(function: Characteristic, loop: Loop, zero: Zero) -> Mode:
     return _mode(zero, lifted, state, motions[dominant].w[0], shares, loop.name, loop.multiplicity)
 
 
+def _nearly_free(function: Characteristic, loop: Loop, value: complex) -> tuple[list[_Motion], Complexes]:
+    """Return how the sites move next to an eigenvalue when all is pushed a little, and what they send.
+
+    Inverse iteration: it serves where I − T W has no null vector too, at a pole that is an eigenvalue. Any
+    push will do that no symmetry of the scene is blind to.
+    """
+    random = np.random.default_rng(0)
+    pushes = [random.uniform(0.5, 1.0, (1, len(group.lifted.p))) for group in loop.sites]
+    all_blocks = [
+        (one.p[None], one.q[None], one.s[None], one.d[None]) for one in (group.lifted for group in loop.sites)
+    ]
+    alone = [
+        _move(blocks, value, np.zeros((1, blocks[1].shape[2])), np.zeros(blocks[2].shape[1]), push)
+        for blocks, push in zip(all_blocks, pushes, strict=True)
+    ]
+    answer = differentiate(function.transfers, np.array([value]))[0][0]
+    hearing = weights_at(function, np.array([value]))[0]
+    sent_alone = np.concatenate(
+        [(blocks[2] @ one.z[..., None])[0, :, 0] for blocks, one in zip(all_blocks, alone, strict=True)]
+    )
+    sent = np.linalg.solve(np.eye(len(answer)) - answer @ hearing, sent_alone)
+    felt_alone = np.concatenate([one.felt[0] for one in alone])
+    felt = np.linalg.solve((np.eye(len(hearing)) - hearing @ answer).T, felt_alone)
+    heard, weight = hearing @ sent, felt @ hearing
+    motions = []
+    s_start = r_start = 0
+    for blocks, push in zip(all_blocks, pushes, strict=True):
+        rows = slice(s_start, s_start + blocks[2].shape[1])
+        lines = slice(r_start, r_start + blocks[1].shape[2])
+        s_start, r_start = rows.stop, lines.stop
+        motions.append(_move(blocks, value, heard[None, lines], weight[rows], push))
+    return motions, sent
+
+
 def _crowd_mode(function: Characteristic, places: Places, listed: Sequence[Crowd], zero: Zero) -> Mode:
     """Describe a zero of a population of crowds; the shares of a crowd's peers are added up."""
     if zero.site:
@@ -217,7 +249,7 @@ def _crowd_mode(function: Characteristic, places: Places, listed: Sequence[Crowd
     felt = np.zeros(len(heard), np.complex128)
     for g, (crowd, motion) in enumerate(zip(listed, motions, strict=True)):
         felt[places.heard[g]] += crowd.counts @ motion.felt
-    waiting = _waiting(function, value, felt, max(function.lags))
+    waiting = _waiting(function, value, felt, max(function.lags, default=0))
     shares: dict[str, float] = {}
     most, dominant = -1.0, (0, 0)
     for g, (crowd, motion) in enumerate(zip(listed, motions, strict=True)):
@@ -247,14 +279,14 @@ def _own_mode(crowd: Crowd, places: Places, zero: Zero, site: tuple[int, int]) -
     g, row = site
     some = some_rows(crowd.lifted, slice(row, row + 1))
     own, others = places.own[g], places.others[g]
-    space = hear_themselves(some, crowd.schedule, own[None], others[None])
-    values, vectors = np.linalg.eig(space.m[0])
+    m, _, s, _ = hear_roughly(some, crowd.schedule, own[None], others[None])
+    values, vectors = np.linalg.eig(m[0])
     z = vectors[:, int(np.argmin(np.abs(values - zero.value)))]
-    found, covectors = np.linalg.eig(space.m[0].T)
+    found, covectors = np.linalg.eig(m[0].T)
     w = covectors[:, int(np.argmin(np.abs(found - zero.value)))]
     now, before, _ = lines_of(crowd.schedule)
     n_z = some.p.shape[-1]
-    received = own * (now @ (space.s[0] @ z) + before @ z[n_z:])
+    received = own * (now @ (s[0] @ z) + before @ z[n_z:])
     waiting = zip(crowd.schedule.sent_names, crowd.schedule.depths, strict=True)
     names = [*some.z_names, *(name for name, depth in waiting for _ in range(depth))]
     shares: dict[str, float] = {}
@@ -279,18 +311,23 @@ class _Motion:
 
 
 def _move(
-    blocks: tuple[Floats, Floats, Floats, Floats], value: complex, heard: Complexes, weight: Complexes
+    blocks: tuple[Floats, Floats, Floats, Floats],
+    value: complex,
+    heard: Complexes | Floats,
+    weight: Complexes | Floats,
+    push: Floats | float = 0.0,
 ) -> _Motion:
     """Return how sites move at ζ, hearing r (k, n_r) from outside, with what they send weighed by χ (n_s,).
 
-    (ζ − M) z = B r and w (ζ − M) = χ S; w B + χ D weighs r.
+    (ζ − M) z = B r + v and w (ζ − M) = χ S + v, pushed by v (k, n); w B + χ D weighs r.
     """
     m, b, s, d = blocks
     shifted = value * np.eye(m.shape[-1]) - m
-    z: Complexes = np.linalg.solve(shifted, b @ heard[..., None])[..., 0].astype(np.complex128)
-    covector = (weight @ s)[..., None]
+    driven = (b @ heard[..., None])[..., 0] + push
+    z: Complexes = np.linalg.solve(shifted, driven[..., None])[..., 0].astype(np.complex128)
+    covector = (weight @ s + push)[..., None]
     w: Complexes = np.linalg.solve(shifted.swapaxes(1, 2), covector)[..., 0].astype(np.complex128)
-    return _Motion(z, w, heard, (w[:, None, :] @ b)[:, 0] + weight @ d)
+    return _Motion(z, w, heard.astype(np.complex128), (w[:, None, :] @ b)[:, 0] + weight @ d)
 
 
 def _move_crowd(
@@ -302,9 +339,9 @@ def _move_crowd(
     for start in range(0, len(crowd.parameters), CHUNK):
         some = some_rows(crowd.lifted, slice(start, start + CHUNK))
         k = len(some.p)
-        space = hear_themselves(some, crowd.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
-        moved = _move((space.m, space.b, space.s, space.d), value, np.tile(heard, (k, 1)), weight)
-        sent = (space.s @ moved.z[..., None] + space.d @ moved.r[..., None])[..., 0]
+        blocks = hear_roughly(some, crowd.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
+        moved = _move(blocks, value, np.tile(heard, (k, 1)), weight)
+        sent = (blocks[2] @ moved.z[..., None] + blocks[3] @ moved.r[..., None])[..., 0]
         packets = moved.z[:, some.p.shape[-1] :]
         received = others * heard + own * (sent @ now.T + packets @ before.T)
         parts.append(replace(moved, r=received))

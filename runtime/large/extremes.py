@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.eigen.pseudospectrum import balance
 from apc.runtime.eigen.rigid import relative_coordinates
 from apc.runtime.frame.discretize import UNIT

@@ -1,7 +1,7 @@
 """The largest eigenvalues of a sparse frame map, and a count of those that are larger.
 
 Takes: crowds of different peers on any graphs, and the exchange between them.
-Gives: `solve_sparse`.
+Gives: `solve_sparse`; `Argument`, `argument_of`, `count_beyond`.
 Guarantees: rigid motions are taken out by their exact directions before any eigenvalue is computed. Errors
 are estimates to first order, from residuals and the errors of the matrix, and so is the radius they bound;
 that nothing lies beyond it is counted by the argument principle on samples of the determinant. The notes say
@@ -20,7 +20,7 @@ goes to 1 as ζ goes to infinity, and its argument moves far less than that of t
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,18 +30,29 @@ from numpy.typing import NDArray
 from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation, turned_along
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
-from apc.runtime.large.crowds import Crowd, hear_themselves, lift_one, some_rows
-from apc.runtime.large.sparse_system import RelativeMatrix, SparseSystem, relative_matrix, sparse_system
+from apc.runtime.large.crowds import Crowd, hear_roughly, lift_one, some_rows
+from apc.runtime.large.relative import (
+    RelativeMatrix,
+    RigidSpace,
+    nothing_rigid,
+    relative_matrix,
+    rigid_space,
+)
+from apc.runtime.large.sparse_system import SparseSystem, small_matrix, sparse_system
+from apc.runtime.large.translation import free_motions, may_drift
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+
+# The argument of a function of ζ.
+Argument = Callable[[complex], float]
 
 # Peers whose copies tell where to look, no more than so many, and by which share of what they hear these
 # move: from all alike to each opposite to its neighbours.
 SAMPLES, SHARES = 2000, (1.0, 0.5, 0.0, -0.5, -1.0)
 
-# Shifts tried, how far apart, and a little off, as a shift must not be an eigenvalue.
-SHIFTS, APART, ASIDE = 6, 0.02, 1.0 + 3e-5
+# Shifts tried, how far apart, and a little off, as a shift must not be an eigenvalue; the least of them.
+SHIFTS, APART, ASIDE, LEAST = 6, 0.02, 1.0 + 3e-5, 1e-6
 
 # Eigenvalues sought near each shift; if a count says that some were missed, more, and a little farther out.
 NEAREST, FURTHER = (6, 24, 60), 1.002
@@ -58,9 +69,15 @@ STEPS, NEAR = 3, 1e-11
 # The circle of the count is so many errors outside of the largest eigenvalue, and at least this far.
 OUTSIDE, FARTHEST = 20.0, 1e-9
 
+# An eigenvalue this near to 1 may belong to a drift, which rounding splits by the root of its errors.
+DRIFTING = 1e-6
+
 # Arcs of the half circle to begin with; eigenvalues this near to the circle, relatively, are not divided by,
 # but looked at, so many of them.
 ARCS, NEAR_CIRCLE, LOOKED_AT = 16, 0.02, 9
+
+# A peer's own eigenvalue this near to one of all, relatively, is divided by whatever it is near to.
+SAME = 1e-9
 
 # The argument's rate of change is measured over this angle; an arc is settled when two rules for its integral
 # differ by less than that (radians); no arc is narrower, and after so many factorizations it is given up.
@@ -77,7 +94,7 @@ class _Pair:
     error: float
 
 
-def solve_sparse(listed: Sequence[Crowd], exchange: Exchange, motions: Sequence[Floats] | None) -> Spectrum:
+def solve_sparse(listed: Sequence[Crowd], exchange: Exchange) -> Spectrum:
     """Compute the largest eigenvalues of different peers on any graphs.
 
     Parameters
@@ -86,12 +103,14 @@ def solve_sparse(listed: Sequence[Crowd], exchange: Exchange, motions: Sequence[
         All peers, one crowd a group of the scene.
     exchange
         The links.
-    motions
-        What nothing holds back of all peers together, see `translation.common_translation`.
     """
     system = sparse_system(listed, exchange)
-    rigid = _rigid_directions(system, exchange, motions)
+    motions = free_motions(listed, exchange)
+    rigid = rigid_space(system, exchange, motions) if motions else None
+    told = rigid is not None
+    rigid = rigid or nothing_rigid(system)
     whole = relative_matrix(system, rigid)
+    argument, alone = argument_of(system, listed), _alone(listed)
     pairs: list[_Pair] = []
     shifts = _shifts(system, listed)
     for nearest in NEAREST:
@@ -100,16 +119,15 @@ def solve_sparse(listed: Sequence[Crowd], exchange: Exchange, motions: Sequence[
         beyond = radius + max(OUTSIDE * off, FARTHEST)
         if beyond >= 1 > radius + off:
             beyond = (1 + radius) / 2
-        # The rigid motions left in: without them, a column for each is full.
-        known = np.array([pair.value for pair in pairs] + [1.0] * rigid.shape[1])
-        count = count_beyond(system.matrix, _alone(listed), known, beyond)
-        count -= rigid.shape[1] if beyond < 1 and count >= 0 else 0
+        # The rigid motions left in: that is what is counted.
+        known = np.array([pair.value for pair in pairs] + [1.0] * len(rigid.held))
+        count = count_beyond(argument, alone, known, beyond)
+        count -= len(rigid.held) if beyond < 1 and count >= 0 else 0
         if count <= 0:
             break
         shifts = [pair.value * FURTHER for pair in pairs[:2]] + shifts[:2]
     inside = False if radius - off > 1 else True if count == 0 and beyond < 1 else None
     radius_error = max(beyond - radius, off) if count == 0 else max(1.0, radius)
-    verdict, stable = judge([inside], rigid.shape[1], 0)
     notes = ["the largest modes only, by Arnoldi's method; their errors are estimates, not bounds"]
     notes.append(
         "that no eigenvalue is larger was counted by the argument principle on samples"
@@ -118,24 +136,13 @@ def solve_sparse(listed: Sequence[Crowd], exchange: Exchange, motions: Sequence[
         if count < 0
         else f"{count} larger eigenvalues were counted but not found"
     )
-    modes = tuple(_mode(system, listed, rigid, whole.places, pair) for pair in pairs)
-    return Spectrum(modes, radius, radius_error, rigid.shape[1], 0, verdict, stable, "", tuple(notes))
-
-
-def _rigid_directions(system: SparseSystem, exchange: Exchange, motions: Sequence[Floats] | None) -> Floats:
-    """Return V (n, d): the common motions, of each part of the graph that hears nothing of the others."""
-    import scipy.sparse
-
-    n = len(system.starts) - 1
-    if motions is None or not motions[0].shape[1]:
-        return np.zeros((int(system.starts[-1]), 0))
-    pairs = np.concatenate([exchange.arcs(link)[0] for link in exchange.links])
-    graph = scipy.sparse.csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    parts, part_of = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    whole = np.concatenate([motions[g] for g in system.crowd_of])
-    peer_of = np.repeat(np.arange(n), np.diff(system.starts))
-    member = part_of[peer_of][:, None] == np.arange(parts)
-    return np.concatenate([member * whole[:, [d]] for d in range(whole.shape[1])], axis=1)
+    at_one = min(abs(pair.value - 1) for pair in pairs) < DRIFTING
+    if inside is None and (not told or (at_one and may_drift(listed, exchange))):
+        radius_error = max(radius_error, radius)
+        notes.append("a motion that stands still or drifts is among these: the radius without it may be less")
+    verdict, stable = judge([inside], len(rigid.held), 0)
+    modes = tuple(_mode(system, listed, rigid, pair) for pair in pairs)
+    return Spectrum(modes, radius, radius_error, len(rigid.held), 0, verdict, stable, "", tuple(notes))
 
 
 def _shifts(system: SparseSystem, listed: Sequence[Crowd]) -> list[complex]:
@@ -151,7 +158,7 @@ def _shifts(system: SparseSystem, listed: Sequence[Crowd]) -> list[complex]:
         most = heard[starts[peers][:, None] + np.arange(len(crowd.schedule.heard))].max(axis=0)
         for share in SHARES:
             own = np.tile(share * most, (len(few), 1))
-            found.append(np.linalg.eigvals(hear_themselves(some, crowd.schedule, own, 0 * own).m).ravel())
+            found.append(np.linalg.eigvals(hear_roughly(some, crowd.schedule, own, 0 * own)[0]).ravel())
     values = np.concatenate(found).astype(np.complex128)
     values = values[(values.imag >= 0)]
     values = values[np.argsort(-np.abs(values), kind="stable")]
@@ -161,7 +168,7 @@ def _shifts(system: SparseSystem, listed: Sequence[Crowd]) -> list[complex]:
             kept.append(value)
         if len(kept) == SHIFTS:
             break
-    return [value * ASIDE for value in kept]
+    return [value * ASIDE if abs(value) > LEAST else LEAST for value in kept]
 
 
 def _largest(
@@ -210,7 +217,7 @@ def _solved(factors: Any, right: Complexes, trans: str = "N") -> Complexes:
 
 def _paired(whole: RelativeMatrix, value: complex, right: Complexes) -> _Pair:
     """Refine an eigenvalue with its left vector: Rayleigh's quotient is right to the vectors' square."""
-    factors = whole.factor(value * (1 + NEAR))
+    factors = whole.factor(value + NEAR * max(abs(value), LEAST))
     left = right.conj()
     for _ in range(STEPS):
         left = _solved(factors, left, "T")
@@ -234,13 +241,13 @@ def _alone(listed: Sequence[Crowd]) -> tuple[Complexes, Floats]:
     return np.concatenate(values), np.concatenate(counts)
 
 
-def count_beyond(matrix: Any, alone: tuple[Complexes, Floats], known: Complexes, radius: float) -> int:
+def count_beyond(argument: Argument, alone: tuple[Complexes, Floats], known: Complexes, radius: float) -> int:
     """Return how many eigenvalues are larger than a radius, −1 if it can't be told.
 
     Parameters
     ----------
-    matrix
-        R.
+    argument
+        That of det(I − R/ζ), see `argument_of`.
     alone
         The eigenvalues of the peers by themselves and how often each is there.
     known
@@ -255,18 +262,21 @@ def count_beyond(matrix: Any, alone: tuple[Complexes, Floats], known: Complexes,
     upper half; the change along an arc is known up to whole turns from its ends, and its rate tells the
     turns: Simpson's rule, as far as the trapezoidal rule on half the arc agrees.
     """
-    complex_matrix = matrix.astype(np.complex128)
     values, counts = alone
-    near = np.abs(np.abs(values) - radius) <= NEAR_CIRCLE * radius
     pairs = np.concatenate([known, known[known.imag != 0].conj()])
+    near = np.abs(np.abs(values) - radius) <= NEAR_CIRCLE * radius
+    # Of many equal peers that all hear one other, most move by themselves: their eigenvalues go, too.
+    for value in pairs[np.abs(np.abs(pairs) - radius) <= NEAR_CIRCLE * radius].tolist():
+        near &= np.abs(values - value) > SAME * radius
     divided = np.concatenate([values[~near], pairs]), np.concatenate([counts[~near], np.ones(len(pairs))])
     samples: dict[float, tuple[float, float]] = {}
 
     def sample(angle: float) -> tuple[float, float]:
         if angle not in samples:
+            points = [radius * np.exp(1j * one) for one in (angle, angle + ANGLE)]
             here, there = (
-                _argument(complex_matrix, divided, radius * np.exp(1j * one))
-                for one in (angle, angle + ANGLE)
+                _wrapped(argument(point) - float(divided[1] @ np.angle(1 - divided[0] / point)))
+                for point in points
             )
             samples[angle] = here, _wrapped(there - here) / ANGLE
         return samples[angle]
@@ -299,17 +309,23 @@ def count_beyond(matrix: Any, alone: tuple[Complexes, Floats], known: Complexes,
     return round(outside - turns) if abs(turns - round(turns)) < 0.1 else -1
 
 
-def _argument(matrix: Any, divided: tuple[Complexes, Floats], point: complex) -> float:
-    """Return the argument of g at a point."""
-    import scipy.sparse
+def argument_of(system: SparseSystem, listed: Sequence[Crowd]) -> Argument:
+    """Return the argument of det(I − R/ζ), from a small matrix: see `sparse_system.small_matrix`."""
     import scipy.sparse.linalg
 
-    n = matrix.shape[0]
-    factors = scipy.sparse.linalg.splu((scipy.sparse.identity(n) - matrix / point).tocsc())
-    total = float(np.angle(factors.U.diagonal()).sum())
-    total += np.pi * (_odd(factors.perm_r) ^ _odd(factors.perm_c))
-    values, counts = divided
-    return _wrapped(total - float(counts @ np.angle(1 - values / point)))
+    small = small_matrix(system, listed)
+
+    def argument(point: complex) -> float:
+        factors = scipy.sparse.linalg.splu(small(point))
+        total = float(np.angle(factors.U.diagonal()).sum())
+        total += np.pi * (_odd(factors.perm_r) ^ _odd(factors.perm_c))
+        for crowd in listed:
+            p = crowd.lifted.p
+            sign, _ = np.linalg.slogdet(np.eye(p.shape[-1]) - p / point)
+            total += float(crowd.counts @ np.angle(sign))
+        return _wrapped(total)
+
+    return argument
 
 
 def _odd(permutation: NDArray[np.int32]) -> bool:
@@ -327,25 +343,19 @@ def _wrapped(angle: float) -> float:
     return float(np.pi - (np.pi - angle) % (2 * np.pi))
 
 
-def _mode(
-    system: SparseSystem, listed: Sequence[Crowd], rigid: Floats, rest: NDArray[np.int64], pair: _Pair
-) -> Mode:
-    """Describe an eigenvalue over the whole state; the shares of all peers of a crowd are added up."""
-    n = len(rigid)
-    held = np.setdiff1d(np.arange(n), rest)
+def _mode(system: SparseSystem, listed: Sequence[Crowd], rigid: RigidSpace, pair: _Pair) -> Mode:
+    """Describe an eigenvalue over the whole state; the shares of all peers of a crowd are added up.
+
+    M [x_p; x_r] = λ [x_p; x_r] with x_r = y + W x_p, and M_pp + M_pr W = 1: (λ − 1) x_p = M_pr y.
+    """
+    n = int(system.starts[-1])
     vector, covector = np.zeros(n, np.complex128), np.zeros(n, np.complex128)
-    vector[rest], covector[rest] = pair.right, pair.left
-    if len(held):
-        count = rigid.shape[1]
-        order = np.argmax(np.abs(rigid), axis=0)
-        weights = rigid[rest] / rigid[order, np.arange(count)]
-        matrix = system.matrix.tocsr()
-        corner = matrix[order][:, order].toarray() + matrix[order][:, rest] @ weights
-        driven = matrix[order][:, rest] @ pair.right
-        moved = np.linalg.lstsq(pair.value * np.eye(count) - corner, driven, rcond=None)[0]
-        vector[order] = moved
-        vector[rest] += weights @ moved
-        covector[order] = -(pair.left @ weights)
+    vector[rigid.rest], covector[rigid.rest] = pair.right, pair.left
+    if len(rigid.held) and pair.value != 1:
+        moved = system.matrix.tocsr()[rigid.held][:, rigid.rest] @ pair.right / (pair.value - 1)
+        vector[rigid.held] = moved
+        vector[rigid.rest] += rigid.relative @ moved
+        covector[rigid.held] = -(rigid.relative.T @ pair.left)
     own = np.abs(vector * covector)
     shares: dict[str, float] = {}
     for g, crowd in enumerate(listed):

@@ -1,7 +1,7 @@
 """All peers of a sparse graph as one sparse matrix, each peer with numbers of its own.
 
 Takes: crowds, and the exchange between them.
-Gives: `SparseSystem`, `sparse_system`; `RelativeMatrix`, `relative_matrix`.
+Gives: `SparseSystem`, `sparse_system`; `MatrixAt`, `small_matrix`.
 Guarantees: the matrix is that of `modes.dense`, in the same order of states, with a bound on its error entry
 by entry; its cost grows with peers and arcs.
 Does not: compute eigenvalues (see `krylov`).
@@ -9,7 +9,7 @@ Does not: compute eigenvalues (see `krylov`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -173,7 +173,7 @@ def _assemble(
 
 
 def _spread(
-    blocks: Sequence[Floats],
+    blocks: Sequence[Floats | Complexes],
     crowd_of: Integers,
     row_of: Integers,
     top: Integers,
@@ -243,52 +243,37 @@ def _packet_of(
     return scipy.sparse.csr_matrix((np.ones(len(lines)), (lines, columns)), shape=shape)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RelativeMatrix:
-    """A sparse matrix without its rigid motions: R = M_rr − W M_pr, over the places r of the state.
-
-    `bordered` is [M_rr −W; M_pr −1], which is far sparser to factor than R; `error` bounds that of R.
-    """
-
-    matrix: Any  # scipy.sparse, (n − d, n − d)
-    error: Any
-    bordered: Any  # (n, n)
-    places: Integers
-
-    def factor(self, shift: complex) -> Any:
-        """Return LU factors of [M_rr − shift, −W; M_pr, −1]: what solves with these solves with R − shift."""
-        import scipy.sparse
-        import scipy.sparse.linalg
-
-        own, whole = self.matrix.shape[0], self.bordered.shape[0]
-        diagonal = np.concatenate([np.full(own, shift), np.zeros(whole - own)])
-        return scipy.sparse.linalg.splu((self.bordered - scipy.sparse.diags(diagonal)).tocsc())
+# A matrix (rows of s, rows of s) at a point ζ.
+MatrixAt = Callable[[complex], Any]
 
 
-def relative_matrix(system: SparseSystem, rigid: Floats) -> RelativeMatrix:
-    """Take rigid motions out: x_r − W x_p moves by M_rr − W M_pr, with W = V_r V_p⁻¹.
+def small_matrix(system: SparseSystem, listed: Sequence[Crowd]) -> MatrixAt:
+    """Return ζ ↦ I − T(ζ) W(ζ), sparse, over what all peers send: see `characteristic`.
+
+    Its determinant is that of I − R/ζ over Π (1 − p/ζ), p the eigenvalues of the peers hearing nothing; it is
+    as many times smaller as a peer has states for each row that it sends.
 
     Parameters
     ----------
     system
         The whole.
-    rigid
-        V (n, d), of which no two move the same state.
+    listed
+        All peers.
     """
     import scipy.sparse
 
-    held = np.argmax(np.abs(rigid), axis=0) if rigid.shape[1] else np.zeros(0, np.int64)
-    rest = np.setdiff1d(np.arange(rigid.shape[0]), held)
-    matrix, error = system.matrix.tocsr(), system.error.tocsr()
-    weights = scipy.sparse.csr_matrix(rigid[rest] / rigid[held, np.arange(len(held))])
-    own, moved = matrix[rest][:, rest], matrix[held][:, rest]
-    reduced = own - weights @ moved
-    off = error[rest][:, rest] + abs(weights) @ (error[held][:, rest] + 8 * UNIT * abs(moved))
-    below = -scipy.sparse.identity(len(held))
-    bordered = scipy.sparse.bmat([[own, -weights], [moved, below]]) if len(held) else own
-    return RelativeMatrix(
-        reduced.tocsr(),
-        (off + 2 * UNIT * abs(reduced)).tocsr(),
-        bordered.tocsc().astype(np.complex128),
-        rest,
-    )
+    sent = np.array([len(one.schedule.sent) for one in listed])[system.crowd_of]
+    heard = np.array([len(one.schedule.heard) for one in listed])[system.crowd_of]
+    top, left = (np.concatenate([[0], np.cumsum(part)]) for part in (sent, heard))
+    shape = (int(top[-1]), int(left[-1]))
+
+    def at(point: complex) -> Any:
+        answers = []
+        for one in (crowd.lifted for crowd in listed):
+            shifted = point * np.eye(one.p.shape[-1]) - one.p
+            answers.append(one.d + one.s @ np.linalg.solve(shifted, one.q.astype(np.complex128)))
+        answer = _spread(answers, system.crowd_of, system.row_of, top[:-1], left[:-1], shape)
+        hearing = sum(weights * point**-lag for lag, weights in zip(system.lags, system.hearing, strict=True))
+        return (scipy.sparse.identity(shape[0]) - answer @ hearing).tocsc()
+
+    return at

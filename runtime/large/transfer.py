@@ -2,7 +2,7 @@
 
 Takes: the matrices of x⁺ = M x + B r, s = S x + D r of many sites, what these may be off by, and how often
 each site counts.
-Gives: `StateSpace`, `Transfer`, `build_transfer`; `respond`, `differentiate`.
+Gives: `StateSpace`, `Transfer`, `build_transfer`; `Response`, `respond`, `differentiate`.
 Guarantees: a response holds in a disc about each point, not only at it, within the bound it comes with:
 rounding, the errors of the matrices and the way across the disc included.
 Does not: answer nearer to zero than twice `Transfer.inner`.
@@ -136,7 +136,7 @@ def _gathered(
     for count in np.unique(large).tolist():
         for place in _chunks(np.flatnonzero(large == count)):
             own = _balanced(space, place, scale)
-            part = _split(own, values[place], vectors[place], count, inner)
+            part = _split(own, counts[place], values[place], vectors[place], count, inner)
             poles[:count, place] = values[place, :count].T
             residues[:count, place] = (counts[place, None, None] * part.residues).swapaxes(0, 1)
             kept = [*range(count), most]  # the block comes last
@@ -144,7 +144,7 @@ def _gathered(
             right[np.ix_(place, kept)], loop[np.ix_(place, kept)] = part.right, part.loop
             doubt[place], block[place] = part.doubt, part.block
             errors[place] = part.errors
-            series += np.einsum("i,pijsr->pjsr", counts[place], part.series)
+            series += part.series
     used = max(1, 1 + int(np.flatnonzero(series.any(axis=(0, 2, 3))).max(initial=0)))
     series = series[:, :used]
     return Transfer(
@@ -160,7 +160,7 @@ def _gathered(
         loop=loop,
         left=left,
         right=right,
-        together=(left.sum(axis=1)[:, :, None] * right.sum(axis=1)[:, None, :]).reshape(sites, -1),
+        together=(left.sum(axis=1)[:, :, None] * right.sum(axis=1)[:, None, :]).reshape(sites, n_s * n_r),
         loops=loop.sum(axis=1),
         series=series[0],
         series_sizes=series[1],
@@ -191,7 +191,10 @@ def _chunks(places: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
 
 @dataclass(frozen=True, slots=True)
 class _Parts:
-    """A chunk of sites of equally many poles; the fields as in `Transfer`, each site counted once."""
+    """A chunk of sites of equally many poles; the fields as in `Transfer`, each site counted once.
+
+    But for `series`, (3, 1 + SERIES, n_s, n_r): its terms, their sizes and their errors, of all sites together.
+    """
 
     residues: Complexes
     doubt: Floats
@@ -200,10 +203,12 @@ class _Parts:
     left: Floats
     right: Floats
     errors: Floats
-    series: Floats  # (3, k, 1 + SERIES, n_s, n_r)
+    series: Floats
 
 
-def _split(space: StateSpace, values: Complexes, vectors: Complexes, large: int, inner: float) -> _Parts:
+def _split(
+    space: StateSpace, counts: Floats, values: Complexes, vectors: Complexes, large: int, inner: float
+) -> _Parts:
     """Split sites that all have `large` poles beyond `inner`."""
     sites, n = values.shape
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
@@ -231,14 +236,14 @@ def _split(space: StateSpace, values: Complexes, vectors: Complexes, large: int,
     errors[:, :large] = _disc_radii(values[:, :large], u * w, inner)
     block = block_resolvent(small, 2 * inner)
     return _Parts(
-        residues=residues.reshape(sites, large, -1),
+        residues=residues.reshape(sites, large, a.shape[1] * b.shape[2]),
         doubt=doubt,
         block=block,
         loop=u * w,
         left=left.swapaxes(1, 2),
         right=right.swapaxes(1, 2),
         errors=errors,
-        series=_block_series(a, b, a_doubt, b_doubt, small, large, charge, block, 2 * inner),
+        series=_block_series(counts, (a, b, a_doubt, b_doubt), small, charge, block, 2 * inner),
     )
 
 
@@ -269,45 +274,65 @@ def _disc_radii(values: Complexes, loop: Floats, inner: float) -> Floats:
 
 
 def _block_series(
-    a: Complexes,
-    b: Complexes,
-    a_doubt: Floats,
-    b_doubt: Floats,
+    counts: Floats,
+    ends: tuple[Complexes, Complexes, Floats, Floats],
     small: Complexes,
-    large: int,
     charge: float,
     block: Floats,
     radius: float,
 ) -> Floats:
-    """Return the terms S X₂ T₂^j Y₂ B of ζ^(−j−1), their sizes, and what they may be off by.
+    """Return the terms S X₂ T₂^j Y₂ B of ζ^(−j−1) of all sites, their sizes, and what they may be off by.
 
     What is left of the series when it is cut, at |ζ| = radius, is charged to the constant term.
+
+    Parameters
+    ----------
+    counts
+        How often each site is there (k,).
+    ends
+        S X (k, n_s, n) and Y B (k, n, n_r), and what they may be off by.
+    small
+        T₂ (k, m, m), over the last m states.
+    charge
+        What a product is off by, relative to that of the sizes.
+    block, radius
+        The bound on ‖(ζ − T₂)⁻¹‖ (k,) from |ζ| = radius on.
     """
-    sites, n_s = a.shape[:2]
-    terms = np.zeros((3, sites, 1 + SERIES, n_s, b.shape[2]))
-    column, size, doubt = b[:, large:], np.abs(b[:, large:]), b_doubt[:, large:]
-    row, row_doubt, weight = a[:, :, large:], a_doubt[:, :, large:], np.abs(small)
-    row_size = np.abs(row)
-    first = np.linalg.norm(row_size, axis=2)[:, :, None] * np.linalg.norm(size, axis=1)[:, None, :]
+    large = ends[0].shape[2] - small.shape[2]
+    row, column, row_doubt, doubt = (
+        ends[0][:, :, large:],
+        ends[1][:, large:],
+        ends[2][:, :, large:],
+        ends[3][:, large:],
+    )
+    row_size, size, weight = np.abs(row), np.abs(column), np.abs(small)
+    terms = np.zeros((3, 1 + SERIES, row.shape[1], column.shape[2]))
+    height = np.linalg.norm(row_size, axis=2)[:, :, None]
+    first = height * np.linalg.norm(size, axis=1)[:, None, :]
     for term in range(SERIES):
-        left = np.linalg.norm(row_size, axis=2)[:, :, None] * np.linalg.norm(size, axis=1)[:, None, :]
-        left *= (block * radius**-term)[:, None, None]
+        left = height * np.linalg.norm(size, axis=1)[:, None, :] * (block * radius**-term)[:, None, None]
         if np.all(left <= CUT * UNIT * first):
-            terms[2, :, 0] += left
             break
         value = row @ column
-        terms[0, :, term + 1] = value.real
-        terms[1, :, term + 1] = np.abs(value)
-        terms[2, :, term + 1] = row_size @ doubt + row_doubt @ (size + doubt) + charge * (row_size @ size)
-        terms[2, :, term + 1] += np.abs(value.imag)
+        off = row_size @ doubt + row_doubt @ (size + doubt) + charge * (row_size @ size) + np.abs(value.imag)
+        for kind, part in enumerate((value.real, np.abs(value), off)):
+            terms[kind, term + 1] = np.tensordot(counts, part, 1)
         column, doubt = small @ column, weight @ (doubt + charge * size)
         size = np.abs(column)
-    else:
-        terms[2, :, 0] += left
+    terms[2, 0] += np.tensordot(counts, left, 1)
     return terms
 
 
-def respond(transfers: Sequence[Transfer], points: Complexes, reach: Floats) -> tuple[Complexes, Floats]:
+@dataclass(frozen=True, slots=True)
+class Response:
+    """T(ζ + h) = `value` + h · `slope`, but for what `doubt` bounds in the disc (z, n_s, n_r)."""
+
+    value: Complexes
+    slope: Complexes
+    doubt: Floats
+
+
+def respond(transfers: Sequence[Transfer], points: Complexes, reach: Floats) -> Response:
     """Add up what all sites answer at some points, and bound it in discs about them.
 
     Parameters
@@ -317,38 +342,44 @@ def respond(transfers: Sequence[Transfer], points: Complexes, reach: Floats) -> 
     points
         ζ (z,), the centres.
     reach
-        The discs' radii (z,).
+        The discs' radii ρ (z,).
 
-    Returns
-    -------
-    T (z, n_s, n_r) at the centres, and a bound on how far the true T is from it anywhere in the discs.
+    Notes
+    -----
+    1/(ζ + h − p) = q − h q² + h² q²/(ζ + h − p), q = 1/(ζ − p): the last is at most (ρ|q|)² |q|/(1 − ρ|q|).
     """
     shape = (len(points), *transfers[0].series.shape[1:])
-    value, doubt = np.zeros(shape, np.complex128), np.zeros(shape)
+    value, slope = np.zeros(shape, np.complex128), np.zeros(shape, np.complex128)
+    doubt = np.zeros(shape)
     # Each chunk's sum rounds once a pole, the sum of the chunks once a chunk.
     chunks = sum(1 + one.poles.shape[1] // CHUNK for one in transfers)
     most = max((len(one.poles) * min(CHUNK, one.poles.shape[1]) for one in transfers), default=0)
     rounding = (most + chunks + 16) * 2 * UNIT
     for one in transfers:
-        _add_series(one, points, reach, value, doubt)
+        _add_series(one, points, reach, value, slope, doubt)
         for chunk, places in _pieces(one, points):
             at, radius = points[places], reach[places, None, None]
-            residues = one.residues[:, chunk].reshape(-1, shape[1] * shape[2])
+            residues = one.residues[:, chunk].reshape(one.poles[:, chunk].size, shape[1] * shape[2])
             sizes = one.residue_sizes[:, chunk].reshape(residues.shape)
             inverse = 1.0 / (at[:, None, None] - one.poles[:, chunk])
             far, flat = np.abs(inverse), (len(at), -1)
             value[places] += (inverse.reshape(flat) @ residues).reshape(len(at), *shape[1:])
+            inverse *= inverse
+            slope[places] -= (inverse.reshape(flat) @ residues).reshape(len(at), *shape[1:])
             with np.errstate(divide="ignore", invalid="ignore"):
-                near = far / (1 - radius * far)  # 1/(|ζ − p| − reach)
-                moved = near * (radius * far + (one.residue_error[chunk] + rounding))
+                moved = radius * far
+                near = far / (1 - moved)  # 1/(|ζ − p| − ρ)
                 # Negative where a pole is in the disc: nothing is known there.
                 lost = near.min(axis=(1, 2), initial=0.0) < 0
+                moved *= moved
+                moved += 3 * (one.residue_error[chunk] + rounding)  # of the value, and twice of the slope
+                moved *= near
                 bound = (moved.reshape(flat) @ sizes).reshape(len(at), *shape[1:]) + _reaction(
                     one, chunk, near
                 )
             bound[lost] = np.nan
             doubt[places] += bound
-    return value, doubt
+    return Response(value, slope, doubt)
 
 
 def _reaction(one: Transfer, chunk: slice, near: Floats) -> Floats:
@@ -384,7 +415,7 @@ def differentiate(transfers: Sequence[Transfer], points: Complexes) -> tuple[Com
         for chunk, places in _pieces(one, points):
             at = points[places]
             inverse = (1.0 / (at[:, None, None] - one.poles[:, chunk])).reshape(len(at), -1)
-            residues = one.residues[:, chunk].reshape(-1, shape[1] * shape[2])
+            residues = one.residues[:, chunk].reshape(one.poles[:, chunk].size, shape[1] * shape[2])
             value[places] += (inverse @ residues).reshape(len(at), *shape[1:])
             slope[places] -= ((inverse * inverse) @ residues).reshape(len(at), *shape[1:])
     return value, slope
@@ -399,12 +430,18 @@ def _pieces(one: Transfer, points: Complexes) -> Iterator[tuple[slice, slice]]:
             yield slice(start, start + CHUNK), slice(place, place + most)
 
 
-def _add_series(one: Transfer, points: Complexes, reach: Floats, value: Complexes, doubt: Floats) -> None:
+def _add_series(
+    one: Transfer, points: Complexes, reach: Floats, value: Complexes, slope: Complexes, doubt: Floats
+) -> None:
     """Add D and what dies out at once, and their bounds."""
-    exponents = np.arange(len(one.series))
-    value += np.einsum("zj,jsr->zsr", points[:, None] ** -exponents, one.series)
+    terms = np.arange(len(one.series))
+    power = points[:, None] ** -terms
+    value += np.einsum("zj,jsr->zsr", power, one.series)
+    slope -= np.einsum("zj,jsr->zsr", power * terms / points[:, None], one.series)
     nearest = np.abs(points) - reach
     nearest = np.where(nearest >= 2 * one.inner, nearest, np.nan)  # too near to zero: nothing is known
-    sizes = nearest[:, None] ** -exponents
-    doubt += np.einsum("zj,jsr->zsr", sizes, one.series_errors + 64 * UNIT * one.series_sizes)
-    doubt += np.einsum("zj,jsr->zsr", sizes * exponents * (reach / nearest)[:, None], one.series_sizes)
+    sizes, share = nearest[:, None] ** -terms, (reach / nearest)[:, None]
+    rounded = sizes * (1 + terms * share)
+    doubt += np.einsum("zj,jsr->zsr", rounded, one.series_errors + 64 * UNIT * one.series_sizes)
+    # Taylor's remainder of ζ^−j.
+    doubt += np.einsum("zj,jsr->zsr", sizes * share**2 * (terms * (terms + 1) / 2), one.series_sizes)

@@ -1,7 +1,7 @@
 """How many motions nothing holds back, in a population of peers that all differ.
 
 Takes: crowds, and the exchange between them.
-Gives: `count_translations`, `common_translation`.
+Gives: `count_translations`; `FreeMotions`, `free_motions`.
 Guarantees: a motion counts if it is one in exact arithmetic for every peer, each with its own numbers.
 Does not: find a motion that only some peers of a crowd are free to make: a count of eigenvalues (see `zeros`)
 then finds one more at 1 than was said, and the verdict is left open.
@@ -14,14 +14,17 @@ every peer, modulo two primes.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.modes import Loop, complete_loops
-from apc.runtime.eigen.peers import PeerGroup, group_of_row, states_of, used_ways
+from apc.runtime.eigen.loop import Loop
+from apc.runtime.eigen.modes import complete_loops
+from apc.runtime.eigen.peer_group import PeerGroup, states_of, used_ways
+from apc.runtime.eigen.peers import group_of_row
 from apc.runtime.eigen.rigid import find_rigid_modes, stays_rigid
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.exchange import Exchange
@@ -65,8 +68,40 @@ def count_translations(listed: Sequence[Crowd], exchange: Exchange) -> int | Non
     return total
 
 
-def common_translation(listed: Sequence[Crowd], exchange: Exchange) -> list[Floats] | None:
-    """Return the motions of all peers together that nothing holds back, whatever the graph.
+@dataclass(frozen=True, slots=True)
+class FreeMotions:
+    """What nothing holds back, for each crowd over the state of one of its peers: z, then its packets.
+
+    `own` (n_g, d_g) are motions of a peer by itself, whoever hears it, and `pivots` for each crowd the places
+    where one of these is 1 and all others 0. `common` are motions of all peers of a connected part of the
+    graph together, crowd by crowd; they are 0 at the pivots.
+    """
+
+    own: tuple[Floats, ...]
+    pivots: tuple[tuple[int, ...], ...]
+    common: tuple[tuple[tuple[Fraction, ...], ...], ...]
+
+    def together(self, crowds: Sequence[int]) -> list[tuple[tuple[int, int], dict[int, Floats]]]:
+        """Return the independent common motions of peers of some crowds.
+
+        Each with its pivot, a crowd and a place, where it is 1 and all others 0, and its vector by crowd.
+        """
+        lengths = [len(self.own[g]) for g in crowds]
+        ends = np.cumsum([0, *lengths]).tolist()
+        basis = _echelon([list(itertools.chain.from_iterable(one[g] for g in crowds)) for one in self.common])
+        found = []
+        for place, vector in basis.items():
+            at = int(np.searchsorted(ends, place, side="right")) - 1
+            parts = {
+                g: np.array([float(entry) for entry in vector[a:b]])
+                for g, (a, b) in zip(crowds, itertools.pairwise(ends), strict=True)
+            }
+            found.append(((crowds[at], place - ends[at]), parts))
+        return found
+
+
+def free_motions(listed: Sequence[Crowd], exchange: Exchange) -> FreeMotions | None:
+    """Return the motions that nothing holds back on any graph; None if that can't be told.
 
     Parameters
     ----------
@@ -75,57 +110,141 @@ def common_translation(listed: Sequence[Crowd], exchange: Exchange) -> list[Floa
     exchange
         The links.
 
-    Returns
-    -------
-    For each crowd the motions (n_g, d) over the state of one of its peers, z and then its packets, as in
-    `crowds.hear_themselves`; None if it can't be told, or if peers are free to move one by one.
+    Notes
+    -----
+    Where all senders send the same, it does not matter which of them a peer hears: the common motions are
+    those of one peer of each crowd, each hearing all. Motions that stand still whatever the weights of what is
+    heard are those of single peers.
     """
+    loops = _standing_loops(listed, exchange)
+    if loops is None or not all(hold_for_all(loop, listed) for loop in loops):
+        return None
+    together, apart = loops
+    groups = together.sites
+    ends = np.cumsum([0, *(states_of(group.schedule, group.jacobians) for group in groups)]).tolist()
+    single = find_rigid_modes(apart, with_drifts=False).exact
+    own = [_echelon([vector[a:b] for vector in single]) for a, b in itertools.pairwise(ends)]
+    if sum(map(len, own)) != len(single):
+        return None
+    common = []
+    for vector in find_rigid_modes(together, with_drifts=False).exact:
+        left = list(vector)
+        for start, motions in zip(ends, own, strict=False):
+            for pivot, motion in motions.items():
+                _subtract(left, left[start + pivot], motion, start)
+        common.append(left)
+    rest = list(_echelon(common).values())
+    return FreeMotions(
+        tuple(
+            _columns(list(motions.values()), b - a)
+            for motions, (a, b) in zip(own, itertools.pairwise(ends), strict=True)
+        ),
+        tuple(tuple(motions) for motions in own),
+        tuple(tuple(tuple(vector[a:b]) for a, b in itertools.pairwise(ends)) for vector in rest),
+    )
+
+
+def may_drift(listed: Sequence[Crowd], exchange: Exchange) -> bool:
+    """Say whether nothing brakes some motion of the first peers, alone or together; True if it can't be told.
+
+    Parameters
+    ----------
+    listed
+        All peers.
+    exchange
+        The links.
+    """
+    loops = _standing_loops(listed, exchange)
+    return loops is None or any(find_rigid_modes(loop).drifts for loop in loops)
+
+
+def _standing_loops(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Loop, Loop] | None:
+    """Return the first peers of all crowds hearing as if all moved alike, and hearing anyhow."""
     groups = representatives(listed, exchange)
-    total = _sums(listed, exchange)
-    if total is None:
+    totals = _totals(listed, exchange)
+    if totals is None:
         return None
     ways = used_ways(group.schedule for group in groups)
-    coupling = {
-        way: tuple(
-            tuple(
-                _share(groups, way, exchange, g, h) * (1 if way.operator == "mean" else total[way.link])
-                for h in range(len(groups))
-            )
-            for g in range(len(groups))
-        )
-        for way in ways
-    }
-    loop = Loop("common", 1, tuple(groups), coupling)
-    free = find_rigid_modes(loop, with_drifts=False)
-    deaf = Loop(
-        "deaf", 1, tuple(groups), {way: ((Fraction(0),) * len(groups),) * len(groups) for way in ways}
+    alike = {way: _alike(groups, exchange, way, totals) for way in ways}
+    anyhow = {way: _anyhow(groups, exchange, way, totals) for way in ways}
+    return Loop("common", 1, tuple(groups), alike), Loop("own", 1, tuple(groups), anyhow)
+
+
+# What each crowd's peers hear in all over each link: the weights of their senders.
+Totals = Sequence[Mapping[str, Fraction]]
+
+
+def _alike(
+    groups: Sequence[PeerGroup], exchange: Exchange, way: Way, totals: Totals
+) -> tuple[tuple[Fraction, ...], ...]:
+    """Return what each crowd hears of each on a way, as if it heard as much of every crowd that it hears."""
+    sending = [one.sends(way.link) for one in groups]
+    rows = []
+    for g, group in enumerate(groups):
+        total = Fraction(1) if way.operator == "mean" else totals[g].get(way.link, Fraction(0))
+        heard = exchange.hears(way.link, g, sending)
+        late = [exchange.delay(way.link, one.role, group.role) == way.delay for one in groups]
+        shares = (total / len(heard) if h in heard and late[h] else Fraction(0) for h in range(len(groups)))
+        rows.append(tuple(shares))
+    return tuple(rows)
+
+
+def _anyhow(
+    groups: Sequence[PeerGroup], exchange: Exchange, way: Way, totals: Totals
+) -> tuple[tuple[Fraction, ...], ...]:
+    """Return weights that nothing about the scene explains, so that only what moves nobody else stands."""
+    alike = _alike(groups, exchange, way, totals)
+    n = len(groups)
+    return tuple(
+        tuple(Fraction(-1, 3 + g * n + h) if weight else weight for h, weight in enumerate(row))
+        for g, row in enumerate(alike)
     )
-    if find_rigid_modes(deaf, with_drifts=False).names or not hold_for_all(loop, listed):
-        return None
-    ends = np.cumsum([0, *(states_of(group.schedule, group.jacobians) for group in groups)])
-    return [free.directions[a:b] for a, b in itertools.pairwise(ends)]
 
 
-def _share(groups: Sequence[PeerGroup], way: Way, exchange: Exchange, g: int, h: int) -> Fraction:
-    """Return crowd h's share of what crowd g hears on a way, if all senders move alike."""
-    on_the_way = [
-        one.sends(way.link) and exchange.delay(way.link, one.role, groups[g].role) == way.delay
-        for one in groups
-    ]
-    return Fraction(1, sum(on_the_way)) if on_the_way[h] else Fraction(0)
-
-
-def _sums(listed: Sequence[Crowd], exchange: Exchange) -> dict[str, Fraction] | None:
-    """Return the sum of the weights that every peer hears over each link of a sum; None when they differ."""
-    found = {}
-    for way in used_ways(crowd.schedule for crowd in listed):
-        if way.operator == "sum" and way.link not in found:
-            pairs, weights = exchange.arcs(way.link)
-            sums = np.bincount(pairs[:, 1], weights, minlength=exchange.peers)
-            if np.any(sums != sums[0]) or len(listed) > 1:
+def _totals(listed: Sequence[Crowd], exchange: Exchange) -> list[dict[str, Fraction]] | None:
+    """Return what all peers of each crowd hear over each link of a sum; None when they differ."""
+    found: list[dict[str, Fraction]] = [{} for _ in listed]
+    for link in {way.link for way in used_ways(one.schedule for one in listed) if way.operator == "sum"}:
+        pairs, weights = exchange.arcs(link)
+        sends = np.repeat([crowd.sends(link) for crowd in listed], [len(crowd.rows) for crowd in listed])
+        heard = sends[pairs[:, 0]]
+        sums = np.bincount(pairs[heard, 1], weights[heard], minlength=exchange.peers)
+        for crowd, totals in zip(listed, found, strict=True):
+            start = int(exchange.starts[crowd.group])
+            own = sums[start : start + len(crowd.rows)]
+            if np.any(own != own[0]):
                 return None
-            found[way.link] = Fraction(float(sums[0]))
+            totals[link] = Fraction(float(own[0]))
     return found
+
+
+def _echelon(vectors: Sequence[Sequence[Fraction]]) -> dict[int, list[Fraction]]:
+    """Return a basis of what vectors span, each by its pivot: the place where it is 1 and all others 0."""
+    basis: dict[int, list[Fraction]] = {}
+    for vector in vectors:
+        left = list(vector)
+        for pivot, other in basis.items():
+            _subtract(left, left[pivot], other, 0)
+        place = max(range(len(left)), key=lambda k: abs(left[k]), default=None)
+        if place is None or not left[place]:
+            continue
+        left = [entry / left[place] for entry in left]
+        for other in basis.values():
+            _subtract(other, other[place], left, 0)
+        basis[place] = left
+    return basis
+
+
+def _subtract(vector: list[Fraction], times: Fraction, other: Sequence[Fraction], start: int) -> None:
+    """Take so many times another vector from a part of a vector, in place."""
+    if times:
+        for place, entry in enumerate(other):
+            vector[start + place] -= times * entry
+
+
+def _columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
+    """Return exact vectors as the columns of a matrix (n, len(vectors))."""
+    return np.array([[float(entry) for entry in one] for one in vectors], np.float64).reshape(-1, n).T
 
 
 def hold_for_all(loop: Loop, listed: Sequence[Crowd]) -> bool:
@@ -141,7 +260,7 @@ def hold_for_all(loop: Loop, listed: Sequence[Crowd]) -> bool:
     try:
         for prime in PRIMES:
             for place, crowd in enumerate(listed):
-                sites = [group.exact() for group in loop.sites]
+                sites = [group.exact for group in loop.sites]
                 sites[place] = _all_peers(crowd, prime)
                 if not stays_rigid(loop, sites):
                     return False

@@ -6,6 +6,9 @@ Guarantees: `low` and `high` bound the spectral radius, rigid modes left out: wi
 largest zero there is one, and beyond a circle just outside of it there is none, both counted by the argument
 principle. Where a count can't be had, the bounds are wide instead.
 Does not: find every zero.
+
+A pole of a site may be an eigenvalue of the whole, as when nobody hears the site: then f has a pole of lesser
+order there, or none, and Newton's method finds nothing. A count around the pole tells.
 """
 
 from __future__ import annotations
@@ -17,8 +20,14 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.large.characteristic import Characteristic, characteristic_ball, count_around, refine
-from apc.runtime.large.counting import FIRST_ARCS, MOST_POINTS
+from apc.runtime.large.characteristic import (
+    FARTHEST,
+    Characteristic,
+    characteristic_ball,
+    count_around,
+    refine,
+)
+from apc.runtime.large.counting import FIRST_ARCS
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -39,6 +48,9 @@ CLEAR = 6.0
 # How far aside of a zero, relatively, its slope is looked at, and how much nearer the next time.
 ASIDE, NEARER = 1e-7, 30.0
 
+# The least circle that is counted, for the discs along it to lie where f can be evaluated.
+INMOST = 1.1
+
 # Arcs about a zero to begin with, and evaluations after which the circle is too small to tell.
 SMALL_ARCS, SMALL_POINTS = 12, 300
 
@@ -56,6 +68,10 @@ RING = 48
 
 # How often zeros that a count has missed are looked for.
 SEARCHES = 4
+
+# Circles between which the largest eigenvalue must be are drawn together until they are this close,
+# relatively, at the cost of no more counts than these; a circle that can't be counted is tried so far aside.
+BRACKETED, MOST_COUNTS, BESIDE = 1e-3, 40, 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +91,13 @@ class Zero:
 class Zeros:
     """Bounds on the spectral radius, and the largest eigenvalues found, the largest first.
 
-    `counted` says that a count proves that nothing lies beyond `high`; `rigid_counted`, that one proves that
+    `radius` is the best estimate, of an eigenvalue that may be too close to others to be listed. `counted` says that a count proves that nothing lies beyond `high`; `rigid_counted`, that one proves that
     there are as many eigenvalues at 1 as was said.
     """
 
     low: float
     high: float
+    radius: float
     found: tuple[Zero, ...]
     counted: bool
     rigid_counted: bool
@@ -109,34 +126,42 @@ def find_zeros(
     near
         How many of the largest poles, of each structure, zeros are looked for close to.
     """
+    if not max(float(one.eigenvalue_errors.max(initial=0.0)) for one in function.transfers) < FARTHEST:
+        return Zeros(0.0, float(np.inf), 0.0, (), False, not rigid)
     rigid_radius = _rigid_radius(function, rigid)
     exact = [one for one in _held_poles(function) if abs(one.value - 1) > rigid_radius]
     poles = near_poles(function, TAKEN_OUT)
     close = near_poles(function, near) * (1 + 1e-7)
     zeros = _distinct(refine(function, np.concatenate([starts, close]), poles=poles), rigid_radius)
-    if not len(zeros) and not exact:
-        zeros = _search(function, float(np.abs(poles).max(initial=1.0)), zeros, poles, rigid_radius)
     rigid_radius = _widened(function, zeros, rigid, rigid_radius)
     zeros = _distinct(zeros, rigid_radius)
     error_of = cache(partial(_zero_error, function))
-    largest, high, beyond = 0.0, 0.0, -1
-    for _ in range(SEARCHES):
+    low, high, beyond = 0.0, 0.0, -1
+    for search in range(SEARCHES):
         largest, error = _largest(zeros, exact, error_of)
         high, beyond = _outside(function, largest, error, rigid, rigid_radius)
-        if beyond <= 0:
+        if not beyond:
             break
+        if beyond < 0 or search:  # from where it must be, if nothing was found from around what is known
+            low, high = _bracket(function, low, high, rigid, rigid_radius)
+            if not low > largest:
+                break
+        cancelled = _cancelled_poles(function, largest, zeros, exact, rigid_radius)
+        exact += cancelled
+        if cancelled:
+            continue
         more = _search(function, high, zeros, poles, rigid_radius)
-        grown = _distinct(np.concatenate([zeros, more]), rigid_radius)
-        if len(grown) == len(zeros):
-            break
-        zeros = grown
+        zeros = _distinct(np.concatenate([zeros, more]), rigid_radius)
     found = [Zero(zero, error_of(zero), 1) for zero in zeros[:listed].tolist()]
     known = [one for one in (*found, *exact) if np.isfinite(one.error)]
     every = sorted(known, key=lambda one: -abs(one.value))[:listed]
-    low = max([0.0, *(abs(one.value) - one.error for one in every)])
-    if beyond:
-        high = _enclosing(function, max(high, largest), rigid, rigid_radius)
-    return Zeros(low, high, tuple(every), not beyond, rigid_radius < WIDEST)
+    low = max([low, *(abs(one.value) - one.error for one in every)])
+    if beyond or not high - low <= WIDEST * high:
+        low, high = _bracket(function, low, high, rigid, rigid_radius)
+    radius, _ = _largest(zeros, exact, lambda zero: 0.0)
+    if not low <= radius <= high:
+        radius = (low + high) / 2 if np.isfinite(high) else low
+    return Zeros(low, high, radius, tuple(every), not beyond, rigid_radius < WIDEST)
 
 
 def _largest(
@@ -198,6 +223,30 @@ def _held_poles(function: Characteristic) -> list[Zero]:
     return found
 
 
+def _cancelled_poles(
+    function: Characteristic, beyond: float, zeros: Complexes, known: Sequence[Zero], rigid_radius: float
+) -> list[Zero]:
+    """Return the poles beyond a circle that are eigenvalues all the same, as a count around each tells.
+
+    Of each structure the largest few.
+    """
+    found: list[Zero] = []
+    taken = [*zeros.tolist(), *(one.value for one in known)]
+    for which, one in enumerate(function.transfers):
+        outside = (np.abs(one.poles) >= beyond * (1 - SAME)) & (one.poles.imag >= 0)
+        places, sites = np.nonzero(outside & (np.abs(one.poles) > 0) & (np.abs(one.poles - 1) > rigid_radius))
+        order = np.argsort(-np.abs(one.poles[places, sites]), kind="stable")[:MOST_HELD]
+        for place, site in zip(places[order].tolist(), sites[order].tolist(), strict=True):
+            pole = complex(one.poles[place, site])
+            if any(abs(pole - other) <= SAME * abs(pole) for other in taken):
+                continue
+            taken.append(pole)
+            error, many = _held_around(function, pole)
+            if np.isfinite(error) and not any(abs(pole - zero) <= 2 * error for zero in zeros.tolist()):
+                found.append(Zero(pole, error, many, (which, site)))
+    return found
+
+
 def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
     """Return zeros in the upper half plane, the largest first, each once and the rigid ones left out."""
     zeros = zeros[np.isfinite(zeros)]
@@ -214,24 +263,29 @@ def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
 
 
 def _zero_error(function: Characteristic, zero: complex) -> float:
-    """Return the radius of a circle about an estimate that has a zero in it, inf if none is shown.
+    """Return the radius of a circle about an estimate that has an eigenvalue in it, inf if none is shown."""
+    return _held_around(function, zero)[0]
 
-    Nearby, at ζ + h, |f| ≈ |f′| h is known to a share c of it: the zero is known to about c h.
+
+def _held_around(function: Characteristic, point: complex) -> tuple[float, int]:
+    """Return the radius of a circle about a point that has eigenvalues in it, and how many; or inf and 0.
+
+    Nearby a zero, at ζ + h, |f| ≈ |f′| h is known to a share c of it: the zero is known to about c h.
     """
-    aside = ASIDE * abs(zero)
+    aside = ASIDE * abs(point)
     for _ in range(SEARCHES):
-        ball = characteristic_ball(function, np.array([zero + aside]), np.zeros(1))
-        radius = max(CLEAR * float(ball.change[0]) * aside, FIRST_RADIUS * abs(zero))
+        ball = characteristic_ball(function, np.array([point + aside]), np.zeros(1))
+        radius = max(CLEAR * float(ball.change[0]) * aside, FIRST_RADIUS * abs(point))
         for _ in range(SEARCHES):
-            if not radius < WIDEST * abs(zero):
+            if not radius < WIDEST * abs(point):
                 break
-            inside = count_around(function, zero, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
-            poles = _poles_within(function, zero, radius)
+            inside = count_around(function, point, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
+            poles = _poles_within(function, point, radius)
             if inside is not None and poles is not None and inside + poles > 0:
-                return radius
+                return radius, inside + poles
             radius *= WIDER
         aside /= NEARER  # a pole or another zero may be that close
-    return float(np.inf)
+    return float(np.inf), 0
 
 
 def _poles_within(function: Characteristic, centre: complex, radius: float) -> int | None:
@@ -259,9 +313,7 @@ def _poles_beyond(function: Characteristic, radius: float) -> int | None:
 def _beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
     """Return how many eigenvalues lie beyond a circle about zero, the rigid ones left out, or None."""
     poles = _poles_beyond(function, radius)
-    turns = (
-        None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function), most=MOST_POINTS)
-    )
+    turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function))
     if poles is None or turns is None:
         return None
     return poles - turns - (rigid if radius < 1 else 0)
@@ -278,7 +330,7 @@ def _outside(
     """Return a circle just outside of the largest zero, and how many eigenvalues are beyond, or −1."""
     width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
     for _ in range(TRIES):
-        radius = max(largest + width, function.innermost * (1 + 1e-9))
+        radius = max(largest + width, function.innermost * INMOST)
         if (
             rigid and abs(radius - 1) <= rigid_radius
         ):  # between the largest zero and the rigid ones, or beyond
@@ -290,15 +342,52 @@ def _outside(
     return largest + width, -1
 
 
-def _enclosing(function: Characteristic, radius: float, rigid: int, rigid_radius: float) -> float:
-    """Return the radius of some circle beyond which there is no eigenvalue, inf if none is found."""
-    width = max(radius * 1e-6, 1e-9)
-    while radius < 1e3:
-        radius += width
-        if not (rigid and abs(radius - 1) <= rigid_radius) and _beyond(function, radius, rigid) == 0:
-            return radius
-        width *= WIDER
-    return float(np.inf)
+def _bracket(
+    function: Characteristic, low: float, high: float, rigid: int, rigid_radius: float
+) -> tuple[float, float]:
+    """Return radii beyond the first of which there is an eigenvalue, and beyond the second none.
+
+    Parameters
+    ----------
+    function
+        f.
+    low
+        A radius that the largest eigenvalue is known to have at least.
+    high
+        Where to begin.
+    rigid, rigid_radius
+        How many eigenvalues are 1, and the circle about 1 that has no others.
+    """
+    inmost = function.innermost * INMOST
+    outer, radius, step = float(np.inf), max(high, low, inmost), 1e-6
+    for _ in range(MOST_COUNTS):
+        radius, beyond = _beyond_near(function, radius, rigid, rigid_radius)
+        if beyond == 0:
+            outer = min(outer, radius)
+        elif beyond > 0:
+            low = max(low, radius)
+        elif np.isfinite(outer):
+            break  # what can't be counted here is left between the two
+        if np.isfinite(outer):
+            if outer <= max(low, inmost) * (1 + BRACKETED):
+                break
+            radius = max(float(np.sqrt(max(low, outer / 2) * outer)), inmost)
+        else:
+            radius, step = radius * (1 + step), step * WIDER
+    return low, outer
+
+
+def _beyond_near(
+    function: Characteristic, radius: float, rigid: int, rigid_radius: float
+) -> tuple[float, int]:
+    """Return a radius near to one, and how many eigenvalues are beyond it; −1 if that can't be told."""
+    for aside in (0.0, BESIDE, -BESIDE):
+        near = radius * (1 + aside)
+        if near > function.innermost and not (rigid and abs(near - 1) <= rigid_radius):
+            beyond = _beyond(function, near, rigid)
+            if beyond is not None and beyond >= 0:
+                return near, beyond
+    return radius, -1
 
 
 def _search(

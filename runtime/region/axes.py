@@ -1,19 +1,19 @@
 """The axes of a stable region: two parameters of a scene, and their ranges.
 
 Takes: a `CompiledSystem` and texts such as `contact.stiffness=10 N/m:3000 N/m`.
-Gives: `RegionAxis`, `parse_axes`; `PLACE`.
+Gives: `parse_axes`; `PLACE`.
 Guarantees: a parameter that can't be an axis is refused, and said why.
 Does not: analyse.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
-from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.analysis.ranges import Range
 from apc.runtime.frame.names import unit_of
 from apc.runtime.sweep.grid import parse_axis
 
@@ -22,29 +22,9 @@ PLACE = Place("region")
 _FORM = "contact.stiffness=10 N/m:3000 N/m"
 
 
-@dataclass(frozen=True, slots=True)
-class RegionAxis:
-    """A parameter (of one group, or of all: `group` None) and its range in SI."""
-
-    name: str
-    group: str | None
-    unit: str
-    low: Fraction
-    high: Fraction
-
-    @property
-    def label(self) -> str:
-        """The parameter's name, its group before it."""
-        return f"{self.group}.{self.name}" if self.group else self.name
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the axis as plain data, ready for JSON."""
-        return {"parameter": self.label, "unit": self.unit, "range": [float(self.low), float(self.high)]}
-
-
 def parse_axes(
     system: CompiledSystem, x: str | None, y: str | None, *, scale: Fraction = Fraction(1)
-) -> tuple[RegionAxis, RegionAxis]:
+) -> tuple[Range, Range]:
     """Read the two axes of a region: `PATH=LOW:HIGH` each, or the scene's own where one is left out.
 
     Parameters
@@ -83,7 +63,7 @@ def parse_axes(
             mistakes = [replace(one, place=Place(f"--{letter}")) for one in error.mistakes]
             raise ApcError(mistakes) from None
         _refuse_period(system, axis.name, axis.label)
-        found.append(RegionAxis(axis.name, axis.group, axis.unit, axis.values[0], axis.values[-1]))
+        found.append(Range(axis.name, axis.group, axis.unit, axis.values[0], axis.values[-1]))
     first, second = found
     if (first.name, first.group) == (second.name, second.group):
         raise ApcError(Mistake("E902", PLACE, f"{first.label} is on both axes; a region has two parameters"))

@@ -1,7 +1,7 @@
 """Smooth plane curves through points and tangents.
 
 Takes: points and unit tangents (k, 2) along a curve.
-Gives: `between`, `off_an_arc`, `stencils`, `through_four`, `fill`.
+Gives: `between`, `refined`, `area_beside`, `off_an_arc`, `stencils`, `through_four`, `fill`.
 Guarantees: `between` is the one interpolant that results are given by; `through_four` is a much better one,
 which tells between which of its points `between` needs more, and gives them.
 Does not: know what the curves bound.
@@ -70,6 +70,23 @@ def area_beside(points: Floats, tangents: Floats) -> float:
         rate += length * ((1 - s) * (1 - 3 * s) * tangent_a + s * (3 * s - 2) * tangent_b)[:, 1]
         total += weight * float(x @ rate)
     return total
+
+
+def refined(points: Floats, tangents: Floats, pieces: int) -> tuple[Floats, Floats]:
+    """Return points and unit tangents along the cubics of a curve (k, 2), each cut into so many pieces."""
+    a, b, tangent_a, tangent_b = points[:-1], points[1:], tangents[:-1], tangents[1:]
+    length = _slope_length(a, b, tangent_a, tangent_b)[:, None]
+    found, ways = [], []
+    for piece in range(pieces):
+        s = piece / pieces
+        found.append(between(a, b, tangent_a, tangent_b, s))
+        ways.append(
+            6 * s * (1 - s) * (b - a)
+            + length * ((1 - s) * (1 - 3 * s) * tangent_a + s * (3 * s - 2) * tangent_b)
+        )
+    every = np.concatenate([np.stack(found, axis=1).reshape(-1, 2), points[-1:]])
+    along = np.concatenate([np.stack(ways, axis=1).reshape(-1, 2), tangents[-1:]])
+    return every, along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 def off_an_arc(tangent_a: Floats, tangent_b: Floats, length: Floats) -> Floats:

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.region.axes import RegionAxis
+from apc.runtime.analysis.ranges import Range
+from apc.runtime.optional import need
 from apc.runtime.region.curves import between
 from apc.runtime.region.panels import Panel, Panels, panel_letter
 from apc.runtime.region.region import Region, side_of_curves
-from apc.runtime.simulate.trajectory import need
 
 Floats = NDArray[np.float64]
 
@@ -116,7 +116,7 @@ def _panel(ax: Any, panel: Panel, normalized: bool) -> None:
         ax.plot(*points.T, color="0.35", linestyle=line, linewidth=1.1, label=f"{label}{where}")
 
 
-def _frame(ax: Any, x: RegionAxis, y: RegionAxis, gain: int = 1) -> None:
+def _frame(ax: Any, x: Range, y: Range, gain: int = 1) -> None:
     ax.set_xlim(float(x.low), float(x.high))
     ax.set_ylim(float(y.low) * gain, float(y.high) * gain)
     ax.set_xlabel(_label(x))
@@ -124,7 +124,7 @@ def _frame(ax: Any, x: RegionAxis, y: RegionAxis, gain: int = 1) -> None:
     ax.tick_params(direction="in", top=True, right=True)
 
 
-def _label(axis: RegionAxis) -> str:
+def _label(axis: Range) -> str:
     unit = axis.unit.replace("*", "·")
     return axis.label if unit == "1" else f"{axis.label} [{unit}]"
 

@@ -18,11 +18,11 @@ from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.store import write_atomically
+from apc.runtime.optional import need
 from apc.runtime.region.figure import draw_panels
 from apc.runtime.region.panels import Panels
 from apc.runtime.region.region import Region
 from apc.runtime.simulate.figures import FORMATS, write_figure
-from apc.runtime.simulate.trajectory import need
 from apc.runtime.sweep.quantities import Row
 from apc.runtime.sweep.table_file import SUFFIXES, check_table_path, write_table
 

@@ -18,14 +18,16 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.analysis.ranges import Range
 from apc.runtime.frame.exchange import build_exchange
 from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.linearize import linearize_rows, site_of_row
 from apc.runtime.frame.overrides import Override, apply, parse_override
 from apc.runtime.frame.parameters import resolve
-from apc.runtime.region.axes import PLACE, RegionAxis, parse_axes
+from apc.runtime.region.axes import PLACE, parse_axes
 from apc.runtime.region.overlay import Overlay, overlay_points, parse_overlay
 from apc.runtime.region.region import CELLS, Floats, Region, region
+from apc.runtime.vary.search import Told
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
 MOVE = Fraction(19, 13)
@@ -125,7 +127,7 @@ def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
 
 
 # A scene with a panel's settings, its axes, and what its y is multiplied by.
-_Work = tuple[CompiledSystem, tuple[RegionAxis, RegionAxis], int]
+_Work = tuple[CompiledSystem, tuple[Range, Range], int]
 
 
 def compare_regions(
@@ -137,6 +139,7 @@ def compare_regions(
     overlays: Sequence[str] = (),
     normalize: bool = False,
     cells: int = CELLS,
+    told: Told | None = None,
 ) -> Panels:
     """Find the regions of some scenes with some settings.
 
@@ -153,7 +156,7 @@ def compare_regions(
     normalize
         Whether y is the effective gain: a scene that sums over its others is given y divided by their number,
         so that its coupling is as strong as that of a scene that takes their mean.
-    cells
+    cells, told
         See `region.region`.
 
     Raises
@@ -176,7 +179,7 @@ def compare_regions(
         jobs.append((", ".join(settings), work, [parse_overlay(work[0][0], text) for text in overlays]))
     found = []
     for title, work, laid in jobs:
-        regions = tuple(region(system, axes, cells=cells) for system, axes, _ in work)
+        regions = tuple(region(system, axes, cells=cells, told=told) for system, axes, _ in work)
         ranges = [(axis.label, float(axis.low), float(axis.high)) for axis in work[0][1]]
         lines = tuple(
             (one.label, overlay_points(work[0][0], one, ranges[0], ranges[1]) * [1.0, work[0][2]])
@@ -186,7 +189,7 @@ def compare_regions(
     return Panels(tuple(found), normalize)
 
 
-def _refuse_set(axes: Sequence[RegionAxis], system: CompiledSystem, settings: Sequence[str]) -> None:
+def _refuse_set(axes: Sequence[Range], system: CompiledSystem, settings: Sequence[str]) -> None:
     """Raise E902 when a panel sets what an axis varies."""
     for text in settings:
         override = parse_override(system, text)
@@ -196,7 +199,7 @@ def _refuse_set(axes: Sequence[RegionAxis], system: CompiledSystem, settings: Se
                 raise ApcError(Mistake("E902", PLACE, what))
 
 
-def gain_factor(system: CompiledSystem, axis: RegionAxis) -> int:
+def gain_factor(system: CompiledSystem, axis: Range) -> int:
     """Return how often a parameter counts: its number of others where it weighs a sum, 1 where a mean.
 
     With the mean of N − 1 others a peer is pulled as by one of them, with their sum as by all of them: the
@@ -214,7 +217,7 @@ def gain_factor(system: CompiledSystem, axis: RegionAxis) -> int:
     found: set[int] = set()
     for place, group in enumerate(system.groups):
         built = jacobians(system.kinds[group.kind])
-        if not built.affine or built.edges:
+        if not built.parameters_suffice:
             what = "the scene weighs its others one by one, so that there is no effective gain to compare at"
             raise ApcError(Mistake("E906", PLACE, what))
         before, after = (

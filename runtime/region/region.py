@@ -10,7 +10,6 @@ Does not: draw, or write files (see `region.figure`, `region.files`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -20,22 +19,27 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.words import counted
 from apc.runtime.analysis.analysis import Prepared, analyze, prepare
-from apc.runtime.eigen.rigid import find_rigid_modes, relative_coordinates
-from apc.runtime.eigen.spectrum import angle_in_frame
+from apc.runtime.analysis.ranges import Range
+from apc.runtime.eigen.rigid import find_rigid_modes
 from apc.runtime.frame.names import Free
 from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.region.axes import PLACE, RegionAxis
+from apc.runtime.region.area import stable_area
+from apc.runtime.region.axes import PLACE
 from apc.runtime.region.boundary import Arc, relative_to, trace
-from apc.runtime.region.cells import Survey, survey
-from apc.runtime.region.curves import area_beside, between
+from apc.runtime.region.cells import survey
+from apc.runtime.region.curves import between
 from apc.runtime.region.eigenpairs import Family, log_magnitudes
 from apc.runtime.region.staircase import trace_steps
-from apc.runtime.region.surrogate import Rectangle, resolve_family
+from apc.runtime.region.strips import BRANCHES, Striped, trace_strips
+from apc.runtime.region.surrogate import Rectangle, point_errors, resolve_family
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator, reaches_time
+from apc.runtime.vary.marginal import marginal_motion
+from apc.runtime.vary.search import Told
 
 if TYPE_CHECKING:
     import pandas
@@ -47,9 +51,6 @@ CELLS = 12
 
 # Distance of a curve from the boundary, relative to a coordinate (see `boundary.trace`).
 TOLERANCE = 1e-9
-
-# Magnitudes looked at in each point: three complex pairs.
-BRANCHES = 6
 
 # How near to 0 or π, in radians, an eigenvalue's angle may come before its turns are counted again.
 FOLD = 0.1
@@ -63,10 +64,10 @@ class Curve:
     """A piece of the boundary made by one mode; the stable side is on the left of the points' order.
 
     `points` (k, 2) are in SI; `tangents` (k, 2) are directions in units of the ranges. From point to point
-    goes the cubic of `curves.between`, or a straight line if not `smooth` (where a time varies, the boundary
-    has steps). `error` bounds the curve's distance from the true boundary, relative to the coordinate in
-    which it makes the smaller difference, `distance` the same in units of the ranges. `knots` (m, 2) are the
-    points solved for, in SI, and `eigenvalues` (m,) those that decide there.
+    goes the cubic of `curves.between`, or a straight line if not `smooth` (where events coincide, and in the
+    steps over two times). `error` bounds the curve's distance from the true boundary, relative to the
+    coordinate in which it makes the smaller difference, `distance` the same in units of the ranges. `knots`
+    (m, 2) are the points solved for, in SI, and `eigenvalues` (m,) those that decide there.
     """
 
     points: Floats
@@ -126,18 +127,21 @@ class Region:
 
     `stable_area` is in the product of the axes' units. `cell` are the sides of the cells the rectangle was
     looked at in, in SI; where values hinted at more, cells down to `finest` of them. `corner` says whether
-    the corner of both lower ends is stable.
+    the corner of both lower ends is stable, `stepped` that the boundary is right to a cell only, as times
+    vary, `linearized` that the scene is not linear.
     """
 
     topology: str
-    x: RegionAxis
-    y: RegionAxis
+    x: Range
+    y: Range
     curves: tuple[Curve, ...]
     stable_area: float
     stable_area_error: float
     cell: tuple[float, float]
     finest: float
     corner: bool
+    stepped: bool
+    linearized: bool
     system: CompiledSystem
 
     def __str__(self) -> str:
@@ -215,11 +219,12 @@ class Region:
 
 def region(
     system: CompiledSystem,
-    axes: tuple[RegionAxis, RegionAxis],
+    axes: tuple[Range, Range],
     *,
     cells: int = CELLS,
     tolerance: float = TOLERANCE,
     prepared: Prepared | None = None,
+    told: Told | None = None,
 ) -> Region:
     """Find the boundary of the stable region of two parameters.
 
@@ -235,6 +240,8 @@ def region(
         Largest distance between curves and boundary, relative to a coordinate.
     prepared
         From `analysis.prepare`, of this system with any numbers.
+    told
+        Is told, in words, how far the work is.
 
     Raises
     ------
@@ -243,39 +250,77 @@ def region(
 
     Notes
     -----
-    Where an axis is a time, the schedule changes from point to point: each is analysed by itself, and the
-    boundary is a line from cell edge to cell edge, its error the size of a cell.
+    Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Where both axes are
+    times, or the scene is linearized at its start, each point is analysed by itself, and the boundary is a
+    line from cell edge to cell edge, its error the size of a cell.
     """
     free = tuple(Free(axis.name, axis.group) for axis in axes)
     low = np.array([float(axis.low) for axis in axes])
     rectangle = Rectangle(low, np.array([float(axis.high) for axis in axes]) - low)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
-        timed = any(reaches_time(system, one) for one in free)
-        source = (
-            PointEvaluator(system, free, prepared) if timed else evaluator(system, free, prepared=prepared)
-        )
-        family = _family(source, rectangle, timed)
-        found = survey(lambda points: _samples(family, source, rectangle, points), cells=cells)
-        if timed:
-            arcs = trace_steps(lambda points: _samples(family, source, rectangle, points)[:, 0], found)
+        used = [prepared.jacobians[group.kind] for group in system.groups]
+        linear = all(site.affine and not site.edges for site in used)
+        times = [place for place, one in enumerate(free) if reaches_time(system, one)]
+        source: BatchEvaluator | PointEvaluator
+        if times:
+            source = PointEvaluator(system, free, prepared)
         else:
-            arcs = trace(family, found, tolerance=tolerance, offset=low / rectangle.width)
-        curves = tuple(_curve(source, rectangle, arc) for arc in arcs)
-    area, off = _area(arcs, found)
+            source = evaluator(system, free, prepared=prepared)
+        found: Striped | None = None
+        if linear and len(times) == 1:
+            found = trace_strips(
+                system, axes, times[0], prepared, cells=cells, tolerance=tolerance, told=told
+            )
+        stepped = bool(times) and found is None
+        if found is None:
+            found = _surveyed(source, rectangle, bool(times), cells, tolerance, told)
+        curves = tuple(_curve(source, rectangle, arc) for arc in found.arcs)
     whole = float(rectangle.width.prod())
     return Region(
         topology=system.name,
         x=axes[0],
         y=axes[1],
         curves=curves,
-        stable_area=area * whole,
-        stable_area_error=off * whole,
-        cell=(found.cell * float(rectangle.width[0]), found.cell * float(rectangle.width[1])),
-        finest=found.finest / found.cell,
-        corner=found.corners[0],
+        stable_area=found.area * whole,
+        stable_area_error=found.off * whole,
+        cell=(found.cell[0] * float(rectangle.width[0]), found.cell[1] * float(rectangle.width[1])),
+        finest=found.finest,
+        corner=found.corner,
+        stepped=stepped,
+        linearized=not linear,
         system=system,
     )
+
+
+def _surveyed(
+    source: BatchEvaluator | PointEvaluator,
+    rectangle: Rectangle,
+    timed: bool,
+    cells: int,
+    tolerance: float,
+    told: Told | None,
+) -> Striped:
+    """Survey the whole rectangle and follow the boundary through it; in steps where a time varies."""
+    family = _family(source, rectangle, timed)
+    looked = 0
+
+    def samples(points: Floats) -> Floats:
+        nonlocal looked
+        looked += len(points)
+        if told:
+            told(f"looking at {counted(looked, 'point')}")
+        return _samples(family, source, rectangle, points)
+
+    found = survey(samples, cells=cells)
+    if timed:
+        arcs = trace_steps(
+            lambda points: samples(points)[:, 0], lambda point: _leading_value(family, point), found
+        )
+    else:
+        arcs = trace(family, found, tolerance=tolerance, offset=rectangle.low / rectangle.width)
+    area, off = stable_area(arcs, found)
+    return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
 
 
 def _family(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, timed: bool) -> Family:
@@ -284,26 +329,7 @@ def _family(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, timed
         return resolve_family(source, rectangle, lambda values: matrix_errors(source, values))
     if timed:
         return _Timed(source, rectangle)
-    return resolve_family(source, rectangle, lambda values: _point_errors(source, values))
-
-
-def _point_errors(source: PointEvaluator, values: Floats) -> tuple[Floats, ...]:
-    """Return bounds (1, n, n) on the errors of an evaluator's one matrix, amid some values (k, 2).
-
-    A block of relative coordinates x_rest − W x_held is off by what its rows and W times the others' are.
-    """
-    middle = values.mean(axis=0)
-    (matrix,) = source.matrices(middle[None])
-    found = np.zeros(matrix.shape)
-    start = 0
-    for system in source.closed_at(middle.tolist()):
-        free = find_rigid_modes(system, with_drifts=False)
-        held, rest, weights = relative_coordinates(free.basis)
-        error = system.error[np.ix_(rest, rest)] + np.abs(weights) @ system.error[np.ix_(held, rest)]
-        rows = slice(start, min(start + len(rest), matrix.shape[-1]))
-        found[0, rows, rows] = error[: rows.stop - start, : rows.stop - start]
-        start = rows.stop
-    return (found,)
+    return resolve_family(source, rectangle, lambda values: point_errors(source, values))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -342,6 +368,12 @@ def _samples(
     return log_magnitudes(family, points, BRANCHES)
 
 
+def _leading_value(family: Family, point: Floats) -> complex:
+    """Return the eigenvalue of largest magnitude at a point (2,)."""
+    values = np.concatenate([np.linalg.eigvals(one[0]) for one in family.matrices(point[None])])
+    return complex(values[np.argmax(np.abs(values))])
+
+
 def _curve(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, arc: Arc) -> Curve:
     """Return an arc in SI."""
     return Curve(
@@ -369,45 +401,9 @@ def _identify(
     source: BatchEvaluator | PointEvaluator, value: Floats, eigenvalue: complex
 ) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
-    best: tuple[float, str, float, float] | None = None
-    for system in source.closed_at(value.tolist()):
-        values, vectors = np.linalg.eig(system.matrix)
-        place = int(np.argmin(np.abs(values - eigenvalue)))
-        off = float(abs(values[place] - eigenvalue))
-        if best is None or off < best[0]:
-            vector = vectors[:, place].astype(np.complex128)
-            turn = angle_in_frame(system, complex(values[place]), vector, np.abs(vector))
-            best = (off, system.name, turn, system.frame_s)
-    assert best is not None
-    return best[1:]
-
-
-def _area(arcs: Sequence[Arc], found: Survey) -> tuple[float, float]:
-    """Return the stable share of the unit square, by Green's theorem, and a bound on its error.
-
-    ∮ x dy around the stable side: along the curves, and up the right edge where that is stable.
-    """
-    area, off = 0.0, 0.0
-    ends: dict[int, list[Floats]] = {}
-    for arc in arcs:
-        area += area_beside(arc.points, arc.tangents) if arc.smooth else _polygon(arc.points)
-        length = np.linalg.norm(np.diff(arc.points, axis=0), axis=1)
-        off += float(length @ arc.errors) + float(length.sum()) * arc.rounding
-        ends.setdefault(arc.chain, []).append(arc.points)
-    turns = []
-    for chain, pieces in ends.items():
-        if not found.closed[chain]:
-            turns += [float(end[1]) for end in (pieces[0][0], pieces[-1][-1]) if end[0] == 1.0]
-    stable, below = found.corners[1], 0.0
-    for turn in [*sorted(turns), 1.0]:
-        area += (turn - below) if stable else 0.0
-        stable, below = not stable, turn
-    return min(max(area, 0.0), 1.0), off
-
-
-def _polygon(points: Floats) -> float:
-    """Return ∫ x dy along straight lines."""
-    return float(((points[:-1, 0] + points[1:, 0]) / 2) @ np.diff(points[:, 1]))
+    listed = ((one, find_rigid_modes(one, with_drifts=False)) for one in source.closed_at(value.tolist()))
+    found = marginal_motion(listed, eigenvalue)
+    return found.name, found.turn, found.frame_s
 
 
 def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

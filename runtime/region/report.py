@@ -9,7 +9,6 @@ from __future__ import annotations
 from apc.compiler.words import with_unit
 from apc.runtime.region.panels import Panels, panel_letter
 from apc.runtime.region.region import Curve, Region
-from apc.runtime.vary.evaluator import PointEvaluator
 
 # Curves listed; a boundary in more pieces is told by their number.
 MOST_CURVES = 12
@@ -24,7 +23,8 @@ def region_report(found: Region) -> str:
         lines.append(f"  {letter}  {axis.label:<{width}}  {span}")
     whole = float(found.rectangle.width.prod())
     share = 100 * found.stable_area / whole
-    area = f"{found.stable_area:.9g} ± {found.stable_area_error:.0e}"
+    off = f" ± {found.stable_area_error:.0e}" if found.stable_area_error else ""
+    area = f"{found.stable_area:.9g}{off}"
     lines += ["", f"  stable area  {area} in SI, {share:.4g} % of the rectangle"]
     if found.curves:
         lines += ["", "  boundary     frequency [Hz]   from (x, y)         to (x, y)           error"]
@@ -37,10 +37,10 @@ def region_report(found: Region) -> str:
     )
     lines += ["", f"  Looked at in cells of {cell}, and finer where the"]
     lines.append("  eigenvalues hint at more; an island inside one cell could be missed.")
-    if any(isinstance(curve.source, PointEvaluator) and curve.smooth for curve in found.curves):
+    if found.linearized:
         lines.append("  The scene is not linear: this holds near its start values only.")
-    if any(not curve.smooth for curve in found.curves):
-        lines.append("  Along a time the boundary has steps: it is right to a cell only.")
+    if found.stepped:
+        lines.append("  Along these times the boundary has steps: it is right to a cell only.")
     return "\n".join(lines)
 
 

@@ -25,13 +25,17 @@ Floats = NDArray[np.float64]
 RESOLUTION = 2.0**-24
 
 
-def trace_steps(growth: Callable[[Floats], Floats], found: Survey) -> tuple[Arc, ...]:
+def trace_steps(
+    growth: Callable[[Floats], Floats], leading: Callable[[Floats], complex], found: Survey
+) -> tuple[Arc, ...]:
     """Follow the boundary from edge to edge by straight lines.
 
     Parameters
     ----------
     growth
         The log of the spectral radius (k,) at points (k, 2).
+    leading
+        The eigenvalue that decides at a point (2,).
     found
         Where the boundary crosses the cells' edges, and in what order.
     """
@@ -51,13 +55,14 @@ def trace_steps(growth: Callable[[Floats], Floats], found: Survey) -> tuple[Arc,
         chord = np.diff(own, axis=0)
         length = np.linalg.norm(chord, axis=1)
         direction = chord / np.maximum(length, RESOLUTION)[:, None]
+        middle = members[len(members) // 2]  # its unstable side has the motion that grows
         arcs.append(
             Arc(
                 points=own,
                 tangents=np.concatenate([direction, direction[-1:]]),
                 errors=np.maximum(length, RESOLUTION),
-                knots=own[len(own) // 2 : len(own) // 2 + 1],
-                values=np.ones(1, np.complex128),
+                knots=unstable[middle][None],
+                values=np.array([leading(unstable[middle])], np.complex128),
                 system=0,
                 rounding=RESOLUTION,
                 chain=number,

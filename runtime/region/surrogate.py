@@ -1,7 +1,7 @@
 """Frame matrices over a rectangle of two parameters, as Chebyshev series.
 
 Takes: an `Evaluator` of two free parameters and their ranges.
-Gives: `ChebyshevFamily`, `DirectFamily`, `resolve_family`.
+Gives: `ChebyshevFamily`, `DirectFamily`, `resolve_family`; `point_errors`.
 Guarantees: a series stands for the matrices only when it has converged to rounding in both directions, as
 seen from its last coefficients; how far it may be off is told.
 Does not: resolve what jumps or bends in the rectangle (see `DirectFamily`, which computes every point anew).
@@ -21,9 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.eigen.pseudospectrum import balance
+from apc.runtime.eigen.rigid import find_rigid_modes, relative_coordinates
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.region.eigenpairs import Family
 from apc.runtime.vary.batch import Evaluator
+from apc.runtime.vary.evaluator import PointEvaluator
 
 Floats = NDArray[np.float64]
 
@@ -223,3 +225,22 @@ def _to_coefficients(nodes: Floats) -> Floats:
     transform: Floats = np.cos(np.outer(np.arange(count), np.arccos(2 * nodes - 1))) * (2 / count)
     transform[0] /= 2
     return transform
+
+
+def point_errors(source: PointEvaluator, values: Floats) -> tuple[Floats, ...]:
+    """Return bounds (1, n, n) on the errors of an evaluator's one matrix, amid some values (k, 2).
+
+    A block of relative coordinates x_rest − W x_held is off by what its rows and W times the others' are.
+    """
+    middle = values.mean(axis=0)
+    (matrix,) = source.matrices(middle[None])
+    found = np.zeros(matrix.shape)
+    start = 0
+    for system in source.closed_at(middle.tolist()):
+        free = find_rigid_modes(system, with_drifts=False)
+        held, rest, weights = relative_coordinates(free.basis)
+        error = system.error[np.ix_(rest, rest)] + np.abs(weights) @ system.error[np.ix_(held, rest)]
+        rows = slice(start, min(start + len(rest), matrix.shape[-1]))
+        found[0, rows, rows] = error[: rows.stop - start, : rows.stop - start]
+        start = rows.stop
+    return (found,)

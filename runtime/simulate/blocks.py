@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.gathering import Places
+from apc.runtime.frame.gathering import Arrivals
 from apc.runtime.frame.parameters import resolve
 from apc.runtime.frame.timetable import Timetable
 from apc.runtime.simulate.forcing import impulses
@@ -91,7 +91,7 @@ def _unsolved(simulation: Simulation, frame: int) -> ApcError:
     return ApcError(Mistake("E915", place, what, hint=hint))
 
 
-def _places(simulation: Simulation, run: int) -> Places | None:
+def _arrivals(simulation: Simulation, run: int) -> Arrivals | None:
     """Return what chance says of the packets of a run; None if all links are reliable."""
     if not simulation.gates:
         return None
@@ -99,7 +99,7 @@ def _places(simulation: Simulation, run: int) -> Places | None:
     timings = resolve(system).timings
     exchange = build_exchange(system, timings)
     table = Timetable(system, timings, exchange, simulation.quantum, seed=seed, run=run)
-    return Places(simulation.gates, table, simulation.frame)
+    return Arrivals(simulation.gates, table, simulation.frame)
 
 
 class _Runner:
@@ -107,7 +107,7 @@ class _Runner:
 
     def __init__(self, simulation: Simulation, run: int) -> None:
         self.simulation, self.length = simulation, simulation.length
-        self.places = _places(simulation, run)
+        self.arrivals = _arrivals(simulation, run)
         self.state = [one.copy() for one in simulation.population.start]
         self.done = np.zeros(len(simulation.parts))
         self.failed: int | None = None  # the frame that could not be played
@@ -188,9 +188,9 @@ class _Runner:
             found = np.array([impulses(one, starts, which)[:, program.rates.g] for one in forces])
             rows = found.reshape(len(forces), length, -1).transpose(1, 0, 2)
             self.inputs[len(self.state) + g][:] = rows.reshape(-1)
-        if self.places is not None:
+        if self.arrivals is not None:
             first_gate = len(self.state) + len(members)
-            for place, rows in enumerate(self.places.take(length), first_gate):
+            for place, rows in enumerate(self.arrivals.take(length), first_gate):
                 self.inputs[place][:] = rows
         self.inputs[-1][:] = numbers
 

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.optional import need
 from apc.runtime.simulate.signals import Signal
-from apc.runtime.simulate.trajectory import Trajectory, need
+from apc.runtime.simulate.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.runtime.optional import need
 from apc.runtime.simulate.signals import Signal
-from apc.runtime.simulate.trajectory import need
 
 Floats = NDArray[np.float64]
 

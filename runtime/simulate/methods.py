@@ -92,7 +92,10 @@ def parse_method(text: str) -> Method:
     if not size:
         expected = "a step"
         raise ApcError(Mistake("E911", place, name, expected, "none", EXAMPLES[name]))
-    step = Fraction(quantity(size, place, what=f"the step of {name}", unit="s").value)
+    try:
+        step = Fraction(quantity(size, place, what=f"the step of {name}", unit="s").value)
+    except ApcError as error:
+        raise ApcError([replace(one, hint=EXAMPLES[name]) for one in error.mistakes]) from None
     if step <= 0:
         expected, got = "more than 0 s", size[:80]
         raise ApcError(Mistake("E911", place, f"the step of {name}", expected, got, EXAMPLES[name]))

@@ -1,7 +1,7 @@
 """All peers of a scene over one frame: each one's program, and the packets between them.
 
-Takes: a `CompiledSystem`, its numbers and schedules, and the programs of its groups.
-Gives: `Population`, `build_population`.
+Takes: a `CompiledSystem`, who hears whom, and the members, with their programs.
+Gives: `Population`, `build_population`; `exchanges_within`, `refuse_unheard_of`.
 Guarantees: sums and means over a complete graph cost one addition a peer, over any other graph one product
 an arc; a reduction that looks at each pair of peers costs one evaluation a pair; before a packet arrives a
 receiver holds the sender's start values.
@@ -15,9 +15,8 @@ recorded, or those that are not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import casadi
@@ -26,45 +25,15 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.gathering import Gate, Gathering
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.schedule import Heard, Propagate, Schedule, Sent, Tick
-from apc.runtime.frame.start import start_sends, start_values
-from apc.runtime.simulate.pairs import Pairs
-from apc.runtime.simulate.program import Program, Segment, seconds_at
-from apc.runtime.simulate.propagate import Transitions
+from apc.runtime.frame.exchange import Exchange
+from apc.runtime.frame.gathering import Gate
+from apc.runtime.frame.schedule import Propagate, Schedule, Tick
+from apc.runtime.simulate.ear import Ear
+from apc.runtime.simulate.member import Member
 
 Floats = NDArray[np.float64]
+
 Compile = Callable[[Sequence[Any]], Sequence[Any]]  # the kernels in another form, as fast as can be had
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Member:
-    """Peers of one group of the scene in a population.
-
-    `peers` (count,) are their numbers in the scene. `rows` (count,) says which of the different sites each
-    is; `parameters` are those sites' vectors, `transitions` theirs; `sends` is what each of them sends at the
-    start, by link.
-    """
-
-    group: int
-    peers: NDArray[np.int64]
-    program: Program
-    rows: NDArray[np.int64]
-    parameters: Floats
-    transitions: tuple[Transitions, ...]
-    sends: tuple[Mapping[str, Sequence[float]], ...]
-    carry: Floats  # (sites, rows of the carry)
-
-    @property
-    def count(self) -> int:
-        """The number of peers."""
-        return len(self.rows)
-
-    def each(self, values: Floats) -> Floats:
-        """Return one row a peer of what is one row a site."""
-        return np.ascontiguousarray(values[self.rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,42 +43,6 @@ class Population:
     members: tuple[Member, ...]
     frame: Any  # casadi.Function
     start: tuple[Floats, ...]
-
-
-def build_member(
-    group: int,
-    peers: NDArray[np.int64],
-    site: SiteJacobians,
-    rows: NDArray[np.int64],
-    vectors: Floats,
-    program: Program,
-    transitions: Sequence[Transitions],
-) -> Member:
-    """Collect what some peers of a group bring to a population.
-
-    Parameters
-    ----------
-    group
-        The group's place in the scene.
-    peers
-        The peers' numbers in the scene (count,).
-    site
-        The group's kind.
-    rows, vectors, transitions
-        Which of the group's different sites each peer is (count,), their parameters (sites, n_p), and what
-        each does over the program's intervals.
-    program
-        What each peer does in a frame.
-    """
-    used, own = np.unique(rows, return_inverse=True)
-    sends, carries = [], []
-    for vector in vectors[used]:
-        listed = [float(one) for one in vector]
-        x, _, remembered = start_values(site, listed)
-        carries.append(program.start(x, remembered))
-        sends.append(start_sends(site, listed, float))
-    moves = tuple(transitions[place] for place in used)
-    return Member(group, peers, program, own, vectors[used], moves, tuple(sends), np.array(carries))
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
@@ -188,7 +121,7 @@ def build_population(
     looked = [pairwise.pair.function for segment in segments for pairwise in segment.pairs]
     found = _distinct([*(segment.kernel for segment in segments), *looked])
     ready = dict(zip(found, kernels(list(found.values())), strict=True))
-    ear = _Ear(system, exchange, members, gates)
+    ear = Ear(system, exchange, members, gates)
     carries = [casadi.MX.sym(f"carry{g}", len(one.carry[0]), one.count) for g, one in enumerate(members)]
     histories = [
         casadi.MX.sym(f"history{g}", sum(one.program.schedule.depths), one.count)
@@ -268,134 +201,3 @@ def _first_held(gate: Gate, members: Sequence[Member]) -> Floats:
         ]
         packet.append(member.each(np.array(rows).reshape(len(rows), len(gate.channels))))
     return np.concatenate(packet)[gate.place[gate.route.pairs[:, 0]]]
-
-
-class _Ear:
-    """The packets of one frame, as they are sent, remembered and heard."""
-
-    def __init__(
-        self, system: CompiledSystem, exchange: Exchange, members: Sequence[Member], gates: Sequence[Gate]
-    ) -> None:
-        self.system, self.exchange, self.members = system, exchange, members
-        self.gathering = Gathering(gates, exchange, members, self.packet)
-        self.old: dict[tuple[int, Sent, int], Any] = {}  # (group, what, frames ago)
-        self.new: dict[tuple[int, Sent], Any] = {}
-        self.totals: dict[tuple[Sent, int, tuple[int, ...]], Any] = {}
-        self.weights: dict[tuple[str, bool], Any] = {}
-        self.sending = {
-            link.name: [any(one.link == link.name for one in m.program.kind.sends) for m in members]
-            for link in system.links
-        }
-        self.pairs = Pairs(exchange, members, self.sending, self.gathering, self._packet)
-
-    def remember(self, histories: Sequence[Any]) -> None:
-        """Take in what was sent in earlier frames."""
-        for g, (member, history) in enumerate(zip(self.members, histories, strict=True)):
-            row = 0
-            schedule = member.program.schedule
-            for sent, depth in zip(schedule.sent, schedule.depths, strict=True):
-                for ago in range(1, depth + 1):
-                    self.old[g, sent, ago] = history[row, :]
-                    row += 1
-
-    def send(self, group: int, segment: Segment, sent: Any) -> None:
-        """Take in what a group sends in a segment."""
-        schedule = self.members[group].program.schedule
-        for place, row in enumerate(segment.sent):
-            self.new[group, schedule.sent[row]] = sent[place, :]
-        self.gathering.renew()
-
-    def histories(self) -> list[Any]:
-        """Return what is remembered when the frame ends."""
-        result = []
-        for g, member in enumerate(self.members):
-            rows = []
-            for sent, depth in zip(member.program.schedule.sent, member.program.schedule.depths, strict=True):
-                listed = [self.new[g, sent], *(self.old[g, sent, ago] for ago in range(1, depth))]
-                rows += listed[:depth]
-            result.append(casadi.vertcat(*rows) if rows else casadi.MX(0, member.count))
-        return result
-
-    def hear(self, group: int, segment: Segment) -> Any:
-        """Return what a group hears in a segment, a column a peer."""
-        schedule = self.members[group].program.schedule
-        rows = [self._heard(group, schedule.heard[row]) for row in segment.heard]
-        return casadi.vertcat(*rows) if rows else casadi.MX(0, self.members[group].count)
-
-    def look(
-        self, group: int, segment: Segment, carry: Any, constants: Any, number: Any, ready: Mapping[int, Any]
-    ) -> list[Any]:
-        """Return what a group hears pair by pair as a segment begins, a column a peer."""
-        schedule, found = self.members[group].program.schedule, []
-        for one in segment.pairs:
-            own = casadi.vertcat(carry[list(one.carry), :], constants[list(one.constants), :])
-            t = seconds_at(schedule, number, one.now)
-            rows = [schedule.heard[row] for row in one.heard]
-            found.append(self.pairs.hear(group, rows, own, t, ready[id(one.pair.function)]))
-        return found
-
-    def packet(self, group: int, sent: Sent, ago: int) -> Any:
-        """Return what a group sent some frames ago, a column a peer: zeros if that is nothing, or later."""
-        found = self.old.get((group, sent, ago)) if ago else self.new.get((group, sent))
-        return casadi.MX(1, self.members[group].count) if found is None else found
-
-    def _packet(self, group: int, heard: Heard) -> Any:
-        return self.old[group, heard.sent, heard.lag] if heard.lag else self.new[group, heard.sent]
-
-    def _heard(self, listener: int, heard: Heard) -> Any:
-        if heard.clock:
-            return self.gathering.hear(listener, heard)
-        way, exchange = heard.way, self.exchange
-        own = self.members[listener].group
-        senders = [
-            h
-            for h, does in enumerate(self.sending[way.link])
-            if does and exchange.delay(way.link, self.members[h].group, own) == way.delay
-        ]
-        count = self.members[listener].count
-        if not exchange.is_complete(way.link):
-            total = casadi.MX.zeros(1, count)
-            for h in senders:
-                matrix = self._weights(way.link, way.operator == "mean", h, listener)
-                if matrix.nnz():
-                    total = total + self._packet(h, heard) @ matrix
-            return total
-        key = (heard.sent, heard.lag, tuple(senders))
-        if key not in self.totals:
-            self.totals[key] = casadi.sum2(casadi.horzcat(*(self._packet(h, heard) for h in senders)))
-        total = casadi.repmat(self.totals[key], 1, count)
-        if listener in senders:
-            total = total - self._packet(listener, heard)
-        if way.operator == "mean":
-            listed = zip(self.members, self.sending[way.link], strict=True)
-            everybody = sum(member.count for member, does in listed if does)
-            total = total / (everybody - int(self.sending[way.link][listener]))
-        return total
-
-    def _weights(self, link: str, mean: bool, sender: int, receiver: int) -> Any:
-        """Return what each peer of a group weighs each of another by, (senders, receivers), sparse."""
-        import scipy.sparse
-
-        exchange = self.exchange
-        if (link, mean) not in self.weights:
-            pairs, weights = exchange.arcs(link)
-            n = exchange.peers
-            whole = scipy.sparse.coo_array((weights, (pairs[:, 0], pairs[:, 1])), shape=(n, n)).tocsc()
-            if mean:
-                sums = np.asarray(whole.sum(axis=0)).ravel()
-                for peer in np.flatnonzero(sums == 0):
-                    if self._averages(int(peer), link):
-                        hears = bool((pairs[:, 1] == peer).any())
-                        check_mean(exchange, int(peer), link, "mean", hears, Fraction(0))
-                whole = whole @ scipy.sparse.diags_array(1 / np.where(sums == 0, 1.0, sums))
-            self.weights[link, mean] = whole.tocsc()
-        columns = self.weights[link, mean][:, self.members[receiver].peers]
-        block = columns.tocsr()[self.members[sender].peers].tocsc()
-        block.sort_indices()  # CasADi wants the rows of a column in order
-        return casadi.DM(block)
-
-    def _averages(self, peer: int, link: str) -> bool:
-        """Say whether a peer takes a mean over a link."""
-        group = int(np.searchsorted(self.exchange.starts, peer, side="right")) - 1
-        heard = next(one for one in self.members if one.group == group).program.schedule.heard
-        return any(one.way.link == link and one.way.operator == "mean" for one in heard)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.runtime.simulate.program import LocalSignal
+from apc.runtime.simulate.local_signals import LocalSignal
 
 EXAMPLE = "'cube.x', 'left[2].*' or '*.v'"
 

@@ -21,26 +21,23 @@ from apc.runtime.frame.exchange import Exchange, build_exchange
 from apc.runtime.frame.gathering import Gate, build_gates, kept_links
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.parameters import Numbers, resolve
-from apc.runtime.frame.schedule import Propagate, Schedule
+from apc.runtime.frame.schedule import Kept, Propagate, Schedule
 from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.frame.timetable import routes_of
+from apc.runtime.frame.site import LinearSite
+from apc.runtime.frame.timetable import Route, routes_of
 from apc.runtime.simulate.flow import Flow, Tolerance, flow_of, rows_to_move
 from apc.runtime.simulate.forcing import SiteForcing, forcing_of, site_forcing
+from apc.runtime.simulate.local_signals import LocalSignal, local_signals
+from apc.runtime.simulate.member import Member, build_member
 from apc.runtime.simulate.methods import CVODES, DEFAULT, EXACT, WHERE_NEEDED, Method, check_step
 from apc.runtime.simulate.native import native
 from apc.runtime.simulate.pairs import count_pairs
-from apc.runtime.simulate.population import (
-    Member,
-    Population,
-    build_member,
-    build_population,
-    exchanges_within,
-    refuse_unheard_of,
-)
-from apc.runtime.simulate.program import LocalSignal, Program, build_program, local_signals
+from apc.runtime.simulate.population import Population, build_population, exchanges_within, refuse_unheard_of
+from apc.runtime.simulate.program import Program
 from apc.runtime.simulate.propagate import Transitions, rates, shaken, transitions
 from apc.runtime.simulate.scales import state_scales
 from apc.runtime.simulate.signals import Choice, Signal, choose, signals_of
+from apc.runtime.simulate.writing import build_program
 from apc.runtime.trouble import finite_equations
 
 Floats = NDArray[np.float64]
@@ -50,9 +47,9 @@ Integers = NDArray[np.int64]
 # machine's caches, and CasADi builds the function in a tenth of a second.
 CHUNK = 2**19
 ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
-# Numbers that come into one call, at most: 64 MiB. Of an unreliable link they are one a way and tick, and the
-# packets of many frames are drawn at less cost than those of a few.
-TOLD = 2**23
+# Numbers that come into one call, at most: 4 MiB. Of an unreliable link they are one a way and tick. For
+# twice as many, CasADi builds the function in more than a second instead of a tenth.
+TOLD = 2**19
 MOST_FRAMES = 2000  # of one chunk: the function of a chunk is built in a time that grows with it
 NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
 # Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
@@ -143,17 +140,12 @@ def prepare(
         patterns = [site.pattern for site in sites]
         exchange = build_exchange(system, numbers.timings)
         routes = routes_of(system, numbers.timings, exchange)
-        schedules = build_schedules(system, numbers.timings, patterns)
-        kept = kept_links(routes, schedules[0].frame_s)
-        if kept:
-            schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
-        if not system.clocks:  # then there is one interval, of any length
-            schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
+        schedules, kept = _schedules(system, numbers, patterns, routes)
+        _check_size(system, exchange, schedules)
+        _check_step(system, numbers, schedules, method)
         available = [
             local_signals(system.kinds[one.kind], s) for one, s in zip(system.groups, schedules, strict=True)
         ]
-        _check_size(system, exchange, schedules)
-        _check_step(system, numbers, schedules, method)
         choices = choose(system, available, signals)
         _check_size(system, exchange, schedules, choices)
         members = _members(system, numbers, exchange, schedules, choices, sites, flows, method)
@@ -187,6 +179,19 @@ def prepare(
         length=length,
         chunk=population.frame.mapaccum("chunk", length, len(population.start)),
     )
+
+
+def _schedules(
+    system: CompiledSystem, numbers: Numbers, patterns: Sequence[LinearSite], routes: Sequence[Route]
+) -> tuple[tuple[Schedule, ...], dict[str, Kept]]:
+    """Return what happens in a frame of each group, and what is kept of unreliable links."""
+    schedules = build_schedules(system, numbers.timings, patterns)
+    kept = kept_links(routes, schedules[0].frame_s)
+    if kept:
+        schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
+    if not system.clocks:  # then there is one interval, of any length
+        schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
+    return schedules, kept
 
 
 def _members(

@@ -25,8 +25,8 @@ from apc.runtime.frame.guards import guards_of
 from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.parameters import resolve
 from apc.runtime.frame.start import start_values
+from apc.runtime.optional import need
 from apc.runtime.simulate.figures import check_format, write_figure
-from apc.runtime.simulate.trajectory import need
 
 Floats = NDArray[np.float64]
 

@@ -7,7 +7,8 @@ Does not: prove anything: what it says holds for the time that was simulated (se
 Settled means: from some time on, well before the end, every position stays within `BAND` of its range around
 its last value; the range is the largest that any peer's position of that name goes through. A motion that
 does not settle *shakes* if it turns to and fro without dying away, *dies away* if it turns and gets smaller,
-*diverges* if a number leaves the range of floats, and *moves on* otherwise.
+*diverges* if a number leaves the range of floats, and *moves on* otherwise. It *rests* if no position ever
+changes.
 
 The work a coupler does is ∫ −f v dt over the forces it holds, f the flow into the coupler at each of its
 flanges and v that flange's velocity: exact, as f is constant between events. Positive work feeds the motion.
@@ -58,9 +59,9 @@ class Extent:
 class Summary:
     """A simulation in numbers, SI.
 
-    `verdict` is "settles", "dies away", "shakes", "moves on" or "diverges"; `settled` is the time from which
-    on it stays, in seconds. `overshoot` is a part of the way from first to last. `copies` are (name, distance
-    at the end) of what is sent to the others as it is. `work` is (part, J).
+    `verdict` is "rests", "settles", "dies away", "shakes", "moves on" or "diverges"; `settled` is the time
+    from which on it stays, in seconds. `overshoot` is a part of the way from first to last. `copies` are
+    (name, distance at the end) of what is sent to the others as it is. `work` is (part, J).
     """
 
     verdict: str
@@ -156,6 +157,8 @@ class Watch:
         )
         positions = [i for i, one in enumerate(signals) if one.role == "state" and one.unit in ("m", "rad")]
         verdict, swing = self._verdict(positions, settled, bool(block.stopped))
+        if verdict == "settles" and positions and not np.any((high - low)[positions]):
+            verdict = "rests"
         times = [settled[i] for i in positions]
         forces = [i for i, one in enumerate(signals) if one.unit == "N"]
         largest = max(forces, key=lambda i: float(self.peak[i]), default=None)
@@ -262,6 +265,7 @@ def _sent_states(kind: Any) -> list[str]:
 
 
 _WORDS = {
+    "rests": "Nothing moves: no force and no start value sets it in motion.",
     "settles": "From {settled} on every position stays within 5 % of its range.",
     "dies away": "At the end it still swings, less and less: {swing}.",
     "shakes": "At the end it swings without dying away: {swing}.",
@@ -296,15 +300,17 @@ def summary_text(topology: str, summary: Summary, notes: Sequence[tuple[str, str
     lines = [f"{topology}: {summary.verdict}", ""]
     lines += wrapped(words, "  ", "  ")
     rows = []
-    if summary.largest_force:
+    if summary.largest_force and (summary.largest_force[1] or summary.verdict != "rests"):
         name, size, at = summary.largest_force
         rows.append(("largest force", f"{quantity(size, 'N')}, {name} at {quantity(at, 's')}"))
     if summary.overshoot:
         rows.append(("overshoot", f"{100 * summary.overshoot[1]:.3g} %, {summary.overshoot[0]}"))
     for name, distance in summary.copies:
+        if not distance and summary.verdict == "rests":
+            continue
         unit = next(one.unit for one in summary.extents if one.name.endswith(f".{name}"))
         rows.append(("copies", f"{name} differs by {quantity(distance, unit)} between peers at the end"))
-    if summary.work:
+    if any(one for _, one in summary.work):
         done = ", ".join(f"{part} {quantity(one, 'J')}" for part, one in summary.work)
         rows.append(("work put in", f"{done} by held forces"))
     rows.append(("recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"))

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.given import given
+from apc.runtime.optional import need
 from apc.runtime.simulate.accuracy import ErrorEstimate, compare_with, error_text
 from apc.runtime.simulate.blocks import Block, blocks
 from apc.runtime.simulate.flow import Tolerance
@@ -129,17 +131,6 @@ class Trajectory:
         from apc.runtime.simulate.figures import draw  # it needs this module
 
         return draw(self, ax)
-
-
-def need(module: str, extra: str) -> Any:
-    """Import an optional library. Raises ApcError (E875) if it isn't there."""
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        what = f"{module} is not installed"
-        raise ApcError(Mistake("E875", Place("apc"), what, hint=f"pip install 'apc[{extra}]'")) from error
 
 
 def result_text(
@@ -383,10 +374,7 @@ def trajectory_of(
 
 def parse_duration(text: str) -> Fraction:
     """Read a duration such as "2 s". Raises ApcError if it is none."""
-    # Imported here: reading a unit brings in pint, which a scene's own duration does not need.
-    from apc.compiler.units import quantity
-
-    return Fraction(quantity(text, Place("--duration"), what="duration", unit="s").value)
+    return given("--duration", text, what="duration", unit="s")
 
 
 def duration_of(system: CompiledSystem, duration: Fraction | None) -> Fraction:

@@ -1,7 +1,7 @@
 """Which parameters a sweep varies, and every combination of their values.
 
 Takes: a `CompiledSystem`, names of parameters, and texts such as `0 N/m:3000 N/m:11` or `0, 8 ms`.
-Gives: `GridAxis`, `Grid`, `parse_axis`, `build_grid`.
+Gives: `GridAxis`, `Grid`, `parse_axis`, `build_grid`, `check_size`.
 Guarantees: values are exact rationals in SI; the order of points is that of the axes as given, the last one
 turning fastest; what can be known to be out of bounds is told before any point is computed.
 Does not: compute points.
@@ -26,6 +26,7 @@ PLACE = Place("sweep")
 DEFAULT_COUNT = 11
 # A result of so many rows takes a gigabyte of memory, and weeks on one core.
 MOST_POINTS = 10_000_000
+MOST_DIGITS = 20  # of a count that are read: it is too large anyway
 
 _FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*")
@@ -84,12 +85,30 @@ def build_grid(axes: Sequence[GridAxis]) -> Grid:
     for place, label in enumerate(labels):
         if label in labels[:place]:
             raise ApcError(Mistake("E883", PLACE, f"{label} is swept twice"))
-    grid = Grid(tuple(axes))
-    if grid.points > MOST_POINTS:
-        sizes = " × ".join(str(len(axis.values)) for axis in axes)
-        got = f"{sizes} = {grid.points:,}"
+    _refuse_many([len(axis.values) for axis in axes])
+    return Grid(tuple(axes))
+
+
+def check_size(texts: Sequence[str]) -> None:
+    """Refuse a grid that is too large by the texts of its axes, before any value of them is built (E883)."""
+    counts = []
+    for text in texts:
+        parts = [part.strip() for part in text.split(":")]
+        given = [part for part in parts[2:3] if part.isascii() and part.isdecimal()]
+        if len(parts) == 1:
+            counts.append(text.count(",") + 1)
+        else:
+            # What is no count is told of when it is read.
+            counts.append(int(given[0][:MOST_DIGITS]) if given else DEFAULT_COUNT)
+    _refuse_many(counts)
+
+
+def _refuse_many(counts: Sequence[int]) -> None:
+    points = math.prod(counts)
+    if points > MOST_POINTS:
+        sizes = " × ".join(f"{count:,}" for count in counts)
+        got = f"{sizes} = {points:,}" if len(counts) > 1 else sizes
         raise ApcError(Mistake("E883", PLACE, "a sweep", f"at most {MOST_POINTS:,} points", got))
-    return grid
 
 
 def parse_axis(system: CompiledSystem, name: str, text: str) -> GridAxis:
@@ -168,7 +187,7 @@ def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
 
 def _count(what: str, text: str) -> int:
     """Read the number of values: a single value is written as a value, not as a range."""
-    if not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) >= 2):
+    if not (text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS and int(text) >= 2):
         raise ApcError(Mistake("E881", PLACE, what, "2 values or more", text[:40] or "nothing", _FORM))
     return int(text)
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, with_unit, wrapped
-from apc.runtime.sweep.grid import Grid, build_grid, parse_axis
+from apc.runtime.sweep.grid import Grid, build_grid, check_size, parse_axis
 from apc.runtime.sweep.local import Workers, cores, local_processes, this_process
 from apc.runtime.sweep.quantities import VERDICT, Cell, Row, find_quantity
 from apc.runtime.sweep.store import Parts, open_parts, remove_parts
@@ -147,11 +147,9 @@ def sweep(
         other work stands at the target; E887 or E601 the target can't be written; E888 the cluster; E889 a
         process ended. What is finished is kept.
     """
-    axes = [
-        parse_axis(system, name, text if isinstance(text, str) else ",".join(text))
-        for name, text in over.items()
-    ]
-    grid = build_grid(axes)
+    texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
+    check_size(list(texts.values()))
+    grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
     quantity = find_quantity(system, of)
     for axis in grid.axes:
         if axis.label == of.partition(":")[2].strip():

@@ -22,8 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.eigen.modes import ClosedSystem, Loop, close_loop, split
-from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.eigen.closing import ClosedSystem, close_loop
+from apc.runtime.eigen.loop import Loop
+from apc.runtime.eigen.modes import split
+from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
@@ -143,7 +145,7 @@ class BatchEvaluator:
             if site_key(group) in used
         }
         sites = [
-            replace(one, parameters=new.parameters, site=new.site, lifted=new.lifted)
+            replace(one, parameters=new.parameters, site=new.site, exact=new.exact, lifted=new.lifted)
             for one in system.sites
             if (new := moved[site_key(one)])
         ]
@@ -164,13 +166,16 @@ class BatchEvaluator:
         Their matrices in floats are still those of the point that stands for all.
         """
         assert not self.timed, "another time is another schedule"
-        vector_of = {site_key(group): vector for group, vector in self._points(value)}
-        return tuple(
-            replace(
-                system, sites=tuple(replace(one, parameters=vector_of[site_key(one)]) for one in system.sites)
-            )
-            for system in self.closed
-        )
+        moved = {
+            site_key(group): (vector, linearize_exact(group.jacobians, vector))
+            for group, vector in self._points(value)
+        }
+
+        def at_point(group: PeerGroup) -> PeerGroup:
+            vector, exact = moved[site_key(group)]
+            return replace(group, parameters=vector, exact=exact)
+
+        return tuple(replace(system, sites=tuple(map(at_point, system.sites))) for system in self.closed)
 
     def _points(self, value: Sequence[float]) -> list[tuple[PeerGroup, Floats]]:
         point = np.array([value], dtype=np.float64)
@@ -371,8 +376,9 @@ def _moved(group: PeerGroup, vector: Floats) -> PeerGroup:
     """Return the group with other parameters, linearized and lifted anew."""
     built = group.jacobians
     site = site_of_row(built, linearize_rows(built, vector[None])[0])
-    lifted = lift(site, group.schedule, exact=linearize_exact(built, vector))
-    return replace(group, parameters=vector, site=site, lifted=lifted)
+    exact = linearize_exact(built, vector)
+    lifted = lift(site, group.schedule, exact=exact)
+    return replace(group, parameters=vector, site=site, exact=exact, lifted=lifted)
 
 
 def _beyond(a: Matrices, b: Matrices) -> NDArray[np.bool_]:

@@ -1,23 +1,27 @@
-"""A crossing of the unit circle proved by ball arithmetic, between two values near to each other.
+"""A crossing of the unit circle held between two values near to each other.
 
-Takes: a crossing found in floats, and the closed systems at any value, for exact arithmetic.
-Gives: `Bracket`, `bracket`.
-Guarantees: a proved bracket holds a crossing of the true systems: on one of its ends every eigenvalue of the
-system that crosses is proved inside the circle, on the other one outside.
+Takes: a crossing found in floats, and the closed systems at any value.
+Gives: `Bracket`, `bracket`, `bracket_in_floats`.
+Guarantees: a bracket holds a crossing of the true systems: on one of its ends every eigenvalue of the systems
+that cross is inside the circle, on the other one outside; proved by ball arithmetic or, for more states than
+that is worth or where the equations can't be had exactly, by the error bounds of an analysis in floats.
 Does not: search (see `crossings`).
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import flint
+import numpy as np
 
 from apc.runtime.eigen.balls import frame_balls, precision, reduced_balls, unprovable
-from apc.runtime.eigen.certify import schur_cohn
-from apc.runtime.eigen.modes import ClosedSystem
+from apc.runtime.eigen.certify import MOST_PROVED, schur_cohn
+from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.rigid import RigidModes, relative_places
+from apc.runtime.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, solve_spectrum
 from apc.runtime.vary.crossings import Root
 
 # Half the width asked of a bracket, relative to the value: half of 1e-12, rounding set aside.
@@ -35,6 +39,15 @@ PRECISIONS = (128, 256, 512, 1024)
 # The closed systems at a value, with the rigid modes of each.
 ExactSystems = Callable[[float], Sequence[tuple[ClosedSystem, RigidModes]]]
 
+# The closed systems at a value, as an analysis has them, one of which crosses.
+FloatSystems = Callable[[float], Sequence[ClosedSystem]]
+
+# Whether the crossing lies above a value, None if that isn't known.
+_Above = Callable[[float], bool | None]
+
+# A bracket in floats reaches this many of the spectral radius's error bounds to either side at first.
+FLOAT_REACH = 2.0
+
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
@@ -46,7 +59,7 @@ class Bracket:
 
 
 def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Bracket | None:
-    """Prove a root of floats, or None where balls can't be had or don't tell.
+    """Prove a root of floats by ball arithmetic, or None where balls can't be had or don't tell.
 
     Parameters
     ----------
@@ -57,23 +70,55 @@ def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Br
     low, high
         No bracket reaches beyond these.
     """
-    if unprovable(systems(root.value)[root.system][0]):
+    system = systems(root.value)[root.system][0]
+    if unprovable(system) or len(system.names) > MOST_PROVED:
         return None
-    size = max(abs(root.value), 1e-300)
-    known: dict[float, bool | None] = {}
     most_bits = 0
 
+    @functools.cache
     def above(value: float) -> bool | None:
-        """Say whether the crossing lies above a value, None if that isn't proved."""
         nonlocal most_bits
-        if value not in known:
-            system, free = systems(value)[root.system]
-            inside, bits = _inside(system, free)
-            most_bits = max(most_bits, bits)
-            known[value] = None if inside is None else inside == root.rising
-        return known[value]
+        inside, bits = _inside(*systems(value)[root.system])
+        most_bits = max(most_bits, bits)
+        return None if inside is None else inside == root.rising
 
-    half = HALF * FIRST * size
+    held = _held(root, above, HALF * FIRST * _size(root), low, high)
+    return None if held is None else Bracket(*held, f"proved with {most_bits} bits")
+
+
+def bracket_in_floats(root: Root, systems: FloatSystems, *, low: float, high: float) -> Bracket | None:
+    """Hold a root between two values whose analyses differ, or None where their bounds don't tell.
+
+    Parameters
+    ----------
+    root
+        The crossing.
+    systems
+        Those closed systems at a value of which one crosses, with bounds on their errors.
+    low, high
+        No bracket reaches beyond these.
+    """
+
+    @functools.cache
+    def above(value: float) -> bool | None:
+        verdict = solve_spectrum(systems(value)).verdict
+        sides = {STABLE: True, STABLE_TRANSLATING: True, UNSTABLE: False}
+        return (sides[verdict] == root.rising) if verdict in sides else None
+
+    error = solve_spectrum(systems(root.value)).spectral_radius_error
+    if not (root.slope and np.isfinite(error)):
+        return None
+    half = max(FLOAT_REACH * error / abs(root.slope), HALF * FIRST * _size(root))
+    held = _held(root, above, half, low, high)
+    return None if held is None else Bracket(*held, "bounded in floats")
+
+
+def _size(root: Root) -> float:
+    return max(abs(root.value), 1e-300)
+
+
+def _held(root: Root, above: _Above, half: float, low: float, high: float) -> tuple[float, float] | None:
+    """Return a value and the error on it of a bracket that starts `half` to either side, if one is found."""
     for _ in range(TRIES):
         left, right = max(root.value - half, low), min(root.value + half, high)
         if above(left) is True and above(right) is False:
@@ -81,15 +126,14 @@ def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Br
         half *= WIDER
     else:
         return None
-    while right - left > 2 * HALF * size:
+    while right - left > 2 * HALF * _size(root):
         middle = (left + right) / 2
         side = above(middle)
         if side is None or middle in (left, right):
             break
         left, right = (middle, right) if side else (left, middle)
     value = (left + right) / 2
-    error = max(right - value, value - left)
-    return Bracket(value, error, f"proved with {most_bits} bits")
+    return value, max(right - value, value - left)
 
 
 def _inside(system: ClosedSystem, free: RigidModes) -> tuple[bool | None, int]:

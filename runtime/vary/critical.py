@@ -17,15 +17,16 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import with_unit
+from apc.compiler.words import with_unit, wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
 from apc.runtime.frame.names import Free, find, parameter_of, unit_of
+from apc.runtime.given import given
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.crossings import CELL
 from apc.runtime.vary.delays import delay_now
 from apc.runtime.vary.evaluator import reaches_time
-from apc.runtime.vary.search import Crossing, Search, search, search_delay
+from apc.runtime.vary.search import Crossing, Search, Told, search, search_delay
 
 _PLACE = Place("critical value")
 
@@ -37,7 +38,8 @@ class Critical:
     `crossings` are all that were found from `scanned[0]` to `scanned[1]`, in order. `value` is the one that
     matters: with the present value stable, the first crossing above it or else the first below it; with the
     present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
-    there is no crossing; `verdict` then says whether all that was scanned is stable.
+    there is no crossing; `verdict` then says whether all that was scanned is stable. `enters` says whether
+    anything that decides depends on the parameter: on a start value of a linear scene nothing does.
     """
 
     topology: str
@@ -51,6 +53,7 @@ class Critical:
     scanned: tuple[float, float]
     cell: float
     whole: bool
+    enters: bool
     verdict: str
 
     def to_dict(self) -> dict[str, Any]:
@@ -67,6 +70,7 @@ class Critical:
             "scanned": list(self.scanned),
             "cell": self.cell,
             "whole": self.whole,
+            "enters": self.enters,
             "verdict": self.verdict,
         }
 
@@ -76,7 +80,9 @@ class Critical:
         present = with_unit(f"{self.present:.6g}", self.unit)
         lines = [f"{self.topology}: {self.parameter} is {present}", ""]
         if self.value is None:
-            lines.append(f"  {self.verdict}")
+            lines += wrapped(self.verdict, "  ", "  ")
+        if not self.enters:
+            return "\n".join(lines)
         for one in self.crossings:
             mark = "→" if one.value == self.value else " "
             error = f" ± {one.error:.0e}" if one.error else ", exact"
@@ -91,7 +97,12 @@ class Critical:
 
 
 def critical(
-    system: CompiledSystem, name: str, *, lower: str | None = None, upper: str | None = None
+    system: CompiledSystem,
+    name: str,
+    *,
+    lower: str | None = None,
+    upper: str | None = None,
+    told: Told | None = None,
 ) -> Critical:
     """Find every value of a parameter at which a scene becomes stable or unstable.
 
@@ -103,7 +114,10 @@ def critical(
         The parameter or delay, of one group or of all (see `names.find`).
     lower, upper
         Quantities between which to look, such as "5000 N/m". Without `lower`, from the least value allowed,
-        or 0; without `upper`, up to `SPAN` times the present value (of a delay, over `PIECES` pieces).
+        or 0 (of a negative value, from `SPAN` times it); without `upper`, up to `SPAN` times the present
+        value (of a delay, over `PIECES` pieces).
+    told
+        Is told how far the search is.
 
     Raises
     ------
@@ -112,24 +126,25 @@ def critical(
         parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear; and those of
         `units.quantity`.
     """
-    known, group = find(system, name, _PLACE)
+    known, group = find(system, name.strip(), _PLACE)
     free = Free(known, group)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         timed = reaches_time(system, free)
         unit = unit_of(system, known)
         present = float(delay_now(system, free)) if timed else parameter_of(system, free).value
-        limits = [_limit(text, free, unit) for text in (lower, upper)]
+        limits = [_limit(*one, free, unit) for one in (("--lower", lower), ("--upper", upper))]
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
         if timed:
             _refuse_moving_start(system, prepared)
-            found = search_delay(system, free, limits[0] or 0.0, limits[1], prepared)
+            found = search_delay(system, free, limits[0] or 0.0, limits[1], prepared, told=told)
         else:
-            found = search(system, free, limits[0], limits[1], prepared)
+            found = search(system, free, limits[0], limits[1], prepared, told=told)
     chosen = _chosen(found, present)
-    every = set(found.stable)
-    words = "stable" if every == {True} else "unstable"
-    verdict = f"{words} at every value scanned" if found.stable else "undecided at every value scanned"
+    words = "stable" if found.stable == (True,) else "unstable" if found.stable else "undecided"
+    verdict = f"{words} at every value scanned"
+    if not found.enters:
+        verdict = f"{words} whatever its value: nothing that decides stability depends on it"
     return Critical(
         topology=system.name,
         parameter=free.label,
@@ -142,6 +157,7 @@ def critical(
         scanned=found.scanned,
         cell=CELL,
         whole=found.whole,
+        enters=found.enters,
         verdict="" if chosen else verdict,
     )
 
@@ -149,20 +165,16 @@ def critical(
 def _refuse_moving_start(system: CompiledSystem, prepared: Prepared) -> None:
     """Refuse a delay of a scene whose matrices don't follow from its parameters in closed form."""
     used = [prepared.jacobians[group.kind] for group in system.groups]
-    if not all(site.affine and not site.edges for site in used):
+    if not all(site.parameters_suffice for site in used):
         what = "the scene is linearized at its start: the critical value of a delay can't be searched"
         raise ApcError(
             Mistake("E845", Place(system.name), what, hint="apc critical of a stiffness or damping")
         )
 
 
-def _limit(text: str | None, free: Free, unit: str) -> float | None:
-    """Read a limit."""
-    if text is None:
-        return None
-    from apc.compiler.units import quantity  # it brings in pint
-
-    return float(quantity(text, Place("limit", 1, 1, text), what=free.name, unit=unit).value)
+def _limit(option: str, text: str | None, free: Free, unit: str) -> float | None:
+    """Read a limit, None if there is none."""
+    return None if text is None else float(given(option, text, what=free.name, unit=unit))
 
 
 def _check_limits(system: CompiledSystem, free: Free, limits: Sequence[float | None], *, timed: bool) -> None:

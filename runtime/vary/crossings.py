@@ -134,13 +134,22 @@ class _Samples:
         order = np.argsort(points, kind="stable")
         return _Samples(
             points[order],
-            tuple(np.concatenate(pair)[order] for pair in zip(self.values, other.values, strict=True)),
-            tuple(np.concatenate(pair)[order] for pair in zip(self.slopes, other.slopes, strict=True)),
+            tuple(_stacked(*pair)[order] for pair in zip(self.values, other.values, strict=True)),
+            tuple(_stacked(*pair)[order] for pair in zip(self.slopes, other.slopes, strict=True)),
         )
 
     def radius(self) -> Floats:
         sizes = [np.abs(one).max(axis=1) for one in self.values if one.shape[1]]
         return np.asarray(np.max(sizes, axis=0)) if sizes else np.zeros(len(self.points))
+
+
+def _stacked(one: Complexes, other: Complexes) -> Complexes:
+    """Return rows of both, those of fewer states filled up with zeros, which decide nothing.
+
+    A scene that is linearized at its start may have more free motions there at one value than at another.
+    """
+    wide = max(one.shape[1], other.shape[1])
+    return np.concatenate([np.pad(rows, ((0, 0), (0, wide - rows.shape[1]))) for rows in (one, other)])
 
 
 def scan(course: Course, points: Floats, *, least: float) -> Scan:
@@ -218,12 +227,15 @@ def _open(samples: _Samples) -> Truths:
     for values, slopes in zip(samples.values, samples.slopes, strict=True):
         if not values.shape[1]:
             continue
-        ends = (values[:-1], slopes[:-1] * width, values[1:], slopes[1:] * width)
-        least, most, single, upper = _extremes(*ends)
-        inside &= (most < 1).all(axis=1)
+        # Every cell both ways at once: forward, and as it looks from its end.
+        ends = np.concatenate([values[:-1], values[1:]]), np.concatenate([values[1:], values[:-1]])
+        rises = np.concatenate([slopes[:-1] * width, -slopes[1:] * width])
+        end_rises = np.concatenate([slopes[1:] * width, -slopes[:-1] * width])
+        least, most, single, upper = _extremes(ends[0], rises, ends[1], end_rises)
+        inside &= (most < 1).reshape(2, len(width), -1).all(axis=(0, 2))
+        least, most = least[: len(width)], most[: len(width)]
+        single, upper = single[: len(width)], upper[: len(width)]
         outside |= (least > 1).any(axis=1)
-        backward = _extremes(ends[2], -ends[3], ends[0], -ends[1])
-        inside &= (backward[1] < 1).all(axis=1)
         crossing += ((most >= 1) & ~(single & upper)).sum(axis=1) * 2
         crossing += ((most >= 1) & single & upper).sum(axis=1)
         lower = (most >= 1) & single & ~upper

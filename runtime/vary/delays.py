@@ -19,6 +19,7 @@ from fractions import Fraction
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.analysis.analysis import Prepared, lifted_groups
+from apc.runtime.analysis.plan import LONG_LINES
 from apc.runtime.frame.hyperperiod import common_divisor
 from apc.runtime.frame.names import Free
 from apc.runtime.frame.overrides import Override, apply
@@ -39,13 +40,16 @@ _Form = tuple[object, ...]
 class Piece:
     """Delays between `low` and `high` seconds; the ends are limits from within.
 
-    `constant` says that nothing depends on the delay within the piece.
+    `constant` says that nothing depends on the delay within the piece: `inside`, the scene at one of its
+    delays, stands for all. With that many packets on their way it has no `evaluator`, whose matrices would
+    hold them all.
     """
 
     low: Fraction
     high: Fraction
-    evaluator: BatchEvaluator
+    evaluator: BatchEvaluator | None
     constant: bool
+    inside: CompiledSystem
 
 
 def system_with_delay(system: CompiledSystem, free: Free, value: Fraction) -> CompiledSystem:
@@ -103,16 +107,15 @@ def delay_pieces(
 
 def _grid(system: CompiledSystem, free: Free, place: Place) -> Callable[[Fraction], Fraction]:
     """Return what gives the next value at which events may coincide that don't at the values before it."""
+    fixed = {time for clock in system.clocks for time in (clock.period, clock.phase)}
+    if free.name in fixed:
+        raise _rhythm(free, place)
     now = delay_now(system, free)
     step = Fraction(1, 1009)
     at = [resolve(system_with_delay(system, free, now + share * step)).timings for share in (0, 1, 2)]
     reached = [name for name in at[0] if at[0][name] != at[1][name]]
-    fixed = {time for clock in system.clocks for time in (clock.period, clock.phase)}
     if any(name in fixed for name in reached):
-        what = (
-            f"{free.name} sets the rhythm of a clock, and with it the frame: it can't be varied continuously"
-        )
-        raise ApcError(Mistake("E844", place, what, hint="apc analyze with --set, one value at a time"))
+        raise _rhythm(free, place)
     lines = []
     for name in reached:
         slope = (at[1][name] - at[0][name]) / step
@@ -134,6 +137,11 @@ def _grid(system: CompiledSystem, free: Free, place: Place) -> Callable[[Fractio
         return min(found)
 
     return following
+
+
+def _rhythm(free: Free, place: Place) -> ApcError:
+    what = f"{free.name} sets the rhythm of a clock, and with it the frame: it can't be varied continuously"
+    return ApcError(Mistake("E844", place, what, hint="apc analyze with --set, one value at a time"))
 
 
 def _piece(
@@ -163,13 +171,15 @@ def _piece(
             durations[quanta] = (float(first - slope * values[0]), float(slope))
     key = tuple((_form(one), tuple(sorted(_steps(one, one).values()))) for one in schedules[0])
     if constant and key in known:
-        return Piece(low, high, known[key], constant)
+        return Piece(low, high, known[key], constant, systems[0])
+    if constant and max(sum(one.depths) for one in schedules[0]) > LONG_LINES:
+        return Piece(low, high, None, constant, systems[0])
     shared = Prepared(prepared.jacobians, schedules[0], resolve(systems[0]).timings, prepared.order)
     groups, exchange = lifted_groups(systems[0], prepared=shared)
     found = batch_evaluator(systems[0], (free,), groups, exchange, durations=durations)
     if constant:
         known[key] = found
-    return Piece(low, high, found, constant)
+    return Piece(low, high, found, constant, systems[0])
 
 
 def _form(schedule: Schedule) -> _Form:

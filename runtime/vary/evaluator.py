@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import PEERS, CompiledSystem, Parameter
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Prepared, lifted_groups, prepare
-from apc.runtime.eigen.modes import ClosedSystem, split
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.frame.overrides import Override, apply
@@ -164,7 +165,7 @@ def evaluator(
     """
     prepared = prepared or prepare(system)
     used = [prepared.jacobians[group.kind] for group in system.groups]
-    if not all(site.affine and not site.edges for site in used):
+    if not all(site.parameters_suffice for site in used):
         return PointEvaluator(system, tuple(free), prepared)
     groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
     return batch_evaluator(system, free, groups, exchange)

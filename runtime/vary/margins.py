@@ -105,7 +105,7 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, pieces:
         if isinstance(found, str):
             return Margins((), found)
         used = [prepared.jacobians[group.kind] for group in system.groups]
-        if not all(site.affine and not site.edges for site in used):
+        if not all(site.parameters_suffice for site in used):
             return Margins(tuple(found), "delays were not varied: the scene is linearized at its start")
         delays = [_delay_margin(system, one, prepared, pieces) for one in _delays(system)]
         return Margins((*found, *delays), "")

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -22,18 +22,24 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
-from apc.runtime.analysis.analysis import Prepared, lifted_groups
-from apc.runtime.eigen.modes import ClosedSystem, split
+from apc.compiler.words import counted
+from apc.runtime.analysis.analysis import Prepared, analyze, lifted_groups
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes
-from apc.runtime.eigen.spectrum import angle_in_frame
+from apc.runtime.eigen.spectrum import DRIFTS
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
-from apc.runtime.vary.bracket import Bracket, bracket
+from apc.runtime.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.runtime.vary.crossings import Root, Scan, eigenvalues, scan
 from apc.runtime.vary.delays import Piece, delay_pieces, system_with_delay
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
+from apc.runtime.vary.marginal import marginal_motion
 
 Floats = NDArray[np.float64]
+
+# Is told, in words, how far a search is.
+Told = Callable[[str], None]
 
 # Without limits given, values from SPAN times smaller to SPAN times larger than the scale are scanned: the
 # present value or, where that is 0, the change that would move an eigenvalue by 1 if it went on as it starts.
@@ -50,6 +56,10 @@ PIECES = 64
 
 # Samples in a piece of a delay to begin with.
 PIECE_SAMPLES = 3
+
+# How far inside a piece, relative to its length, its matrices are those of its end, but for the order of
+# events that coincide there.
+BESIDE = Fraction(1, 10**6)
 
 _PLACE = Place("critical value")
 
@@ -87,13 +97,15 @@ class Search:
     """All crossings of one parameter in an interval, with what lies between them.
 
     `edges` are the crossings in order, and `stable` says of each stretch, one more than there are crossings,
-    whether it is stable; it is empty when no sample told.
+    whether it is stable; it is empty when no sample told. `enters` says whether any matrix was seen to change
+    along the way.
     """
 
     edges: tuple[Crossing, ...]
     stable: tuple[bool, ...]
     scanned: tuple[float, float]
     whole: bool
+    enters: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +139,13 @@ class Line:
 
 
 def search(
-    system: CompiledSystem, free: Free, low: float | None, high: float | None, prepared: Prepared
+    system: CompiledSystem,
+    free: Free,
+    low: float | None,
+    high: float | None,
+    prepared: Prepared,
+    *,
+    told: Told | None = None,
 ) -> Search:
     """Find the crossings of a parameter that reaches no time.
 
@@ -141,18 +159,43 @@ def search(
         Between which values, None for those of `critical`.
     prepared
         From `analysis.prepare`.
+    told
+        Is told how far the search is.
     """
     parameter = parameter_of(system, free)
     family = evaluator(system, [free], prepared=prepared)
     line = Line(family, np.array([parameter.value]), 0)
     scale = line.scale()
-    bottom = low if low is not None else (parameter.minimum or 0.0)
+    bottom = low
+    if bottom is None:
+        bottom = parameter.minimum
+    if bottom is None:
+        bottom = -SPAN * scale if parameter.value < 0 else 0.0
     top = high if high is not None else max(SPAN * scale, bottom + scale)
     if parameter.maximum is not None:
         top = min(top, parameter.maximum)
-    found = scan(line.course, spread(bottom, top, scale), least=scale / SPAN)
-    edges = [proved_crossing(root, line, found) for root in found.roots]
-    return _search(edges, found, (bottom, top))
+    looked, enters = 0, False
+    present = line.course(line.base[[line.column]])
+
+    def course(values: Floats) -> Sequence[tuple[Floats, Floats]]:
+        nonlocal looked, enters
+        looked += len(values)
+        if told:
+            told(f"looking at {counted(looked, 'value')} of {free.label}")
+        pairs = line.course(values)
+        enters = enters or any(
+            bool(slope.any()) or len(one[0]) != len(matrix[0]) or not np.all(matrix == one)
+            for (matrix, slope), (one, _) in zip(pairs, present, strict=True)
+        )
+        return pairs
+
+    found = scan(course, spread(bottom, top, scale), least=scale / SPAN)
+    edges = []
+    for number, root in enumerate(found.roots):
+        if told:
+            told(f"proving crossing {number + 1} of {len(found.roots)}")
+        edges.append(proved_crossing(root, line, found))
+    return _search(edges, found, (bottom, top), enters=enters)
 
 
 def spread(bottom: float, top: float, scale: float) -> Floats:
@@ -174,18 +217,18 @@ def spread(bottom: float, top: float, scale: float) -> Floats:
     return np.asarray(found[np.append(True, np.diff(found) > 0)])
 
 
-def _search(edges: Sequence[Crossing], found: Scan, asked: tuple[float, float]) -> Search:
+def _search(edges: Sequence[Crossing], found: Scan, asked: tuple[float, float], *, enters: bool) -> Search:
     """Put the crossings together with the stretches between them."""
     points, radius = found.points, found.radius
     if not len(points):
-        return Search((), (), asked, whole=False)
+        return Search((), (), asked, whole=False, enters=enters)
     ends = [-np.inf, *(one.value for one in edges), np.inf]
     stable = tuple(
         bool(radius[(points > low) & (points < high)][0] < 1) for low, high in itertools.pairwise(ends)
     )
     # A limit on which an eigenvalue lies on the circle, as a stiffness of exactly 0, is no sample itself.
     scanned = (min(asked[0], float(points[0])), min(asked[1], float(points[-1])))
-    return Search(tuple(edges), stable, scanned, found.whole)
+    return Search(tuple(edges), stable, scanned, found.whole, enters)
 
 
 def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
@@ -199,46 +242,45 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
         return listed
 
     if not isinstance(family, BatchEvaluator):
-        return _described(root, None, family.closed_at(point(root.value)))
+
+        def all_of_them(value: float) -> tuple[ClosedSystem, ...]:
+            return family.closed_at(point(value))
+
+        held = bracket_in_floats(root, all_of_them, low=float(low), high=float(high))
+        return _described(root, held, [(one, _free(one)) for one in all_of_them(root.value)])
 
     def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
         listed = zip(family.exact_at(point(value)), family.wirings, strict=True)
-        return [
-            (one, find_rigid_modes(one, with_drifts=False) if wiring.moving else wiring.rigid)
-            for one, wiring in listed
-        ]
+        return [(one, _free(one) if wiring.moving else wiring.rigid) for one, wiring in listed]
+
+    def at(value: float) -> ClosedSystem:
+        return family.system_at(point(value), root.system)
 
     proved = bracket(root, systems, low=float(low), high=float(high))
-    return _described(root, proved, [family.system_at(point(root.value), root.system)])
-
-
-def _described(root: Root, proved: Bracket | None, closed: Sequence[ClosedSystem]) -> Crossing:
-    """Return the crossing of a root; without a proof, with the error that floats are trusted with."""
     if proved is None:
+        proved = bracket_in_floats(root, lambda value: [at(value)], low=float(low), high=float(high))
+    return _described(root, proved, [(at(root.value), systems(root.value)[root.system][1])])
+
+
+def _free(system: ClosedSystem) -> RigidModes:
+    return find_rigid_modes(system, with_drifts=False)
+
+
+def _described(
+    root: Root, held: Bracket | None, systems: Sequence[tuple[ClosedSystem, RigidModes]]
+) -> Crossing:
+    """Return the crossing of a root; if no bracket holds it, with the error that floats are trusted with."""
+    if held is None:
         error = FLOAT_ROUNDINGS / abs(root.slope) if root.slope else root.high - root.low
-        proved = Bracket(root.value, max(error, abs(root.value) * FLOAT_ROUNDINGS), "estimated in floats")
+        held = Bracket(root.value, max(error, abs(root.value) * FLOAT_ROUNDINGS), "estimated in floats")
     return Crossing(
-        value=proved.value,
-        error=proved.error,
+        value=held.value,
+        error=held.error,
         stable_side="below" if root.rising else "above",
-        frequency_hz=_frequency(root.eigenvalue, closed),
+        frequency_hz=marginal_motion(systems, root.eigenvalue).frequency_hz,
         kind="crossing",
-        proof=proved.proof,
+        proof=held.proof,
     )
-
-
-def _frequency(value: complex, closed: Sequence[ClosedSystem]) -> float:
-    """Return the frequency of an eigenvalue of some of the systems, whole turns within a frame counted."""
-    best: tuple[float, float] = (np.inf, 0.0)
-    for system in closed:
-        values, right = np.linalg.eig(system.matrix)
-        place = int(np.argmin(np.abs(values - value)))
-        found, covectors = np.linalg.eig(system.matrix.T)
-        covector = covectors[:, int(np.argmin(np.abs(found - values[place])))]
-        shares = np.abs(right[:, place] * covector)
-        angle = angle_in_frame(system, complex(values[place]), right[:, place], shares)
-        best = min(best, (float(np.abs(values[place] - value)), abs(angle) / (2 * np.pi * system.frame_s)))
-    return best[1]
 
 
 def search_delay(
@@ -250,6 +292,7 @@ def search_delay(
     *,
     pieces: int = PIECES,
     first_above: float | None = None,
+    told: Told | None = None,
 ) -> Search:
     """Find the crossings of a delay: within pieces as of any parameter, and jumps between them.
 
@@ -267,6 +310,8 @@ def search_delay(
         How many pieces of the delay are scanned where `high` is not given.
     first_above
         Stop at the first crossing above this value.
+    told
+        Is told how far the search is.
 
     Notes
     -----
@@ -281,14 +326,17 @@ def search_delay(
     every = delay_pieces(system, free, start, prepared, place=_PLACE, high=end)
     for piece in itertools.islice(every, pieces if end is None else None):
         at = piece.high if end is None else min(piece.high, end)
-        found = _piece_scan(piece, float(piece.low), float(at))
+        if told:
+            until = f" of {float(end):.6g} s" if end is not None else ""
+            told(f"looking at {free.label} up to {float(at):.6g} s{until}")
+        found = _piece_scan(piece, float(piece.low), float(at), prepared)
         whole = whole and found.whole
         if not len(found.points):
             continue
         first = bool(found.radius[0] < 1)
         if stable and stable[-1] != first:
             assert before is not None, "what came before was scanned"
-            edges.append(_jump(before, piece, stable_below=stable[-1]))
+            edges.append(_jump(system, free, before, piece, prepared, stable_below=stable[-1]))
         if not stable or stable[-1] != first:
             stable.append(first)
         for root in found.roots:
@@ -297,34 +345,48 @@ def search_delay(
         before = piece
         if first_above is not None and edges and edges[-1].value > first_above:
             break
-    return Search(tuple(edges), tuple(stable), (float(start), float(at)), whole)
+    return Search(tuple(edges), tuple(stable), (float(start), float(at)), whole, enters=True)
 
 
-def _piece_scan(piece: Piece, low: float, high: float) -> Scan:
+def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> Scan:
     """Scan one piece, its ends as limits from within."""
     family = piece.evaluator
+    if family is None:
+        found = analyze(piece.inside, prepared=prepared)
+        if found.stable is None or found.verdict == DRIFTS:
+            return Scan(np.empty(0), np.empty(0), (), whole=found.verdict == DRIFTS)
+        return Scan(np.array([low]), np.array([found.spectral_radius]), (), whole=True)
 
     def course(points: Floats) -> Sequence[tuple[Floats, Floats]]:
         if family.timed:
             return family.slopes(points[:, None], np.ones((len(points), 1)))
-        found = family.matrices(points[:, None])
-        return [(matrix, np.zeros_like(matrix)) for matrix in found]
+        matrices = family.matrices(points[:, None])
+        return [(matrix, np.zeros_like(matrix)) for matrix in matrices]
 
     points = np.array([low]) if piece.constant else np.linspace(low, high, PIECE_SAMPLES)
     return scan(course, points, least=high - low)
 
 
-def _jump(before: Piece, after: Piece, *, stable_below: bool) -> Crossing:
+def _jump(
+    system: CompiledSystem,
+    free: Free,
+    before: Piece,
+    after: Piece,
+    prepared: Prepared,
+    *,
+    stable_below: bool,
+) -> Crossing:
     """Describe a change of side between two pieces: the delay at which events coincide, exactly."""
-    family = (after if stable_below else before).evaluator  # the motion that grows is on that side
-    found = [np.linalg.eigvals(one[0]) for one in family.matrices(np.array([[float(after.low)]]))]
-    place = int(np.argmax([float(np.abs(one).max(initial=0.0)) for one in found]))
-    worst = complex(found[place][int(np.argmax(np.abs(found[place])))])
+    # The motion that grows is on the unstable side.
+    piece, way = (after, 1) if stable_below else (before, -1)
+    beside = after.low + way * BESIDE * (piece.high - piece.low)
+    grows = piece.inside if piece.constant else system_with_delay(system, free, beside)
+    modes = analyze(grows, prepared=prepared).modes
     return Crossing(
         value=float(after.low),
         error=0.0,
         stable_side="below" if stable_below else "above",
-        frequency_hz=_frequency(worst, [family.closed[place]]),
+        frequency_hz=modes[0].frequency_hz,
         kind="jump",
         proof="events coincide there",
     )
@@ -341,6 +403,12 @@ def _delay_crossing(
         listed = split(*lifted_groups(moved, prepared=prepared)).systems
         return [(one, find_rigid_modes(one, with_drifts=False)) for one in listed]
 
-    proved = bracket(root, systems, low=float(piece.low), high=float(piece.high))
-    closed = [systems(root.value)[root.system][0]]
-    return _described(root, proved, closed)
+    held = bracket(root, systems, low=float(piece.low), high=float(piece.high))
+    if held is None:
+        held = bracket_in_floats(
+            root,
+            lambda value: [systems(value)[root.system][0]],
+            low=float(piece.low),
+            high=float(piece.high),
+        )
+    return _described(root, held, [systems(root.value)[root.system]])

@@ -256,15 +256,21 @@ def _doubt(matrix: Floats, slope: Floats, error: Floats, right: Complexes, left:
 
 def sensitivity_report(found: Sensitivities) -> str:
     """Return the table "what moves it most", of at most 80 columns."""
-    shown = [row for row in found.rows if row.derivative][:SHOWN]
+    # Eigenvalues that share the radius often change alike, and then one row tells it.
+    alike: dict[tuple[str, str], list[Sensitivity]] = {}
+    for row in found.rows:
+        if row.relative:
+            alike.setdefault((row.parameter, f"{row.relative / 100:+.2e}"), []).append(row)
+    shown = list(alike.items())[:SHOWN]
     if not shown:
-        return "\n".join(wrapped(found.note or "no parameter moves the spectral radius", "  ", "    "))
-    width = max(len(row.parameter) for row in shown)
+        note = found.note if len(found.active) < 2 else ""
+        return "\n".join(wrapped(note or "no parameter moves the spectral radius", "  ", "    "))
+    width = max(len(name) for (name, _), _ in shown)
     lines = ["  what moves it most" + " " * max(width - 16, 2) + "value            per percent"]
-    for row in shown:
-        mode = f"  mode {row.mode + 1}" if len(found.active) > 1 else ""
-        value = with_unit(f"{row.value:.6g}", row.unit)
-        lines.append(f"  {row.parameter:<{width}}  {value:<16} {row.relative / 100:+.2e}{mode}")
+    for (name, change), rows in shown:
+        some = ", ".join(str(row.mode + 1) for row in rows) if len(rows) < len(found.active) else ""
+        value = with_unit(f"{rows[0].value:.6g}", rows[0].unit)
+        lines.append(f"  {name:<{width}}  {value:<16} {change}{f'  mode {some}' if some else ''}")
     if found.note:
         lines += wrapped(found.note, "  ", "    ")
     return "\n".join(lines)

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.modes import ClosedSystem, Packet, packet_places
-from apc.runtime.eigen.peers import PeerGroup
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.loop import Packet, packet_places
+from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
 
 Floats = NDArray[np.float64]

@@ -1,4 +1,5 @@
-"""Every figure of this folder's page by one command: `python -m tests.bench` writes README.md beside it.
+"""Every figure by one command: `python -m tests.bench` writes README.md beside it, and what the project's
+README.md shows, its pictures too.
 
 `--quick` takes smaller runs of each, `--only NAME` one or more of them, and keeps the rest of the page.
 """
@@ -40,6 +41,7 @@ def _own(name: str, *words: str) -> tuple[str, ...]:
 
 
 PARTS = (
+    Part("readme", "Pictures and blocks of the README", _own("readme")),
     Part("process", "Whole processes", _own("process"), _own("process", "--runs", "3")),
     Part(
         "scenes",
@@ -47,12 +49,12 @@ PARTS = (
         _own("scenes"),
         _own("scenes", "--rounds", "3"),
     ),
+    Part("needs", "What each scene needs", _own("needs")),
     Part("bench", "Speed against error on the paper's scene", ("apc", "bench", AVERAGE)),
     Part("hard", "Hard cases", ("apc", "bench", "--hard", "tests/hard")),
     Part("scale", "More peers", ("apc", "bench", AVERAGE, "--scale", "3,30,300,3000,30000,1e6")),
     Part("random", "Random scenes", _own("random_scenes"), _own("random_scenes", "--points", "200")),
     Part("comparison", "Other programs", _own("comparison")),
-    Part("drake", "Drake", _own("drake")),
     Part("work_precision", "Methods of simulation", _own("work_precision")),
     Part("simulate", "Simulation", _own("simulate"), _own("simulate", "--quick")),
     Part("language", "Compiling", _own("language"), _own("language", "--quick")),

@@ -1,7 +1,6 @@
-"""The paper's scene asked of other programs for the same answer: `python -m tests.bench.comparison`.
+"""The paper's scene asked of other programs for the same answers: `python -m tests.bench.comparison`.
 
-Each is asked for the spectral radius of one frame, without the eigenvalue 1 of the common translation; times
-and errors stand side by side, the error against fifty digits.
+First the spectral radius of one frame, without the eigenvalue 1 of the common translation:
 
     apc             compiled before; the analysis alone
     NumPy by hand   SciPy's exponential of one user, a frame of eight ticks, users joined by hand
@@ -9,8 +8,15 @@ and errors stand side by side, the error against fifty digits.
     python-control  the plants sampled by its `c2d`; it has no systems of several rates, so that the frame is
                     again joined by hand
 
-Where an eigenvalue has to be told from 1 by its distance, as by all but apc, it is the one nearest to 1.
-FMPy and PathSim simulate and know no spectral radius; Drake's simulation is compared in `tests.bench.drake`.
+Where an eigenvalue has to be told from 1 by its distance, as by all but apc, it is the one nearest to 1. Then
+the states at every tick while three users' cube swings:
+
+    apc             prepared before; the run alone
+    NumPy by hand   a loop over the ticks, all users at once, its steps exact
+    Drake, PathSim  see `tests.bench.drake` and `tests.bench.pathsim`: neither knows a spectral radius
+
+Times (of the processor) and errors (against fifty digits) stand side by side. FMPy is left out: it runs
+models that another program has exported, and none that could state the scene and export it comes with pip.
 """
 
 from __future__ import annotations
@@ -29,8 +35,13 @@ from scipy.linalg import expm
 import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import analyze
-from apc.runtime.bench.reference import Truth, spectral_truth
+from apc.runtime.bench.reference import Truth, exact_course, spectral_truth
+from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.simulation import Simulation, prepare
 from apc.runtime.threads import single_threaded
+from tests.bench.drake import played_by_drake
+from tests.bench.pathsim import played_by_pathsim
+from tests.bench.simulate import MOVED, numpy_loop
 from tests.topologies import AVERAGE, compiled
 
 Floats = NDArray[np.float64]
@@ -41,6 +52,14 @@ DEVICE, CUBE = 0.1, 0.2  # kg
 K_C, K_T = 1000.0, 500.0  # N/m
 # Damping of device and cube, in N·s/m: the paper's, and one at which the textbook's form loses its digits.
 DAMPINGS = (5.0, 1e-6)
+SECONDS = 1  # that are played
+# By its name: what is installed for it, and the tolerances asked of it after the one it comes with.
+SIMULATORS = {
+    "Drake": ("pydrake", "drake", played_by_drake, (None, 1e-8)),
+    "PathSim": ("pathsim", "pathsim", played_by_pathsim, (None, 1e-10)),
+}
+WHOLE = "apc's time is that of the whole answer:\nevery mode and its shape, and a bound on its error\n"
+WITHOUT = "FMPy is left out: what it runs another program has to export,\nand none that can comes with pip"
 
 
 def by_exponential(mass: float, damping: float) -> Floats:
@@ -102,9 +121,9 @@ def compare(damping: float, rounds: int = ROUNDS) -> dict[str, tuple[float, floa
     with single_threaded():
         for _ in range(rounds):
             for name, call in calls.items():
-                began = time.perf_counter()
+                began = time.process_time()
                 found[name] = call()
-                times[name].append(time.perf_counter() - began)
+                times[name].append(time.process_time() - began)
     exact = Fraction(truth.digits)
     return {
         name: (statistics.median(times[name]), float(abs(Fraction(found[name]) - exact))) for name in calls
@@ -117,17 +136,58 @@ def scene(damping: float) -> CompiledSystem:
     return apc.set_parameters(compiled(AVERAGE), {"device.damping": value, "cube.damping": value})
 
 
+def play(rounds: int = ROUNDS) -> dict[str, tuple[float, float]]:
+    """Return (median seconds, largest error of a state in m and m/s) by program; others play once."""
+    system = compiled(MOVED)
+    truth = exact_course(system, Fraction(SECONDS))
+    assert not isinstance(truth, str), truth
+    ready = prepare(system, Fraction(SECONDS), signals=["*.x", "*.v"])
+    ticks = round(SECONDS / TICK) + 1
+    calls: dict[str, Callable[[], Floats]] = {
+        "apc": lambda: _rows(ready),
+        "NumPy by hand": lambda: numpy_loop(ticks)[:, :, :4].reshape(ticks, -1),
+    }
+    found: dict[str, tuple[float, float]] = {}
+    with single_threaded():
+        for name, call in calls.items():
+            times = []
+            for _ in range(rounds):
+                began = time.process_time()
+                rows = call()
+                times.append(time.process_time() - began)
+            found[name] = statistics.median(times), float(np.abs(rows - truth[1]).max())
+        for name, (module, _, played, tolerances) in SIMULATORS.items():
+            for tolerance in tolerances if importlib.util.find_spec(module) else ():
+                rows, taken = played(float(SECONDS), tolerance)
+                title = name if tolerance is None else f"{name}, {tolerance:g}"
+                found[title] = taken, float(np.abs(rows - truth[1]).max())
+    return found
+
+
+def _rows(ready: Simulation) -> Floats:
+    return np.concatenate([block.values for block in blocks(ready)])
+
+
+def show(title: str, table: dict[str, tuple[float, float]]) -> None:
+    """Print a table of times and errors."""
+    print(f"{title}\n\n  program              median      ratio      error")
+    for name, (seconds, error) in table.items():
+        print(f"  {name:<16} {1e3 * seconds:8.3f} ms {seconds / table['apc'][0]:10.3f} {error:10.1e}")
+    print()
+
+
 def main() -> None:
-    """Print a table for each damping."""
+    """Print a table for each question, and who is left out."""
     for damping in DAMPINGS:
-        print(f"spectral radius of the paper's scene, damping {damping:g} N·s/m\n")
-        print("  program              median      ratio      error")
-        table = compare(damping)
-        for name, (seconds, error) in table.items():
-            print(f"  {name:<16} {1e3 * seconds:8.3f} ms {seconds / table['apc'][0]:10.3f} {error:10.1e}")
-        print()
-    if not importlib.util.find_spec("control"):
-        print("python-control is left out: it is not installed (pip install control)")
+        show(f"spectral radius of the paper's scene, damping {damping:g} N·s/m", compare(damping))
+    print(WHOLE)
+    show(f"12 states of three users at every tick of {SECONDS} s, error in m and m/s", play())
+    packages = {"python-control": ("control", "control")}
+    packages |= {name: (module, package) for name, (module, package, *_) in SIMULATORS.items()}
+    for name, (module, package) in packages.items():
+        if not importlib.util.find_spec(module):
+            print(f"{name} is left out: it is not installed (pip install {package})")
+    print(WITHOUT)
 
 
 if __name__ == "__main__":

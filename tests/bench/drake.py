@@ -1,33 +1,20 @@
-"""The three-user scene in Drake's simulator and in ours, error beside time: `python -m tests.bench.drake`.
+"""The three-user scene in Drake's simulator.
 
 Drake (drake.mit.edu, `pip install drake`) is given the scene as a diagram of its own C++ systems: one linear
 plant of 12 states, gains, delays and holds; nothing of it is Python while it runs. The forces' delay is a
 DiscreteTimeDelay of one tick. A packet is taken by a hold at its network tick and handed on by a second one
 half a millisecond before it is due: in Drake what is read at a coincident tick is what was before, so that a
 hold that switched at the very tick would be read a tick late.
-
-Both record all states at every tick. The error is the distance from a loop over the ticks in NumPy, whose
-steps are exact.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import time
-from collections.abc import Callable
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.simulation import prepare
-from apc.runtime.threads import single_threaded
-from tests.bench.simulate import MOVED, best, numpy_loop
-from tests.topologies import compiled
-
-SECONDS = 10
 FAST, SLOW = 1e-3, 8e-3
 USERS = 3
 
@@ -80,7 +67,7 @@ def diagram() -> tuple[Any, Any, Any]:
     return builder.Build(), plant, log
 
 
-def played_by_drake(accuracy: float | None) -> tuple[NDArray[np.float64], float]:
+def played_by_drake(seconds: float, accuracy: float | None) -> tuple[NDArray[np.float64], float]:
     """Return the states at every tick (ticks, 12) and the seconds that the run took."""
     from pydrake.systems.analysis import Simulator
 
@@ -93,35 +80,7 @@ def played_by_drake(accuracy: float | None) -> tuple[NDArray[np.float64], float]
     if accuracy is not None:
         simulator.get_mutable_integrator().set_target_accuracy(accuracy)
     simulator.Initialize()
-    began = time.perf_counter()
-    simulator.AdvanceTo(float(SECONDS))
-    taken = time.perf_counter() - began
+    began = time.process_time()
+    simulator.AdvanceTo(seconds)
+    taken = time.process_time() - began
     return log.FindLog(context).data().T.copy(), taken
-
-
-def main() -> None:
-    """Print the comparison, or why there is none."""
-    if importlib.util.find_spec("pydrake") is None:
-        print("Drake is not installed (pip install drake): nothing to compare with")
-        return
-    with single_threaded():
-        expected = numpy_loop(1000 * SECONDS + 1)[:, :, :4].reshape(-1, 12)
-        ready = prepare(compiled(MOVED), Fraction(SECONDS), signals=["*.x", "*.v"])
-        run: Callable[[], list[Any]] = lambda: list(blocks(ready))  # noqa: E731 -- a name for what is timed
-        ours = best(run)
-        rows = np.concatenate([block.values for block in run()])
-        print(f"{SECONDS} s of three users, 12 states at every tick")
-        error = np.abs(rows - expected).max()
-        print(f"  {'this project':<22}  {1e3 * ours:8.2f} ms   error {error:.1e} m, m/s")
-        for accuracy in (None, 1e-8):
-            found, taken = played_by_drake(accuracy)
-            error = np.abs(found - expected).max()
-            name = "Drake as it comes" if accuracy is None else f"Drake, accuracy {accuracy:g}"
-            print(
-                f"  {name:<22}  {1e3 * taken:8.2f} ms   error {error:.1e} m, m/s   "
-                f"{taken / ours:.0f} times ours"
-            )
-
-
-if __name__ == "__main__":
-    main()

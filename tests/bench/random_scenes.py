@@ -149,7 +149,7 @@ def check(found: Analysis, radius: flint.arb, rigid: int) -> str:
     )
 
 
-def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",)) -> Tally:
+def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws: int = DRAWS) -> Tally:
     """Analyse so many random scenes by each method.
 
     Parameters
@@ -160,11 +160,13 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",)) -> Ta
         Of what is drawn.
     methods
         See `analysis.analyze`.
+    draws
+        Of numbers for each structure.
     """
     generator, tally = random.Random(seed), Tally()
     with single_threaded(), precision(BITS):
         for number in range(points):
-            if number % DRAWS == 0:
+            if number % draws == 0:
                 text = structure(generator)
                 plain = compiled(text)
             drawn = numbers(generator)

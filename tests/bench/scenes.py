@@ -13,11 +13,13 @@ def main() -> None:
     """Print a line a scene and task; exit 1 if a default is off the front, or something is wrong."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.scenes", description=__doc__)
     parser.add_argument("--rounds", type=int, default=15)
-    rounds = parser.parse_args().rounds
+    names = sorted(path.stem for path in SCENES.glob("*.yaml"))
+    parser.add_argument("names", nargs="*", metavar="SCENE", help="only these")
+    given = parser.parse_args()
     print(f"{'scene':<20} {'task':<9} {'chosen':<12} {'median':>9} {'error':>9} {'bound':>9}  front")
     failed = 0
-    for path in sorted(SCENES.glob("*.yaml")):
-        for one in bench(compile_topology(path), rounds=rounds).comparisons:
+    for name in given.names or names:
+        for one in bench(compile_topology(SCENES / f"{name}.yaml"), rounds=given.rounds).comparisons:
             chosen = one.chosen
             assert chosen is not None
             error, bound = (f"{v:.1e}" if v is not None else "–" for v in (chosen.error, chosen.bound))
@@ -27,13 +29,13 @@ def main() -> None:
             else:
                 where = ("yes" if chosen.front else "NO") + (f"; also {others}" if others else "")
             print(
-                f"{path.stem:<20} {one.task:<9} {chosen.name:<12} {1e3 * chosen.seconds:6.2f} ms "
+                f"{name:<20} {one.task:<9} {chosen.name:<12} {1e3 * chosen.seconds:6.2f} ms "
                 f"{error:>9} {bound:>9}  {where}",
                 flush=True,
             )
             failed += chosen.error is not None and not chosen.front
             wrong = [note for note in one.notes if note.startswith("WRONG")]
-            wrong += [f"{name} {why}" for name, why in one.refused if why.startswith(FAILED)]
+            wrong += [f"{method} {why}" for method, why in one.refused if why.startswith(FAILED)]
             failed += len(wrong)
             for line in wrong:
                 print(f"  {line}")

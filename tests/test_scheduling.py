@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.schedule`: section by section, what an instant means."""
+"""Claims about `apc.runtime.frame.scheduling`: section by section, what an instant means."""
 
 from __future__ import annotations
 
@@ -8,17 +8,13 @@ from typing import Any
 
 import pytest
 
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.parameters import resolve
 from apc.runtime.frame.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, Tick, Value
-from apc.runtime.frame.scheduling import build_schedules
-from tests.sites import MS, grouped, linked, paper
+from tests.scheduled import schedules
+from tests.sites import MS, paper
 
 
 def _schedule(order: tuple[str, ...] = ORDER, **values: Any) -> Schedule:
-    system = paper(**values)
-    patterns = [jacobians(kind).pattern for kind in system.kinds]
-    [schedule] = build_schedules(system, resolve(system).timings, patterns, order=order)
+    [schedule] = schedules(paper(**values), order)
     return schedule
 
 
@@ -44,11 +40,6 @@ def test_a_tick_at_exactly_the_arrival_sees_the_packet() -> None:
     ticks = [event for event in schedule.events if isinstance(event, Tick)]
     lags = [_lags(schedule, tick) for tick in ticks]
     assert lags == [{1}, {1}, {1}, {0}, {0}, {0}, {0}, {0}]
-
-
-def test_the_frame_is_the_least_common_multiple_of_the_periods() -> None:
-    assert _schedule(haptic=Fraction(3, 1000), network=Fraction(7, 2000)).frame_s == Fraction(21, 1000)
-    assert _schedule(haptic=Fraction(1, 90), network=Fraction(1, 60)).frame_s == Fraction(1, 30)
 
 
 @pytest.mark.parametrize(
@@ -132,18 +123,3 @@ def test_every_order_keeps_packets_causal() -> None:
                 for place in (row for rows in event.heard for row in rows):
                     one: Heard = schedule.heard[place]
                     assert one.lag > 0 or schedule.sent.index(one.sent) in sent_at
-
-
-def test_a_group_hears_each_class_of_senders_as_late_as_it_is() -> None:
-    base = grouped(paper(), ("left", 2, {}), ("right", 1, {}), ("far", 1, {}))
-    system = linked(base, delays={("left", "right"): 16 * MS})
-    patterns = [jacobians(kind).pattern for kind in system.kinds]
-    left, right, far = build_schedules(system, resolve(system).timings, patterns)
-    assert left is far
-    assert {one.lag for one in left.heard} == {1}
-    assert {(one.way.delay, one.lag) for one in right.heard} == {
-        ("lan.delay left right", 2),
-        ("lan.delay", 1),
-    }
-    # Everyone keeps as many packets as anyone asks for.
-    assert left.depths == right.depths == (2, 2)

@@ -1,0 +1,78 @@
+"""What long work shows on a terminal while it goes on: a bar, or a line in words.
+
+Takes: how far the work is. Gives: `Bar`, `progress_bar`, `status_line`.
+Guarantees: all of it goes to stderr, only to a terminal, and is gone when the work ends, however it ends.
+Does not: slow the work down: what draws a bar is loaded when one is shown.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+LONG = 1.0  # seconds of work after which a bar is shown
+
+# Is told how much is done, and of how much.
+Bar = Callable[[float, float], None]
+
+
+@contextmanager
+def progress_bar(title: str, unit: str, *, after: float = LONG) -> Iterator[Bar]:
+    """Give a function that shows on a terminal how much is done, once the work takes long.
+
+    Parameters
+    ----------
+    title
+        What is being done, in a word.
+    unit
+        What is counted.
+    after
+        Seconds of work after which it is shown.
+    """
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn(title),
+        BarColumn(),
+        TextColumn(f"{{task.fields[of]}} {unit}"),
+        TimeRemainingColumn(),
+    )
+    drawn = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = drawn.add_task(title, total=None, of="")
+    begun, shown = time.monotonic(), False
+
+    def show(done: float, total: float) -> None:
+        nonlocal shown
+        if not shown and time.monotonic() - begun > after:
+            drawn.start()
+            shown = True
+        drawn.update(task, completed=done, total=total, of=f"{done:,.6g} of {total:,.6g}")
+
+    try:
+        yield show
+    finally:
+        if shown:
+            drawn.stop()
+
+
+@contextmanager
+def status_line() -> Iterator[Callable[[str], None]]:
+    """Give a function that writes what is being done over what it wrote before."""
+    terminal = sys.stderr.isatty()
+
+    def write(text: str) -> None:
+        if terminal:
+            sys.stderr.write(f"\r\x1b[K{text[: shutil.get_terminal_size().columns - 1]}")
+            sys.stderr.flush()
+
+    try:
+        yield write
+    finally:
+        write("")

@@ -1,0 +1,107 @@
+"""Equal peers on any graph, r = W s: one loop an eigenvalue of W.
+
+Takes: a group of equal peers, the graph that all their ways share, an eigenvalue of its W.
+Gives: `common_graph`, `GraphScale`, `graph_scale`, `graph_loop`.
+Guarantees: exact weights where the eigenvalue is rational; else how far off they may be, and the closed form.
+Does not: find the eigenvalues of W (see `exchange.graph_modes`).
+
+An eigenvalue λ makes a system of one site, r = λ s, as often as W holds it. A complex pair λ = α ± iβ is one
+real system of two sites, r = [α −β; β α] s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+
+from apc.runtime.eigen.loop import Coupling, Loop
+from apc.runtime.eigen.peer_group import PeerGroup
+from apc.runtime.frame.exchange import Exchange, GraphMode, Surd, check_mean
+from apc.runtime.frame.schedule import Way
+
+
+def common_graph(ways: Sequence[Way], exchange: Exchange) -> str:
+    """Return "" if the links' W are one graph, or else why they have not the same eigenvectors."""
+    links = list(dict.fromkeys(way.link for way in ways))
+    shapes = {exchange.links[link].graph.shape for link in links}
+    listed = [exchange.links[link].graph for link in links]
+    if len(shapes) > 1 or any(
+        not np.array_equal(graph.arcs, listed[0].arcs) or not np.array_equal(graph.weights, listed[0].weights)
+        for graph in listed
+    ):
+        return f"the graphs of {' and '.join(links)} are not the same"
+    if len({way.operator == "mean" for way in ways}) > 1 and _degree(links[0], exchange) is None:
+        return f"means and sums over {links[0]}, whose peers hear unequal weights"
+    if any(way.operator in ("max", "min") for way in ways):
+        return "who is the largest or smallest decides who is heard"
+    return ""
+
+
+def _degree(link: str, exchange: Exchange) -> Fraction | None:
+    """Return the sum of the weights that every peer hears over a link, None when it differs."""
+    pairs, weights = exchange.arcs(link)
+    if np.all(weights == 1):
+        counts = np.bincount(pairs[:, 1], minlength=exchange.peers)
+        return Fraction(int(counts[0])) if np.all(counts == counts[0]) else None
+    sums = [Fraction(0)] * exchange.peers
+    for receiver, weight in zip(pairs[:, 1].tolist(), weights.tolist(), strict=True):
+        sums[receiver] += Fraction(weight)
+    return sums[0] if len(set(sums)) == 1 else None
+
+
+@dataclass(frozen=True, slots=True)
+class GraphScale:
+    """What each way weighs a neighbour by, in units of W; `by_mean`: of the W whose rows add up to 1."""
+
+    weights: Mapping[Way, Fraction]
+    by_mean: bool
+
+
+def graph_scale(group: PeerGroup, ways: Sequence[Way], exchange: Exchange) -> GraphScale:
+    """Return how equal peers weigh their neighbours on the graph that all their ways share.
+
+    Raises
+    ------
+    ApcError
+        E801, E802 a mean that can't be.
+    """
+    link = ways[0].link
+    means = any(way.operator == "mean" for way in ways)
+    pairs, weights = exchange.arcs(link)
+    if means:
+        sums = np.bincount(pairs[:, 1], weights, minlength=exchange.peers)
+        hears = np.bincount(pairs[:, 1], minlength=exchange.peers) > 0
+        for peer in np.flatnonzero((sums == 0) | ~hears).tolist():
+            total = sum(map(Fraction, weights[pairs[:, 1] == peer].tolist()), Fraction(0))
+            check_mean(exchange, peer, link, "mean", bool(hears[peer]), total)
+    degree = _degree(link, exchange)
+    return GraphScale(
+        {
+            way: group.gain(way, group) / (degree if degree and way.operator == "mean" else Fraction(1))
+            for way in ways
+        },
+        means and degree is None,
+    )
+
+
+def graph_loop(group: PeerGroup, mode: GraphMode, scale: GraphScale) -> Loop:
+    """Let one site hear itself by an eigenvalue, or two by a complex pair."""
+    a, b = mode.real, mode.imaginary
+    weights = scale.weights
+    doubts = {way: float(abs(one)) * mode.doubt for way, one in weights.items()}
+    # What rounding makes of an eigenvalue 0 is called 0.
+    named = 0.0 if abs(mode.value.real) <= mode.doubt else mode.value.real
+    name = "common" if mode.common else f"graph {named:+.6g}"
+    if not b:
+        coupling: Coupling = {way: ((one * a,),) for way, one in weights.items()}
+        surds: Mapping[Way, Surd] = {}
+        if mode.doubt and mode.surd:
+            surd = mode.surd
+            surds = {way: replace(surd, scale=one * surd.scale) for way, one in weights.items()}
+        return Loop(name, mode.multiplicity, (group,), coupling, doubts, surds)
+    pair = {way: ((one * a, -one * b), (one * b, one * a)) for way, one in weights.items()}
+    sites = tuple(replace(group, name=part) for part in ("real", "imaginary"))
+    return Loop(f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, sites, pair, doubts)

@@ -1,0 +1,159 @@
+"""Peers that move alike: one site, linearized and lifted once for all of them.
+
+Takes: a parameter vector of theirs, its matrices, its schedule, what it hears at the start.
+Gives: `PeerGroup`, `build_group`; `used_ways`, `states_of`; `check_size`, `too_large`.
+Guarantees: a group's matrices are at hand in exact rationals as well, wherever its functions can be walked.
+Does not: find out who is alike (see `peers`); close a loop (see `closing`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.eigen.runs import Peers, joined, shifted
+from apc.runtime.frame.exchange import Exchange
+from apc.runtime.frame.jacobians import SiteJacobians
+from apc.runtime.frame.lift import LiftedSite, lift
+from apc.runtime.frame.linearize import linearize_exact
+from apc.runtime.frame.schedule import Schedule, Way
+from apc.runtime.frame.site import LinearSite, rational_floats
+from apc.runtime.frame.start import Listening
+
+Floats = NDArray[np.float64]
+
+# More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
+# their error bounds would decide nothing.
+MOST_STATES = 1000
+
+# Names of peers written out in the name of a group that is part of a scene's group.
+MOST_NAMED = 4
+
+# What a receive weighs each sender's channel by, by (edge, channel): one for all senders, or one a group.
+Gains = Mapping[tuple[str, str], tuple[Fraction, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeerGroup:
+    """`count` peers that move alike; `parameters` is the vector (n_p,) of the first of them.
+
+    `peers` are their numbers in the scene, from 0; `role` is the scene's group where it has delays of its own
+    (see `Exchange.role`); `place` is what `gains` calls the group. `exact` holds the site's matrices in
+    rationals; where they can't be had, its floats taken at their word.
+    """
+
+    name: str
+    count: int
+    parameters: Floats
+    jacobians: SiteJacobians
+    site: LinearSite
+    exact: LinearSite
+    schedule: Schedule
+    lifted: LiftedSite
+    peers: Peers
+    role: int
+    place: int
+    listening: Listening | None
+    gains: Gains
+
+    def sends(self, link: str) -> bool:
+        """Say whether these peers send over a link."""
+        return any(sending.link == link for sending in self.jacobians.kind.sends)
+
+    def gain(self, way: Way, sender: PeerGroup) -> Fraction:
+        """Return what a peer weighs a sender's packets on a way by, beside the link's own weights."""
+        if not way.edge:
+            return Fraction(1)
+        listed = self.gains[way.edge, way.channel]
+        return listed[0] if len(listed) == 1 else listed[sender.place]
+
+
+def build_group(
+    place: int,
+    parts: Sequence[tuple[int, Peers]],
+    vector: Floats,
+    built: SiteJacobians,
+    site: LinearSite,
+    schedule: Schedule,
+    exchange: Exchange,
+    *,
+    listening: Listening | None = None,
+    gains: Gains | None = None,
+) -> PeerGroup:
+    """Lift a site and put it together with what is known of its peers, `parts` of the scene's groups.
+
+    Parameters
+    ----------
+    place
+        What the `gains` call the group.
+    parts
+        Its peers: groups of the scene and which of their peers, counted in the group.
+    vector, built, site, schedule
+        The parameters (n_p,) of the first of them, its kind's Jacobians, its matrices, its schedule.
+    exchange
+        The links.
+    listening, gains
+        What it hears at the start and weighs each sender by, where that matters.
+    """
+    counts = np.diff(exchange.starts)
+    names = []
+    for group, peers in parts:
+        name = exchange.groups[group]
+        if len(peers) < counts[group]:
+            more = ["…"] if len(peers) > MOST_NAMED else []
+            name += f"[{','.join([*(str(int(peer) + 1) for peer in peers[:MOST_NAMED]), *more])}]"
+        names.append(name)
+    if len(names) > MOST_NAMED:
+        names = [*names[:MOST_NAMED], "…"]
+    peers = joined([shifted(peers, int(exchange.starts[group])) for group, peers in parts])
+    # The functions of a nonlinear loop can't be walked one by one.
+    exact = linearize_exact(built, vector, listening) if built.walkable else None
+    return PeerGroup(
+        name="+".join(names),
+        count=len(peers),
+        parameters=vector,
+        jacobians=built,
+        site=site,
+        exact=rational_floats(site) if exact is None else exact,
+        schedule=schedule,
+        lifted=lift(site, schedule, exact=exact),
+        peers=peers,
+        role=exchange.role(parts[0][0]),
+        place=place,
+        listening=listening,
+        gains=gains or {},
+    )
+
+
+def used_ways(schedules: Iterable[Schedule]) -> tuple[Way, ...]:
+    """Return every way on which something is heard, in order."""
+    return tuple(sorted({one.way for schedule in schedules for one in schedule.heard}))
+
+
+def states_of(schedule: Schedule, site: SiteJacobians) -> int:
+    """Return how many states a peer keeps from frame to frame."""
+    return len(site.kind.states) + len(schedule.carried) + sum(schedule.depths)
+
+
+def check_size(sites: Sequence[SiteJacobians], exchange: Exchange) -> None:
+    """Refuse more different peers than are worth an object each."""
+    states = sum(len(site.kind.states) for site in sites)
+    if states > MOST_STATES:
+        raise too_large(exchange, f"{len(sites):,} different peers", states)
+
+
+def too_large(exchange: Exchange, what: str, states: int) -> ApcError:
+    """Return the refusal of a system of too many states."""
+    return ApcError(
+        Mistake(
+            "E804",
+            Place(exchange.scene),
+            f"{what} make one system of {states:,} states; the matrix of one may have {MOST_STATES:,}",
+            hint="--method auto: linear peers without edge functions need no such matrix",
+        )
+    )

@@ -1,0 +1,120 @@
+"""What an unreliable link does to packets, in numbers.
+
+Takes: a link's `Channel` and the scene's numbers.
+Gives: `ChannelLaw`, `channel_law`; `nominal_notes`.
+Guarantees: one law for all ways of a link with one delay.
+Does not: draw a packet (see `packets`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.frame.jitter import LATEST
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelLaw:
+    """The numbers of a channel.
+
+    `p`, `r`, `one_minus_h` and `one_minus_k` are netem's `gemodel` (see `compiled.Loss`); `delay` and
+    `jitter` are in seconds; `trace` (n,) replaces all of them: seconds, infinite for a lost packet.
+    """
+
+    p: float
+    r: float
+    one_minus_h: float
+    one_minus_k: float
+    delay: float
+    jitter: float
+    distribution: str
+    trace: Floats | None
+
+    @property
+    def bad(self) -> float:
+        """The share of time in the bad state: p/(p + r), 0 if the state never changes."""
+        return self.p / (self.p + self.r) if self.p + self.r else 0.0
+
+    @property
+    def mean_loss(self) -> float:
+        """The share of packets that get lost, in the long run."""
+        if self.trace is not None:
+            return float(np.mean(np.isinf(self.trace)))
+        return self.bad * self.one_minus_h + (1 - self.bad) * self.one_minus_k
+
+    @property
+    def longest(self) -> float:
+        """The longest delay that a packet which arrives can have, in seconds."""
+        if self.trace is not None:
+            return float(np.max(self.trace, initial=0.0, where=np.isfinite(self.trace)))
+        return self.delay + self.jitter * LATEST[self.distribution]
+
+
+def channel_law(system: CompiledSystem, link: Link, delay: Fraction) -> ChannelLaw:
+    """Return the numbers of a link's channel.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to use (see `overrides.apply`).
+    link
+        A link of it that has a channel.
+    delay
+        The delay of the way, in seconds.
+
+    Raises
+    ------
+    ApcError
+        E891 a group of peers sets a number of the link for itself.
+    """
+    channel = link.channel
+    assert channel is not None, f"{link.name} is reliable"
+    loss = (
+        ()
+        if channel.loss is None
+        else (channel.loss.p, channel.loss.r, channel.loss.one_minus_h, channel.loss.one_minus_k)
+    )
+    for group in system.groups:
+        for parameter in group.values:
+            if parameter.name in loss:
+                what = f"{parameter.name} is of a link, the same for all peers: {group.name} can't set it"
+                raise ApcError(Mistake("E891", Place(system.name), what))
+    value = {parameter.name: parameter.value for parameter in system.parameters}
+    seconds = {timing.name: float(timing.value) for timing in system.timings}
+    p, r, one_minus_h, one_minus_k = (value[name] for name in loss) if loss else (0.0, 1.0, 1.0, 0.0)
+    jitter = 0.0 if channel.jitter is None else seconds[channel.jitter]
+    return ChannelLaw(
+        p, r, one_minus_h, one_minus_k, float(delay), jitter, channel.distribution, channel.trace
+    )
+
+
+def nominal_notes(system: CompiledSystem) -> tuple[str, ...]:
+    """Return, for each unreliable link, what an analysis of its nominal delay leaves out."""
+    timings = {timing.name: timing.value for timing in system.timings}
+    notes = []
+    for link in system.links:
+        if link.channel is None:
+            continue
+        law = channel_law(system, link, timings[link.delay])
+        named = []
+        if law.mean_loss:
+            named.append(f"packet loss ({100 * law.mean_loss:.3g} %)")
+        if law.jitter:
+            named.append("jitter")
+        if law.trace is not None:
+            named.append("the recorded delays")
+        if named:
+            delay = f"{float(timings[link.delay]) * 1e3:.6g} ms"
+            notes.append(
+                f"{' and '.join(named)} of {link.name} are not in this verdict: every packet takes the "
+                f"nominal {delay}; see apc simulate"
+            )
+    return tuple(notes)

@@ -1,0 +1,75 @@
+"""The motion that neither grows nor dies out at a point of the stability boundary: whose it is, how fast.
+
+Takes: closed systems with their rigid motions, and the eigenvalue that lies on the circle.
+Gives: `Marginal`, `marginal_motion`.
+Guarantees: a rigid motion, whose eigenvalue is 1 everywhere, is never taken for the one that decides, even
+where that one is 1 as well: what changes sign from tick to tick is so after a frame of evenly many of them.
+Does not: find the point (see `search`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.rigid import RigidModes, relative_coordinates
+from apc.runtime.eigen.spectrum import angle_in_frame
+
+# An eigenvalue of 1 leaves open how far the peers stand aside together; next to the boundary, where it is
+# this much larger, they stand where the motion takes them. Far above rounding, far below half a turn.
+ASIDE = 1e-7
+
+
+@dataclass(frozen=True, slots=True)
+class Marginal:
+    """The closed system `name`'s motion that turns by `turn` radians in a frame of `frame_s` seconds."""
+
+    name: str
+    turn: float
+    frame_s: float
+
+    @property
+    def frequency_hz(self) -> float:
+        """The motion's frequency."""
+        return abs(self.turn) / (2 * np.pi * self.frame_s)
+
+
+def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenvalue: complex) -> Marginal:
+    """Return the motion of an eigenvalue, whole turns within a frame counted.
+
+    Parameters
+    ----------
+    systems
+        The closed systems it may be of, with their rigid motions; not all of them rigid altogether.
+    eigenvalue
+        That of the relative coordinates on the circle, as nearly as it is known.
+    """
+    best: tuple[float, Marginal] | None = None
+    for system, free in systems:
+        held, rest, weights = relative_coordinates(free.basis)
+        if not len(rest):
+            continue
+        driven = system.matrix[np.ix_(held, rest)]
+        reduced = system.matrix[np.ix_(rest, rest)] - weights @ driven
+        values, vectors = np.linalg.eig(reduced)
+        place = int(np.argmin(np.abs(values - eigenvalue)))
+        off = float(np.abs(values[place] - eigenvalue))
+        if best is not None and off >= best[0]:
+            continue
+        value = complex(values[place])
+        found, covectors = np.linalg.eig(reduced.T)
+        relative, covector = vectors[:, place], covectors[:, int(np.argmin(np.abs(found - value)))]
+        # Back to the whole state, as in `spectrum`: (λ − M_pp − M_pr W) x_p = M_pr y.
+        corner = system.matrix[np.ix_(held, held)] + driven @ weights
+        vector, shares = np.zeros(len(system.names), np.complex128), np.zeros(len(system.names))
+        beside = value * (1 + ASIDE) * np.eye(len(held)) - corner
+        vector[held] = np.linalg.lstsq(beside, driven @ relative, rcond=None)[0]
+        vector[rest] = relative + weights @ vector[held]
+        shares[rest] = np.abs(vector[rest] * covector)
+        shares[held] = np.abs(vector[held] * (covector @ weights))
+        best = off, Marginal(system.name, angle_in_frame(system, value, vector, shares), system.frame_s)
+    assert best is not None, "something moves where something neither grows nor dies out"
+    return best[1]

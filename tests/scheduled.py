@@ -1,0 +1,17 @@
+"""Schedules of compiled systems, for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.frame.jacobians import jacobians
+from apc.runtime.frame.parameters import resolve
+from apc.runtime.frame.schedule import ORDER, Schedule
+from apc.runtime.frame.scheduling import build_schedules
+
+
+def schedules(system: CompiledSystem, order: Sequence[str] = ORDER) -> tuple[Schedule, ...]:
+    """Return the schedule of every group."""
+    patterns = [jacobians(kind).pattern for kind in system.kinds]
+    return build_schedules(system, resolve(system).timings, patterns, order=order)

@@ -1,0 +1,37 @@
+"""Claims about `apc.runtime.vary.bracket`: what holds a crossing, in balls and in floats."""
+
+from __future__ import annotations
+
+import pytest
+
+from apc.runtime.vary import bracket as brackets
+from apc.runtime.vary.critical import critical
+from tests.topologies import AVERAGE, compiled
+
+LIMIT = 1096.410868365630  # tests.reference, of the paper's scene
+PATH = "coordination.stiffness"
+
+
+def test_more_states_than_balls_are_worth_are_held_in_floats_and_around_the_proved_value(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = compiled(AVERAGE)
+    proved = critical(scene, PATH)
+    monkeypatch.setattr(brackets, "MOST_PROVED", 3)
+    held = critical(scene, PATH)
+    assert proved.crossings[0].proof.startswith("proved with")
+    assert held.crossings[0].proof == "bounded in floats"
+    assert None not in (held.value, held.error, proved.value, proved.error)
+    assert abs(held.value - proved.value) <= held.error + proved.error  # type: ignore[operator] # they are there
+    assert held.value == pytest.approx(LIMIT, rel=1e-11)
+    assert held.error < 1e-9 * LIMIT  # type: ignore[operator] # it is there
+
+
+def test_a_delays_crossing_is_held_in_floats_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = compiled(AVERAGE)
+    proved = critical(scene, "contact.delay", upper="3 ms").crossings[0]
+    monkeypatch.setattr(brackets, "MOST_PROVED", 3)
+    held = critical(scene, "contact.delay", upper="3 ms").crossings[0]
+    assert held.proof == "bounded in floats"
+    assert abs(held.value - proved.value) <= held.error + proved.error
+    assert held.error < 1e-9 * proved.value

@@ -1,0 +1,76 @@
+"""Claims about `apc.runtime.simulate.population`."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis.analysis import lifted_groups
+from apc.runtime.eigen.modes import dense
+from apc.runtime.simulate.population import exchanges_within
+from apc.runtime.simulate.simulation import Simulation, prepare
+from tests.scheduled import schedules
+from tests.sites import MS, columned, grouped, linked, paper
+
+
+def test_peers_meet_within_a_frame_only_where_something_is_heard_in_the_frame_it_is_sent_in() -> None:
+    assert exchanges_within(schedules(paper(comm=8 * MS))) == ()
+    assert exchanges_within(schedules(paper(comm=3 * MS))) == (0,)
+    assert exchanges_within(schedules(paper(comm=Fraction(0), network_phase=2 * MS))) == (2,)
+
+
+def _frames(system: CompiledSystem, count: int) -> np.ndarray:
+    """Return the continuous states of all peers after each frame, peer by peer."""
+    simulation = prepare(system, Fraction(1), jit=False)
+    population, states = simulation.population, list(simulation.population.start)
+    rows = []
+    for number in range(count):
+        found = population.frame.call(
+            [*(one.T for one in states), *_nothing(simulation, len(states)), number]
+        )
+        states = [np.asarray(one).T for one in found[: len(states)]]
+        rows.append(np.concatenate([states[g][:, :4].ravel() for g in range(len(population.members))]))
+    return np.array(rows)
+
+
+def _nothing(simulation: Simulation, first: int) -> list[np.ndarray]:
+    """Return the impulses of a frame without forces that change with time."""
+    frame = simulation.population.frame
+    return [np.zeros(frame.size_in(place)) for place in range(first, frame.n_in() - 1)]
+
+
+STARTS = [0.01, -0.02, 0.03, 0.0]
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize("graph", ["complete", "ring", "star"])
+@pytest.mark.parametrize("comm", [Fraction(0), 3 * MS, 8 * MS, 24 * MS])
+def test_the_frame_of_all_peers_is_the_map_of_the_analysis(operator: str, graph: str, comm: Fraction) -> None:
+    """Packets on their way hold the senders' start values; forces before the first tick are zero."""
+    base = linked(paper(operator, peers=4, kt=200.0, bt=1.0, comm=comm), graph)
+    system = columned(base, cube__x__start=STARTS, device__x__start=STARTS)
+    closed = dense(*lifted_groups(system))
+    state = np.zeros(len(closed.names))
+    for place, name in enumerate(closed.names):
+        peer = int(name[len("user[")]) - 1
+        if ".device.x" in name or ".cube.x" in name or "coordination.x sent" in name:
+            state[place] = STARTS[peer]
+    found = _frames(system, 5)
+    for row in found:
+        state = closed.matrix @ state
+        np.testing.assert_allclose(row, state[list(closed.motion)], rtol=0, atol=1e-14)
+
+
+def test_members_of_several_groups_hear_each_other() -> None:
+    groups = (("left", 2, {"cube.x.start": 0.02}), ("right", 1, {"device.mass": 0.2}))
+    system = grouped(paper("sum", kt=150.0), *groups)
+    closed = dense(*lifted_groups(system))
+    state = np.array(
+        [0.02 if "left" in n and ("cube.x" in n or "n.x sent" in n) else 0.0 for n in closed.names]
+    )
+    for row in _frames(system, 4):
+        state = closed.matrix @ state
+        np.testing.assert_allclose(row, state[list(closed.motion)], rtol=0, atol=1e-14)

@@ -1,0 +1,46 @@
+"""Claims about `apc.progress`: only a terminal sees how far the work is, and nothing of it stays."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from apc.progress import progress_bar, status_line
+
+
+def test_what_is_no_terminal_sees_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with status_line() as told:
+        told("looking")
+    with progress_bar("sweep", "points") as show:
+        show(1, 2)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_line_is_written_over_and_gone_when_the_work_ends(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with pytest.raises(KeyboardInterrupt), status_line() as told:
+        told("looking at 3 values")
+        told("x" * 500)
+        raise KeyboardInterrupt
+    written = capsys.readouterr()
+    assert written.out == ""
+    lines = written.err.split("\r\x1b[K")
+    assert lines[1] == "looking at 3 values"
+    assert len(lines[2]) < 500, "no wider than the terminal"
+    assert lines[-1] == ""
+
+
+def test_a_bar_is_shown_once_the_work_takes_long(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with progress_bar("sweep", "points") as show:
+        show(1, 4)
+    assert capsys.readouterr().err == ""
+    with progress_bar("sweep", "points", after=0.0) as show:
+        show(1, 4)
+        show(3, 4)
+    assert "of 4 points" in capsys.readouterr().err
