@@ -46,14 +46,17 @@ HOUSE = {
         rigid components pseudospectrum enclosure balls roots certify ratios duals spectrum
     """,
     "apc.runtime.large": """
-        diagonal transfer counting characteristic zeros crowds determinant determinant_spectrum
-        translation extremes graph twins sparse_system relative krylov
+        diagonal transfer response counting characteristic circles zeros crowds determinant
+        determinant_spectrum translation extremes graph twins sparse_system relative sampled_count
+        krylov
     """,
     "apc.runtime.analysis": """
         plan selfcheck analysis needs ranges box box_proof openloop paper conventions switches
         contact_modes
     """,
-    "apc.runtime.vary": "wiring batch evaluator marginal crossings bracket delays search critical margins sensitivity",
+    "apc.runtime.vary": """
+        wiring batch evaluator marginal crossings bracket delays search critical margins sensitivity
+    """,
     "apc.runtime.sweep": "grid quantities table_file work store local cluster sweep",
     "apc.runtime.simulate": """
         methods scales stepping integrate propagate flow forcing

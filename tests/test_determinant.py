@@ -14,6 +14,7 @@ from apc.runtime.eigen.modes import arrange, complete_loops, dense, split
 from apc.runtime.eigen.spectrum import Spectrum
 from apc.runtime.frame.overrides import apply, parse_override
 from apc.runtime.large.characteristic import characteristic_ball, refine
+from apc.runtime.large.circles import beyond
 from apc.runtime.large.determinant import of_crowds
 from apc.runtime.large.determinant_spectrum import solve_crowds, solve_loops
 from apc.runtime.large.translation import count_translations
@@ -117,12 +118,10 @@ def test_groups_with_delays_of_their_own_are_one_determinant(delays: dict[tuple[
 
 @pytest.mark.parametrize("radius", [0.7, 0.8, 0.9, 0.95, 1.05])
 def test_a_count_is_the_number_of_eigenvalues_of_the_whole_matrix(radius: float) -> None:
-    from apc.runtime.large.zeros import _beyond
-
     system = different(8, kt=2000.0)
     values = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
     function, _ = of_crowds(*crowded(system))
-    assert _beyond(function, radius, 0) == int((np.abs(values) > radius).sum())
+    assert beyond(function, radius, 0) == int((np.abs(values) > radius).sum())
 
 
 def test_newtons_method_finds_zeros_and_says_where_it_does_not() -> None:

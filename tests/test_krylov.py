@@ -1,4 +1,4 @@
-"""Claims about `sparse_system`, `relative` and `krylov`: different peers on sparse graphs."""
+"""Claims about `sparse_system`, `relative`, `sampled_count` and `krylov`: sparse graphs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import pytest
 
 from apc.runtime.analysis.analysis import analyze, lifted_groups
 from apc.runtime.eigen.modes import dense
-from apc.runtime.large.krylov import argument_of, count_beyond, solve_sparse
+from apc.runtime.large.krylov import solve_sparse
 from apc.runtime.large.relative import relative_matrix, rigid_space
+from apc.runtime.large.sampled_count import argument_of, count_beyond
 from apc.runtime.large.sparse_system import small_matrix, sparse_system
 from apc.runtime.large.translation import free_motions
 from tests.populations import crowded, different

@@ -60,8 +60,8 @@ WIDE_KRYLOV = {"coasting": 1.0, "defective": 1e-3}
 # What other scenes' bounds are within, relative to a radius above 1: a verdict needs hardly more.
 USEFUL = 1e-6
 
-# Packets of a thousand frames, or a hundred in a frame, are as many states or rows of a sparse matrix: seconds,
-# for what no sparse matrix is good for.
+# Packets of a thousand frames, or a hundred in a frame, are as many states or rows of a sparse matrix: they
+# take seconds, for what no sparse matrix is good for.
 SLOW = {"very-long-delay", "non-commensurate"}
 
 

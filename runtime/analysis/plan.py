@@ -106,8 +106,8 @@ def make_plan(
             from apc.runtime.large.twins import split_twins  # of no use to any other method
 
             found = method
-            whole, loops = loops, tuple(part for loop in loops for part in split_twins(loop))
-            if len(loops) > len(whole):
+            loops = tuple(part for loop in loops for part in split_twins(loop))
+            if len(loops) > len(arranged.loops):
                 notes = (f"{len(loops)} systems, as peers that can change places move alike or apart",)
         elif method == "auto" and (
             max(sum(group.schedule.depths) for loop in loops for group in loop.sites) > LONG_LINES

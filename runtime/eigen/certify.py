@@ -7,8 +7,8 @@ What is too near the circle for the last precision is left open, and so is what 
 Does not: prove what its numbers can't be had exactly for (see `balls.unprovable`).
 
 The characteristic polynomial of the relative coordinates comes in balls, for each part (see `components`) its
-own; Schur and Cohn's recursion decides it without an eigenvalue being known. Smith's discs then enclose the
-eigenvalues.
+own. Smith's discs enclose its roots (see `roots`); where one reaches over the circle, Schur and Cohn's
+recursion decides without an eigenvalue being known.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PRECISIONS = (256, 512, 1024, 2048, 4096)
 # those of a float.
 DOUBTFUL = 512
 
-# More states than this aren't proved: the characteristic polynomial costs n⁴ or so, seconds at this size.
+# More states that drive each other than this aren't proved: the characteristic polynomial costs n⁴ or so, seconds at this size.
 MOST_PROVED = 120
 
 # Of more states than this no vectors are computed: they cost n⁴, too, seconds at this size.

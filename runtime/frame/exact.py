@@ -17,8 +17,8 @@ from typing import Any
 
 import casadi
 
-# Functions whose instructions are kept: an analysis walks the same few of a scene's kinds many times over, and
-# asking CasADi for them takes longer than the arithmetic.
+# Functions whose instructions are kept: an analysis walks the same few of a scene's kinds many times, and asking
+# CasADi for them takes longer than the arithmetic.
 KEPT = 16
 
 _UNARY: dict[int, Callable[[Any], Any]] = {

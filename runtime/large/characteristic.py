@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.large.counting import Ball, wind
-from apc.runtime.large.transfer import Transfer, differentiate, respond
+from apc.runtime.large.response import differentiate, respond
+from apc.runtime.large.transfer import Transfer
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -150,7 +151,7 @@ def _inverse(matrix: Complexes) -> tuple[Complexes, Floats, Floats]:
     off += PRODUCT_ROUNDINGS * (n + 2) * UNIT * (size @ np.abs(matrix))
     wrong = off.sum(axis=2).max(axis=1, initial=0.0)
     largest = size.max(axis=1, keepdims=True, initial=0.0)
-    return inverse, size + 2 * wrong[:, None, None] * largest, wrong
+    return inverse.astype(np.complex128), size + 2 * wrong[:, None, None] * largest, np.asarray(wrong)
 
 
 def _scaled_norm(matrices: Floats) -> Floats:

@@ -23,7 +23,8 @@ from apc.runtime.frame.lift import LiftedSite
 from apc.runtime.large.characteristic import Characteristic, null_vectors, weights_at
 from apc.runtime.large.crowds import Crowd, hear_roughly, lift_one, lines_of, some_rows
 from apc.runtime.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
-from apc.runtime.large.transfer import CHUNK, differentiate
+from apc.runtime.large.response import differentiate
+from apc.runtime.large.transfer import CHUNK
 from apc.runtime.large.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]

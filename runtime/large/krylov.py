@@ -1,7 +1,7 @@
 """The largest eigenvalues of a sparse frame map, and a count of those that are larger.
 
 Takes: crowds of different peers on any graphs, and the exchange between them.
-Gives: `solve_sparse`; `Argument`, `argument_of`, `count_beyond`.
+Gives: `solve_sparse`.
 Guarantees: rigid motions are taken out by their exact directions before any eigenvalue is computed. Errors
 are estimates to first order, from residuals and the errors of the matrix, and so is the radius they bound;
 that nothing lies beyond it is counted by the argument principle on samples of the determinant. The notes say
@@ -9,18 +9,12 @@ so.
 Does not: list more than the largest modes.
 
 Arnoldi's method (ARPACK) finds the eigenvalues nearest to a few shifts, where copies of some peers, all
-alike, would have their largest ones. The count goes around
-
-    g(ζ) = det(I − R/ζ) / Π_k (1 − p_k/ζ),
-
-R the whole and p_k the eigenvalues of peers by themselves, hearing nothing, and those of R that are known: it
-goes to 1 as ζ goes to infinity, and its argument moves far less than that of the determinant.
+alike, would have their largest ones. A count then tells whether larger ones were missed.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,14 +32,12 @@ from apc.runtime.large.relative import (
     relative_matrix,
     rigid_space,
 )
-from apc.runtime.large.sparse_system import SparseSystem, small_matrix, sparse_system
+from apc.runtime.large.sampled_count import argument_of, count_beyond
+from apc.runtime.large.sparse_system import SparseSystem, sparse_system
 from apc.runtime.large.translation import free_motions, may_drift
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-
-# The argument of a function of ζ.
-Argument = Callable[[complex], float]
 
 # Peers whose copies tell where to look, no more than so many, and by which share of what they hear these
 # move: from all alike to each opposite to its neighbours.
@@ -71,17 +63,6 @@ OUTSIDE, FARTHEST = 20.0, 1e-9
 
 # An eigenvalue this near to 1 may belong to a drift, which rounding splits by the root of its errors.
 DRIFTING = 1e-6
-
-# Arcs of the half circle to begin with; eigenvalues this near to the circle, relatively, are not divided by,
-# but looked at, so many of them.
-ARCS, NEAR_CIRCLE, LOOKED_AT = 16, 0.02, 9
-
-# A peer's own eigenvalue this near to one of all, relatively, is divided by whatever it is near to.
-SAME = 1e-9
-
-# The argument's rate of change is measured over this angle; an arc is settled when two rules for its integral
-# differ by less than that (radians); no arc is narrower, and after so many factorizations it is given up.
-ANGLE, SETTLED, NARROWEST, MOST_FACTORS = 1e-8, 0.5, 1e-12, 1200
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,108 +220,6 @@ def _alone(listed: Sequence[Crowd]) -> tuple[Complexes, Floats]:
     values = [np.linalg.eigvals(crowd.lifted.p).astype(np.complex128).ravel() for crowd in listed]
     counts = [np.repeat(crowd.counts, crowd.lifted.p.shape[-1]) for crowd in listed]
     return np.concatenate(values), np.concatenate(counts)
-
-
-def count_beyond(argument: Argument, alone: tuple[Complexes, Floats], known: Complexes, radius: float) -> int:
-    """Return how many eigenvalues are larger than a radius, −1 if it can't be told.
-
-    Parameters
-    ----------
-    argument
-        That of det(I − R/ζ), see `argument_of`.
-    alone
-        The eigenvalues of the peers by themselves and how often each is there.
-    known
-        Eigenvalues of R, conjugates left out.
-    radius
-        The circle's.
-
-    Notes
-    -----
-    g is taken with what is far from the circle only, and with the eigenvalues that are known: what is near to
-    the circle turns it in an angle too small to be seen between samples. Its argument is followed around the
-    upper half; the change along an arc is known up to whole turns from its ends, and its rate tells the
-    turns: Simpson's rule, as far as the trapezoidal rule on half the arc agrees.
-    """
-    values, counts = alone
-    pairs = np.concatenate([known, known[known.imag != 0].conj()])
-    near = np.abs(np.abs(values) - radius) <= NEAR_CIRCLE * radius
-    # Of many equal peers that all hear one other, most move by themselves: their eigenvalues go, too.
-    for value in pairs[np.abs(np.abs(pairs) - radius) <= NEAR_CIRCLE * radius].tolist():
-        near &= np.abs(values - value) > SAME * radius
-    divided = np.concatenate([values[~near], pairs]), np.concatenate([counts[~near], np.ones(len(pairs))])
-    samples: dict[float, tuple[float, float]] = {}
-
-    def sample(angle: float) -> tuple[float, float]:
-        if angle not in samples:
-            points = [radius * np.exp(1j * one) for one in (angle, angle + ANGLE)]
-            here, there = (
-                _wrapped(argument(point) - float(divided[1] @ np.angle(1 - divided[0] / point)))
-                for point in points
-            )
-            samples[angle] = here, _wrapped(there - here) / ANGLE
-        return samples[angle]
-
-    # The eigenvalues that were missed are most likely near those of peers by themselves.
-    there = np.angle(values[near & (values.imag >= 0)])
-    likely = np.quantile(there, np.linspace(0, 1, LOOKED_AT)) if len(there) else there
-    edges = np.unique(
-        np.concatenate([np.linspace(0.0, np.pi, ARCS + 1), likely, np.angle(known[known.imag > 0])])
-    )
-    pending = list(itertools.pairwise(edges.tolist()))
-    turned = 0.0
-    while pending:
-        if 2 * len(samples) > MOST_FACTORS:
-            return -1
-        a, b = pending.pop()
-        middle = (a + b) / 2
-        (at_a, rate_a), (_, rate_m), (at_b, rate_b) = sample(a), sample(middle), sample(b)
-        simpson = (b - a) / 6 * (rate_a + 4 * rate_m + rate_b)
-        halves = (b - a) / 4 * (rate_a + 2 * rate_m + rate_b)
-        exact = simpson + _wrapped(at_b - at_a - simpson)
-        if abs(simpson - halves) < SETTLED and abs(exact - simpson) < SETTLED:
-            turned += exact
-        elif b - a < NARROWEST:
-            return -1
-        else:
-            pending += [(a, middle), (middle, b)]
-    outside = float(divided[1][np.abs(divided[0]) > radius].sum())
-    turns = 2 * turned / (2 * np.pi)  # the lower half mirrors the upper
-    return round(outside - turns) if abs(turns - round(turns)) < 0.1 else -1
-
-
-def argument_of(system: SparseSystem, listed: Sequence[Crowd]) -> Argument:
-    """Return the argument of det(I − R/ζ), from a small matrix: see `sparse_system.small_matrix`."""
-    import scipy.sparse.linalg
-
-    small = small_matrix(system, listed)
-
-    def argument(point: complex) -> float:
-        factors = scipy.sparse.linalg.splu(small(point))
-        total = float(np.angle(factors.U.diagonal()).sum())
-        total += np.pi * (_odd(factors.perm_r) ^ _odd(factors.perm_c))
-        for crowd in listed:
-            p = crowd.lifted.p
-            sign, _ = np.linalg.slogdet(np.eye(p.shape[-1]) - p / point)
-            total += float(crowd.counts @ np.angle(sign))
-        return _wrapped(total)
-
-    return argument
-
-
-def _odd(permutation: NDArray[np.int32]) -> bool:
-    """Say whether a permutation is odd: n less its cycles."""
-    import scipy.sparse
-
-    n = len(permutation)
-    graph = scipy.sparse.csr_matrix((np.ones(n), (np.arange(n), permutation)), shape=(n, n))
-    cycles = scipy.sparse.csgraph.connected_components(graph, directed=False)[0]
-    return bool((n - cycles) % 2)
-
-
-def _wrapped(angle: float) -> float:
-    """Return an angle in (−π, π]."""
-    return float(np.pi - (np.pi - angle) % (2 * np.pi))
 
 
 def _mode(system: SparseSystem, listed: Sequence[Crowd], rigid: RigidSpace, pair: _Pair) -> Mode:

@@ -20,6 +20,7 @@ from apc.runtime.frame.exchange import Exchange
 from apc.runtime.large.sparse_system import SparseSystem
 from apc.runtime.large.translation import FreeMotions
 
+Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
@@ -55,47 +56,80 @@ def rigid_space(system: SparseSystem, exchange: Exchange, motions: FreeMotions) 
     motions
         What nothing holds back.
     """
-    import scipy.sparse
-
-    n, peers = int(system.starts[-1]), len(system.starts) - 1
-    values, places, columns, held = [], [], [], []
+    found = _Columns([], [], [], [])
     for g, (own, pivots) in enumerate(zip(motions.own, motions.pivots, strict=True)):
         starts = system.starts[:-1][system.crowd_of == g]
         for motion, pivot in zip(own.T, pivots, strict=True):
-            moving = np.flatnonzero(motion)
-            values.append(np.tile(motion[moving], len(starts)))
-            places.append((starts[:, None] + moving).ravel())
-            columns.append(np.repeat(len(held) + np.arange(len(starts)), len(moving)))
-            held += (starts + pivot).tolist()
-    single = len(held)
+            found.add(motion, starts, len(found.held) + np.arange(len(starts)))
+            found.held.extend((starts + pivot).tolist())
+    single = len(found.held)
+    for members in _parts(exchange):
+        crowd_of = system.crowd_of[members]
+        for (crowd, pivot), vectors in motions.together(np.unique(crowd_of).tolist()):
+            for g, motion in vectors.items():
+                starts = system.starts[members[crowd_of == g]]
+                found.add(motion, starts, np.full(len(starts), len(found.held)))
+            found.held.append(int(system.starts[members[crowd_of == crowd][0]]) + pivot)
+    space = found.matrix(int(system.starts[-1]))
+    bound = (system.error + 4 * UNIT * abs(system.matrix)) @ abs(space)
+    off = abs(system.matrix @ space - space) - 2 * bound
+    if off.nnz and off.max() > 0:
+        return None
+    return _told_by(space, np.array(found.held, dtype=np.int64), single)
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """Motions of single peers laid out over the whole: entries, their places, columns; what tells each."""
+
+    values: list[Floats]
+    places: list[Integers]
+    columns: list[Integers]
+    held: list[int]
+
+    def add(self, motion: Floats, starts: Integers, columns: Integers) -> None:
+        """Let peers whose states start there move by a motion, each in its column."""
+        moving = np.flatnonzero(motion)
+        self.values.append(np.tile(motion[moving], len(starts)))
+        self.places.append((starts[:, None] + moving).ravel())
+        self.columns.append(np.repeat(columns, len(moving)))
+
+    def matrix(self, states: int) -> Any:
+        """Return V (n, d)."""
+        import scipy.sparse
+
+        shape = (states, len(self.held))
+        if not self.held:
+            return scipy.sparse.csr_matrix(shape)
+        entries = (np.concatenate(part) for part in (self.values, self.places, self.columns))
+        value, place, column = entries
+        return scipy.sparse.csr_matrix((value, (place, column)), shape=shape)
+
+
+def _parts(exchange: Exchange) -> list[Integers]:
+    """Return the peers of each part of the graph that hears nothing of the others."""
+    import scipy.sparse
+
+    peers = exchange.peers
     pairs = np.concatenate([exchange.arcs(link)[0] for link in exchange.links])
     graph = scipy.sparse.csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(peers, peers))
     parts, part_of = scipy.sparse.csgraph.connected_components(graph, directed=False)
     order = np.argsort(part_of, kind="stable")
-    for members in np.split(order, np.cumsum(np.bincount(part_of, minlength=parts))[:-1]):
-        for (crowd, pivot), vectors in motions.together(np.unique(system.crowd_of[members]).tolist()):
-            for g, motion in vectors.items():
-                moving, starts = np.flatnonzero(motion), system.starts[members[system.crowd_of[members] == g]]
-                values.append(np.tile(motion[moving], len(starts)))
-                places.append((starts[:, None] + moving).ravel())
-                columns.append(np.full(len(starts) * len(moving), len(held)))
-            held.append(int(system.starts[members[system.crowd_of[members] == crowd][0]]) + pivot)
-    entries = [np.concatenate([np.zeros(0), *part]) for part in (values, places, columns)]
-    shape = (n, len(held))
-    found = scipy.sparse.csr_matrix(
-        (entries[0], (entries[1].astype(np.int64), entries[2].astype(np.int64))), shape=shape
-    )
-    bound = (system.error + 4 * UNIT * abs(system.matrix)) @ abs(found)
-    moved = abs(system.matrix @ found - found)
-    if (moved - 2 * bound).max() > 0 if found.nnz else False:
-        return None
-    pivots = np.array(held, dtype=np.int64)
-    rest = np.setdiff1d(np.arange(n), pivots)
-    # V_p = [1 0; X 1], the common motions last, as these are 0 where the others are held.
-    corner = found[pivots]
-    inverse = 2 * scipy.sparse.identity(len(held), format="csr") - corner
+    return list(np.split(order, np.cumsum(np.bincount(part_of, minlength=parts))[:-1]))
+
+
+def _told_by(space: Any, held: Integers, single: int) -> RigidSpace:
+    """Return motions V, the first `single` of single peers, with what tells them.
+
+    V_p = [1 0; X 1], as common motions are 0 where those of single peers are held.
+    """
+    import scipy.sparse
+
+    corner = space[held]
     assert single == len(held) or not corner[:single, single:].count_nonzero(), "motions not told apart"
-    return RigidSpace(pivots, rest, (found[rest] @ inverse).tocsr())
+    inverse = 2 * scipy.sparse.identity(len(held), format="csr") - corner
+    rest = np.setdiff1d(np.arange(space.shape[0]), held)
+    return RigidSpace(held, rest, (space[rest] @ inverse).tocsr())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -113,8 +113,8 @@ def free_motions(listed: Sequence[Crowd], exchange: Exchange) -> FreeMotions | N
     Notes
     -----
     Where all senders send the same, it does not matter which of them a peer hears: the common motions are
-    those of one peer of each crowd, each hearing all. Motions that stand still whatever the weights of what is
-    heard are those of single peers.
+    those of one peer of each crowd, each hearing all. Motions that stand still whatever the weights of what
+    is heard are those of single peers.
     """
     loops = _standing_loops(listed, exchange)
     if loops is None or not all(hold_for_all(loop, listed) for loop in loops):

@@ -6,10 +6,10 @@ Guarantees: the loops it returns, each as often as its multiplicity says, have t
 loop.
 Does not: find symmetries other than of two sites that change places.
 
-Twins g and h are of equal dynamics, hear all others alike and are heard by them alike. A class c of n_c twins
-that weigh themselves by w_own and one another by w_other moves alike, as one site that hears
-w_own + (n_c − 1) w_other times itself and n_d W_cd times class d; or apart, its sum zero and all else at rest,
-each twin hearing w_own − w_other times itself, n_c − 1 times over.
+Twins g and h are of equal dynamics, hear all others alike and are heard by them alike. A class c of n_c
+twins that weigh themselves by w_own and one another by w_other moves alike, as one site that hears
+w_own + (n_c − 1) w_other times itself and n_d W_cd times class d; or apart, its sum zero and all else at
+rest, each twin hearing w_own − w_other times itself, n_c − 1 times over.
 """
 
 from __future__ import annotations

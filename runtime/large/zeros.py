@@ -27,32 +27,21 @@ from apc.runtime.large.characteristic import (
     count_around,
     refine,
 )
-from apc.runtime.large.counting import FIRST_ARCS
+from apc.runtime.large.circles import (
+    CLEAR,
+    FIRST_RADIUS,
+    SMALL_ARCS,
+    SMALL_POINTS,
+    WIDER,
+    WIDEST,
+    bracket,
+    held_around,
+    just_outside,
+    poles_within,
+)
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-
-# The smallest circle about a zero that is tried, relative to it, and what the next ones are larger by.
-FIRST_RADIUS, WIDER = 4e-15, 8.0
-
-# A circle about a zero that has to be wider than this shows nothing.
-WIDEST = 1e-3
-
-# The circle just outside of the largest zero is so many times farther from it than its error; if a pole or
-# another zero is in the way, wider ones are tried, so many.
-OUTSIDE, TRIES = 8.0, 10
-
-# A circle about a zero is so many times larger than what the zero is known to: then few arcs do.
-CLEAR = 6.0
-
-# How far aside of a zero, relatively, its slope is looked at, and how much nearer the next time.
-ASIDE, NEARER = 1e-7, 30.0
-
-# The least circle that is counted, for the discs along it to lie where f can be evaluated.
-INMOST = 1.1
-
-# Arcs about a zero to begin with, and evaluations after which the circle is too small to tell.
-SMALL_ARCS, SMALL_POINTS = 12, 300
 
 # Zeros nearer to one another than this, relatively, are one that was found twice.
 SAME = 1e-11
@@ -68,10 +57,6 @@ RING = 48
 
 # How often zeros that a count has missed are looked for.
 SEARCHES = 4
-
-# Circles between which the largest eigenvalue must be are drawn together until they are this close,
-# relatively, at the cost of no more counts than these; a circle that can't be counted is tried so far aside.
-BRACKETED, MOST_COUNTS, BESIDE = 1e-3, 40, 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +76,9 @@ class Zero:
 class Zeros:
     """Bounds on the spectral radius, and the largest eigenvalues found, the largest first.
 
-    `radius` is the best estimate, of an eigenvalue that may be too close to others to be listed. `counted` says that a count proves that nothing lies beyond `high`; `rigid_counted`, that one proves that
-    there are as many eigenvalues at 1 as was said.
+    `radius` is the best estimate, of an eigenvalue that may be too close to others to be listed. `counted`
+    says that a count proves that nothing lies beyond `high`; `rigid_counted`, that one proves that there are
+    as many eigenvalues at 1 as was said.
     """
 
     low: float
@@ -139,11 +125,11 @@ def find_zeros(
     low, high, beyond = 0.0, 0.0, -1
     for search in range(SEARCHES):
         largest, error = _largest(zeros, exact, error_of)
-        high, beyond = _outside(function, largest, error, rigid, rigid_radius)
+        high, beyond = just_outside(function, largest, error, rigid, rigid_radius)
         if not beyond:
             break
         if beyond < 0 or search:  # from where it must be, if nothing was found from around what is known
-            low, high = _bracket(function, low, high, rigid, rigid_radius)
+            low, high = bracket(function, low, high, rigid, rigid_radius)
             if not low > largest:
                 break
         cancelled = _cancelled_poles(function, largest, zeros, exact, rigid_radius)
@@ -157,7 +143,8 @@ def find_zeros(
     every = sorted(known, key=lambda one: -abs(one.value))[:listed]
     low = max([low, *(abs(one.value) - one.error for one in every)])
     if beyond or not high - low <= WIDEST * high:
-        low, high = _bracket(function, low, high, rigid, rigid_radius)
+        low, outer = bracket(function, low, high, rigid, rigid_radius)
+        high = outer if beyond else min(high, outer)
     radius, _ = _largest(zeros, exact, lambda zero: 0.0)
     if not low <= radius <= high:
         radius = (low + high) / 2 if np.isfinite(high) else low
@@ -182,7 +169,7 @@ def _rigid_radius(function: Characteristic, rigid: int) -> float:
     radius = max(CLEAR * float(ball.change[0]) * 1e-7, FIRST_RADIUS)
     while radius < WIDEST:
         inside = count_around(function, 1.0, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
-        poles = _poles_within(function, 1.0, radius)
+        poles = poles_within(function, 1.0, radius)
         if inside is not None and poles is not None and inside + poles == rigid:
             return radius
         radius *= WIDER
@@ -198,7 +185,7 @@ def _widened(function: Characteristic, zeros: Complexes, rigid: int, radius: flo
     for distance in np.sort(distances[(distances > radius) & (distances < WIDEST)])[::-1]:
         wider = 2 * float(distance)
         inside = count_around(function, 1.0, wider, arcs=SMALL_ARCS, most=SMALL_POINTS)
-        poles = _poles_within(function, 1.0, wider)
+        poles = poles_within(function, 1.0, wider)
         if rigid and inside is not None and poles is not None and inside + poles == rigid:
             return wider
     return radius
@@ -241,10 +228,15 @@ def _cancelled_poles(
             if any(abs(pole - other) <= SAME * abs(pole) for other in taken):
                 continue
             taken.append(pole)
-            error, many = _held_around(function, pole)
+            error, many = held_around(function, pole)
             if np.isfinite(error) and not any(abs(pole - zero) <= 2 * error for zero in zeros.tolist()):
                 found.append(Zero(pole, error, many, (which, site)))
     return found
+
+
+def _zero_error(function: Characteristic, zero: complex) -> float:
+    """Return the radius of a circle about an estimate that has an eigenvalue in it, inf if none is shown."""
+    return held_around(function, zero)[0]
 
 
 def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
@@ -260,134 +252,6 @@ def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
         if next(near, None) is None:
             kept.append(zero)
     return np.array(kept, dtype=np.complex128)
-
-
-def _zero_error(function: Characteristic, zero: complex) -> float:
-    """Return the radius of a circle about an estimate that has an eigenvalue in it, inf if none is shown."""
-    return _held_around(function, zero)[0]
-
-
-def _held_around(function: Characteristic, point: complex) -> tuple[float, int]:
-    """Return the radius of a circle about a point that has eigenvalues in it, and how many; or inf and 0.
-
-    Nearby a zero, at ζ + h, |f| ≈ |f′| h is known to a share c of it: the zero is known to about c h.
-    """
-    aside = ASIDE * abs(point)
-    for _ in range(SEARCHES):
-        ball = characteristic_ball(function, np.array([point + aside]), np.zeros(1))
-        radius = max(CLEAR * float(ball.change[0]) * aside, FIRST_RADIUS * abs(point))
-        for _ in range(SEARCHES):
-            if not radius < WIDEST * abs(point):
-                break
-            inside = count_around(function, point, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
-            poles = _poles_within(function, point, radius)
-            if inside is not None and poles is not None and inside + poles > 0:
-                return radius, inside + poles
-            radius *= WIDER
-        aside /= NEARER  # a pole or another zero may be that close
-    return float(np.inf), 0
-
-
-def _poles_within(function: Characteristic, centre: complex, radius: float) -> int | None:
-    """Return how many poles are within a circle, each as often as f has it; None: no telling."""
-    total = 0
-    for one in function.transfers:
-        distance = np.abs(one.eigenvalues - centre)
-        if np.any(np.abs(distance - radius) <= one.eigenvalue_errors):
-            return None
-        total += int((distance < radius).sum())
-    return total
-
-
-def _poles_beyond(function: Characteristic, radius: float) -> int | None:
-    """Return how many of the sites' eigenvalues are larger, multiplicities counted; None: no telling."""
-    total = 0
-    for one in function.transfers:
-        size = np.abs(one.eigenvalues)
-        if np.any(np.abs(size - radius) <= one.eigenvalue_errors):
-            return None
-        total += int(((size > radius).sum(axis=1) * one.counts).sum())
-    return total
-
-
-def _beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
-    """Return how many eigenvalues lie beyond a circle about zero, the rigid ones left out, or None."""
-    poles = _poles_beyond(function, radius)
-    turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function))
-    if poles is None or turns is None:
-        return None
-    return poles - turns - (rigid if radius < 1 else 0)
-
-
-def _arcs(function: Characteristic) -> int:
-    """Return how many arcs to begin with: f turns as often as its longest delay has frames."""
-    return max(FIRST_ARCS, 2 * max(function.lags, default=0))
-
-
-def _outside(
-    function: Characteristic, largest: float, error: float, rigid: int, rigid_radius: float
-) -> tuple[float, int]:
-    """Return a circle just outside of the largest zero, and how many eigenvalues are beyond, or −1."""
-    width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
-    for _ in range(TRIES):
-        radius = max(largest + width, function.innermost * INMOST)
-        if (
-            rigid and abs(radius - 1) <= rigid_radius
-        ):  # between the largest zero and the rigid ones, or beyond
-            radius = 1 + 2 * rigid_radius
-        beyond = _beyond(function, radius, rigid)
-        if beyond is not None:
-            return radius, beyond
-        width *= WIDER
-    return largest + width, -1
-
-
-def _bracket(
-    function: Characteristic, low: float, high: float, rigid: int, rigid_radius: float
-) -> tuple[float, float]:
-    """Return radii beyond the first of which there is an eigenvalue, and beyond the second none.
-
-    Parameters
-    ----------
-    function
-        f.
-    low
-        A radius that the largest eigenvalue is known to have at least.
-    high
-        Where to begin.
-    rigid, rigid_radius
-        How many eigenvalues are 1, and the circle about 1 that has no others.
-    """
-    inmost = function.innermost * INMOST
-    outer, radius, step = float(np.inf), max(high, low, inmost), 1e-6
-    for _ in range(MOST_COUNTS):
-        radius, beyond = _beyond_near(function, radius, rigid, rigid_radius)
-        if beyond == 0:
-            outer = min(outer, radius)
-        elif beyond > 0:
-            low = max(low, radius)
-        elif np.isfinite(outer):
-            break  # what can't be counted here is left between the two
-        if np.isfinite(outer):
-            if outer <= max(low, inmost) * (1 + BRACKETED):
-                break
-            radius = max(float(np.sqrt(max(low, outer / 2) * outer)), inmost)
-        else:
-            radius, step = radius * (1 + step), step * WIDER
-    return low, outer
-
-
-def _beyond_near(
-    function: Characteristic, radius: float, rigid: int, rigid_radius: float
-) -> tuple[float, int]:
-    """Return a radius near to one, and how many eigenvalues are beyond it; −1 if that can't be told."""
-    for aside in (0.0, BESIDE, -BESIDE):
-        near = radius * (1 + aside)
-        if near > function.innermost and not (rigid and abs(near - 1) <= rigid_radius):
-            beyond = _beyond(function, near, rigid)
-            if beyond is not None and beyond >= 0:
-                return near, beyond
-    return radius, -1
 
 
 def _search(
