@@ -32,6 +32,24 @@ ZEROS = (0.5, 0.99, -0.3 + 0.2j, -0.3 - 0.2j, 1.0 + 1e-9, 2.0, 0.6 + 0.8j, 0.6 -
 )
 def test_zeros_are_counted_however_near_to_the_circle(radius: float, count: int) -> None:
     assert wind(_polynomial(ZEROS), 0.0, radius) == count
+    assert wind(_polynomial(ZEROS), 0.0, radius, close=np.array(ZEROS)) == count
+
+
+def test_arcs_graded_towards_a_known_zero_are_settled_at_once() -> None:
+    """A zero 1e-10 within the circle: halving finds its way there in 30 rounds."""
+    rounds: list[int] = []
+
+    def counted(points: np.ndarray, reach: np.ndarray) -> Ball:
+        rounds.append(len(points))
+        return _polynomial((zero, zero.conjugate()))(points, reach)
+
+    zero = 0.9 * np.exp(1j)
+    assert wind(counted, 0.0, 0.9 + 1e-10) == 2
+    assert len(rounds) > 25
+    halved = sum(rounds)
+    rounds.clear()
+    assert wind(counted, 0.0, 0.9 + 1e-10, close=np.array([zero])) == 2
+    assert len(rounds) == 1 and sum(rounds) < halved
 
 
 def test_a_zero_on_the_circle_is_no_count() -> None:

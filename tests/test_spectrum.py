@@ -382,5 +382,12 @@ def test_a_change_of_sign_at_every_mark_is_half_a_turn_each_whatever_the_zeros_s
         assert turned_along(one, complex(2.3)) == pytest.approx(4 * math.pi, rel=1e-12)
 
 
+def test_a_course_over_the_whole_range_of_floats_still_has_its_angle() -> None:
+    """A quarter turn a mark for six marks, from 1e-250 to 1e250 and back: one and a half turns."""
+    sizes = np.array([1e-250, 1e250, 1e-250, 1e250, 1e-250, 1e250, 1e-250])
+    course = sizes * np.exp(0.5j * np.pi * np.arange(7))
+    assert turned_along(course, -1.0 + 0j) == pytest.approx(3 * np.pi)
+
+
 def test_an_angle_below_a_rounding_is_none() -> None:
     assert oscillation(0.5, 1e-77, 0.008) == (0.0, 1.0)

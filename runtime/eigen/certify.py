@@ -40,7 +40,8 @@ PRECISIONS = (256, 512, 1024, 2048, 4096)
 # those of a float.
 DOUBTFUL = 512
 
-# More states that drive each other than this aren't proved: the characteristic polynomial costs n⁴ or so, seconds at this size.
+# More states that drive each other than this aren't proved: the characteristic polynomial costs n⁴ or so,
+# seconds at this size.
 MOST_PROVED = 120
 
 # Of more states than this no vectors are computed: they cost n⁴, too, seconds at this size.
@@ -54,6 +55,9 @@ ROUNDED = 2.0**-50
 
 # A radius known so well needs no more bits: floats can't tell it better.
 SHARP = 2.0**-50
+
+# A verdict that is proved isn't followed by more than so many times its bits, for a sharper radius.
+SHARPENING = 4
 
 # Multiples of it, whole numbers left out, are spread evenly and favour no symmetry (Weyl): what inverse
 # iteration starts from.
@@ -117,7 +121,7 @@ def prove(system: ClosedSystem, free: RigidModes, held: Sequence[int]) -> Proof:
                 continue
             right, left = _vectors_of(parts, roots, reduced if free.exact else None)
             best = Proof(inside, settled or bits, free, values, radii, right, left)
-        if inside is not None and _sharp(best):
+        if inside is not None and (_sharp(best) or bits >= SHARPENING * settled):
             break
         if any(doubt for way, doubt in system.doubts.items() if way not in system.surds) and bits >= DOUBTFUL:
             break

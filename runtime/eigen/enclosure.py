@@ -30,7 +30,8 @@ Matrix = NDArray[Any]  # float64 or complex128
 # cluster at zero, the queues running empty; the first split between large and small is here.
 SMALL = 1e-2
 
-# A radius less certain than this is worth more work: other splits, this many.
+# A radius less certain than this, or than this part of it where it is above 1, is worth more work: other
+# splits, this many.
 WIDE = 1e-8
 SPLITS_TRIED = 8
 
@@ -107,7 +108,8 @@ def _enclose_part(
     others = [count for count in counts if count != first and sizes[count - 1] > SMALL]
     tried = [_enclose(matrix, error, values, right, left, first)]
     for count in (*others[:SPLITS_TRIED], 0):
-        if min(one.high for one in tried) - max(one.low for one in tried) <= WIDE:
+        low = max(one.low for one in tried)
+        if min(one.high for one in tried) - low <= WIDE * max(low, 1.0):
             break
         tried.append(_enclose(matrix, error, values, right, left, count))
     low, high = max(one.low for one in tried), min(one.high for one in tried)

@@ -178,7 +178,7 @@ def _is_open(one: _Solved, lowest: float) -> bool:
     """
     if not one.high > lowest:  # another system decides
         return False
-    return (one.inside is None and not lowest > 1) or not one.high - one.low <= WIDE
+    return (one.inside is None and not lowest > 1) or not one.high - one.low <= WIDE * max(one.low, 1.0)
 
 
 def _proof_in_words(solved: Sequence[_Solved], drifts: int) -> str:
@@ -359,6 +359,7 @@ def turned_along(course: Complexes, value: complex) -> float:
     principal = float(np.angle(value))
     if not np.all(np.abs(course) > 0):
         return principal
-    turns = np.angle(course[1:] / course[:-1])
+    phases = course / np.abs(course)  # the courses themselves can grow or shrink out of the range of floats
+    turns = np.angle(phases[1:] / phases[:-1])
     turned = float(np.sum(np.where(turns <= HALF_TURN_BACK, turns + 2 * np.pi, turns)))
     return principal + 2 * np.pi * round((turned - principal) / (2 * np.pi))

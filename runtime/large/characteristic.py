@@ -172,7 +172,13 @@ def _scaled_norm(matrices: Floats) -> Floats:
 
 
 def count_around(
-    function: Characteristic, centre: float | complex, radius: float, *, arcs: int, most: int | None = None
+    function: Characteristic,
+    centre: float | complex,
+    radius: float,
+    *,
+    arcs: int,
+    most: int | None = None,
+    close: Complexes | None = None,
 ) -> int | None:
     """Return zeros less poles of f within a circle, None if that can't be told.
 
@@ -180,7 +186,7 @@ def count_around(
     ----------
     function
         f.
-    centre, radius, arcs, most
+    centre, radius, arcs, most, close
         As `counting.wind` has them.
     """
     return wind(
@@ -189,6 +195,7 @@ def count_around(
         radius,
         arcs=arcs,
         most=most,
+        close=close,
     )
 
 

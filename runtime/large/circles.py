@@ -12,9 +12,12 @@ around 0 along a circle, so many more zeros than poles are in it.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.runtime.large.characteristic import Characteristic, characteristic_ball, count_around
 from apc.runtime.large.counting import FIRST_ARCS
+
+Complexes = NDArray[np.complex128]
 
 # The smallest circle about a zero that is tried, relative to it, and what the next ones are larger by.
 FIRST_RADIUS, WIDER = 4e-15, 8.0
@@ -41,6 +44,9 @@ SMALL_ARCS, SMALL_POINTS = 12, 300
 # Circles between which the largest eigenvalue must be are drawn together until they are this close,
 # relatively, at the cost of no more counts than these; a circle that can't be counted is tried so far aside.
 BRACKETED, MOST_COUNTS, BESIDE = 1e-3, 40, 1e-4
+
+# Known zeros this close to a circle, relatively, no more than so many, tell where its arcs have to be short.
+CLOSE_BY, MOST_CLOSE = 1e-5, 16
 
 # Points from which a circle about a zero is looked for, and circles tried from each.
 LOOKS = 4
@@ -89,10 +95,25 @@ def _poles_beyond(function: Characteristic, radius: float) -> int | None:
     return total
 
 
-def beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
-    """Return how many eigenvalues lie beyond a circle about zero, the rigid ones left out, or None."""
+def beyond(function: Characteristic, radius: float, rigid: int, zeros: Complexes | None = None) -> int | None:
+    """Return how many eigenvalues lie beyond a circle about zero, the rigid ones left out, or None.
+
+    Parameters
+    ----------
+    function
+        f.
+    radius
+        The circle's.
+    rigid
+        How many eigenvalues are 1.
+    zeros
+        Zeros in the upper half plane (z,), where they are known.
+    """
     poles = _poles_beyond(function, radius)
-    turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function))
+    if zeros is not None:
+        gaps = np.abs(np.abs(zeros) - radius)
+        zeros = zeros[gaps < CLOSE_BY * radius][:MOST_CLOSE]
+    turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function), close=zeros)
     if poles is None or turns is None:
         return None
     return poles - turns - (rigid if radius < 1 else 0)
@@ -104,15 +125,27 @@ def _arcs(function: Characteristic) -> int:
 
 
 def just_outside(
-    function: Characteristic, largest: float, error: float, rigid: int, rigid_radius: float
+    function: Characteristic, zeros: Complexes, largest: float, error: float, rigid: int, rigid_radius: float
 ) -> tuple[float, int]:
-    """Return a circle just outside of the largest zero, and how many eigenvalues are beyond, or −1."""
+    """Return a circle just outside of the largest zero, and how many eigenvalues are beyond, or −1.
+
+    Parameters
+    ----------
+    function
+        f.
+    zeros
+        Those that are known (z,).
+    largest, error
+        The largest one's magnitude, and what it may be off by.
+    rigid, rigid_radius
+        How many eigenvalues are 1, and the circle about 1 that has no others.
+    """
     width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
     for _ in range(TRIES):
         radius = max(largest + width, function.innermost * INMOST)
         if rigid and abs(radius - 1) <= rigid_radius:
             radius = 1 + 2 * rigid_radius
-        found = beyond(function, radius, rigid)
+        found = beyond(function, radius, rigid, zeros)
         if found is not None:
             return radius, found
         width *= WIDER

@@ -35,7 +35,7 @@ Argument = Callable[[complex], float]
 # but looked at, so many of them.
 ARCS, NEAR_CIRCLE, LOOKED_AT = 16, 0.02, 9
 
-# A peer's own eigenvalue this near to one of all, relatively, is divided by whatever it is near to.
+# A peer's own eigenvalue this near to a known one, relatively, takes its place.
 SAME = 1e-9
 
 # The argument's rate of change is measured over this angle; an arc is settled when two rules for its integral
@@ -67,9 +67,12 @@ def count_beyond(argument: Argument, alone: tuple[Complexes, Floats], known: Com
     values, counts = alone
     pairs = np.concatenate([known, known[known.imag != 0].conj()])
     near = np.abs(np.abs(values) - radius) <= NEAR_CIRCLE * radius
-    # Of many equal peers that all hear one other, most move by themselves: their eigenvalues go, too.
-    for value in pairs[np.abs(np.abs(pairs) - radius) <= NEAR_CIRCLE * radius].tolist():
-        near &= np.abs(values - value) > SAME * radius
+    # Of many equal peers that all hear one other, most move by themselves: these eigenvalues are divided by.
+    for value in np.unique(pairs[np.abs(np.abs(pairs) - radius) <= NEAR_CIRCLE * radius]).tolist():
+        alike = np.abs(values - value) <= SAME * radius
+        if alike.any():
+            near &= ~alike
+            pairs = pairs[pairs != value]
     divided = np.concatenate([values[~near], pairs]), np.concatenate([counts[~near], np.ones(len(pairs))])
     samples: dict[float, tuple[float, float]] = {}
 

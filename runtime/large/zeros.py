@@ -125,7 +125,7 @@ def find_zeros(
     low, high, beyond = 0.0, 0.0, -1
     for search in range(SEARCHES):
         largest, error = _largest(zeros, exact, error_of)
-        high, beyond = just_outside(function, largest, error, rigid, rigid_radius)
+        high, beyond = just_outside(function, zeros, largest, error, rigid, rigid_radius)
         if not beyond:
             break
         if beyond < 0 or search:  # from where it must be, if nothing was found from around what is known
