@@ -59,7 +59,7 @@ def _graded(edges: Floats, close: Complexes) -> Floats:
         aside = first * GRADING ** np.arange(steps)
         whole.append(angle % (2 * np.pi) + np.concatenate([-aside, aside]))
     found = np.unique(np.concatenate(whole))
-    return found[(found >= edges[0]) & (found <= edges[-1])]
+    return np.asarray(found[(found >= edges[0]) & (found <= edges[-1])])
 
 
 def wind(
