@@ -42,12 +42,12 @@ HOUSE = {
         lift batch_lift residues
     """,
     "apc.runtime.eigen": """
-        runs peer_group listening peers loop closing coupling graph_loops modes
+        runs peer_group listening peers loop closing coupling graph_loops twins modes
         rigid components pseudospectrum enclosure balls roots certify ratios duals spectrum
     """,
     "apc.runtime.large": """
         diagonal transfer response counting characteristic circles zeros crowds determinant
-        determinant_spectrum translation extremes graph twins sparse_system relative sampled_count
+        determinant_spectrum translation extremes graph sparse_system relative sampled_count
         krylov
     """,
     "apc.runtime.analysis": """
@@ -59,7 +59,7 @@ HOUSE = {
     """,
     "apc.runtime.sweep": "grid quantities table_file work store local cluster sweep",
     "apc.runtime.simulate": """
-        methods scales stepping integrate propagate flow forcing
+        methods scales stepping integrate propagate flow instants quadrature forcing
         local_signals pairs program writing native member ear population
         signals simulation length blocks accuracy summary trajectory formats recording figures still
         ensemble

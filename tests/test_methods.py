@@ -46,7 +46,7 @@ def test_a_method_is_read_with_its_step_exact(text: str, method: Method) -> None
         ),
         (
             "rk4:0.1",
-            "E204 the step of rk4 wants s, got 0.1 (no unit). Write: the step of rk4: 0.1 s",
+            "E204 the step of rk4 wants s, got 0.1 (no unit). Write: rk4:0.1ms",
         ),
         (
             "cvodes:7",

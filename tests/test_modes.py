@@ -186,12 +186,13 @@ def test_a_ring_of_many_peers_costs_half_as_many_systems() -> None:
 
 @pytest.mark.parametrize("operator", ["mean", "sum"])
 def test_different_peers_on_a_graph_are_one_whole_system(operator: str) -> None:
-    system = columned(linked(paper(operator, peers=4, **GAINS), "ring"), device__mass=[0.1, 0.2, 0.1, 0.3])
+    masses = [0.1, 0.2, 0.15, 0.3]
+    system = columned(linked(paper(operator, peers=4, **GAINS), "ring"), device__mass=masses)
     scene = Scene(
         operator,
         4,
         weights={(i, j): weight for i, j, weight in _arcs("ring", 4)},
-        users=({}, {"device": 0.2}, {}, {"device": 0.3}),
+        users=({}, {"device": 0.2}, {"device": 0.15}, {"device": 0.3}),
         **GAINS,
     )
     found = split(*lifted_groups(system))
@@ -200,6 +201,24 @@ def test_different_peers_on_a_graph_are_one_whole_system(operator: str) -> None:
         ("all peers as one system: the peers on lan (ring) differ",),
     )
     assert found.systems[0].names[8] == "user[2].device.x"
+    assert _apart(_split(system), _brute(scene), same_size=False) < 1e-12
+
+
+def test_different_peers_that_can_change_places_move_alike_or_apart() -> None:
+    masses = [
+        0.1,
+        0.2,
+        0.1,
+        0.3,
+    ]  # the first and the third hear the same two
+    system = columned(linked(paper(peers=4, **GAINS), "ring"), device__mass=masses)
+    users = tuple({"device": mass} for mass in masses)
+    scene = Scene("mean", 4, weights={(i, j): w for i, j, w in _arcs("ring", 4)}, users=users, **GAINS)
+    found = split(*lifted_groups(system))
+    assert [(one.name, one.multiplicity) for one in found.systems] == [
+        ("common", 1),
+        ("difference user[1,3]", 1),
+    ]
     assert _apart(_split(system), _brute(scene), same_size=False) < 1e-12
 
 

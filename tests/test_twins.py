@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.large.twins`: sites that can change places make few small loops of one large."""
+"""Claims about `apc.runtime.eigen.twins`: sites that can change places make few small loops of one large."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from apc.runtime.analysis.analysis import analyze, lifted_groups
 from apc.runtime.eigen.closing import close_loop
 from apc.runtime.eigen.modes import dense_loop
-from apc.runtime.large.twins import split_twins
+from apc.runtime.eigen.twins import split_twins
 from tests.sites import grouped, linked, paper
 
 # A path of four with a fork at either end: 0 and 1 are twins, and 4 and 5.
@@ -27,8 +27,9 @@ def test_the_loops_have_together_the_spectrum_of_the_whole(
 ) -> None:
     first = ("first", 1, {"device.mass": 0.25}) if graph in ("star", "complete") else ("first", 1, {})
     base = grouped(paper(operator, kt=300.0, bt=1.0, kc=800.0), first, ("others", 5, {}))
-    whole = dense_loop(*lifted_groups(linked(base, graph)))
-    loops = split_twins(whole)
+    groups, exchange = lifted_groups(linked(base, graph))
+    whole = dense_loop(groups, exchange)
+    loops = split_twins(whole, exchange)
     assert [len(loop.sites) for loop in loops] == sizes
     together = [
         np.linalg.eigvals(close_loop(loop).matrix) for loop in loops for _ in range(loop.multiplicity)

@@ -71,9 +71,7 @@ class Needs:
         sites = "; ".join(f"{site.name}: {site}" if len(self.sites) > 1 else str(site) for site in self.sites)
         whole = self.peers > 1 and sum(count for count, _ in self.systems) == 1
         noun = _NOUNS.get(self.method, "system" if whole else "mode")
-        systems = " and ".join(
-            f"{counted(count, noun)} of {size}" for count, size in self.systems
-        )
+        systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in self.systems)
         analysed = f"not analysed: {self.refused}" if self.refused else f"analysed as {systems}"
         pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in self.pairs)
         return f"{sites}, {counted(self.peers, 'peer')}; {analysed}{pairs}"

@@ -103,12 +103,7 @@ def make_plan(
         loops, found, notes = arranged.loops, arranged.method, arranged.notes
         packets = max(sum(sum(group.schedule.depths) for group in loop.sites) for loop in loops)
         if method == "determinant":
-            from apc.runtime.large.twins import split_twins  # of no use to any other method
-
             found = method
-            loops = tuple(part for loop in loops for part in split_twins(loop))
-            if len(loops) > len(arranged.loops):
-                notes = (f"{len(loops)} systems, as peers that can change places move alike or apart",)
         elif method == "auto" and (
             max(sum(group.schedule.depths) for loop in loops for group in loop.sites) > LONG_LINES
             or (packets > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)

@@ -13,7 +13,8 @@ for a sum. K groups of n_1 … n_K equal peers then split exactly:
     difference g  peers of group g apart, their sum zero, all else at rest: r_g = −c_g s_g        n_g − 1
     times
 
-Equal peers on any other graph: see `graph_loops`. Different peers on such a graph are one whole system.
+Equal peers on any other graph: see `graph_loops`. Different peers on such a graph are one whole system, less
+those that can change places: see `twins`.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from apc.runtime.eigen.coupling import complete_degrees, couple
 from apc.runtime.eigen.graph_loops import common_graph, graph_loop, graph_scale
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
+from apc.runtime.eigen.twins import split_twins
 from apc.runtime.frame.exchange import Exchange, graph_modes
 
 
@@ -93,7 +95,11 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
             note = f"{len(found)} systems, one an eigenvalue of the graph of {named}"
             return Arrangement("modes", tuple(graph_loop(groups[0], one, scale) for one in found), (note,))
         reason = f"the graph of {named} has no full set of eigenvectors"
-    return Arrangement("dense", (dense_loop(groups, exchange),), (f"all peers as one system: {reason}",))
+    parts = split_twins(dense_loop(groups, exchange), exchange)
+    if len(parts) > 1:
+        note = f"{len(parts)} systems, as peers that can change places move alike or apart"
+        return Arrangement("modes", parts, (note,))
+    return Arrangement("dense", parts, (f"all peers as one system: {reason}",))
 
 
 def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:

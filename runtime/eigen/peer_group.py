@@ -100,21 +100,11 @@ def build_group(
     listening, gains
         What it hears at the start and weighs each sender by, where that matters.
     """
-    counts = np.diff(exchange.starts)
-    names = []
-    for group, peers in parts:
-        name = exchange.groups[group]
-        if len(peers) < counts[group]:
-            more = ["…"] if len(peers) > MOST_NAMED else []
-            name += f"[{','.join([*(str(int(peer) + 1) for peer in peers[:MOST_NAMED]), *more])}]"
-        names.append(name)
-    if len(names) > MOST_NAMED:
-        names = [*names[:MOST_NAMED], "…"]
     peers = joined([shifted(peers, int(exchange.starts[group])) for group, peers in parts])
     # The functions of a nonlinear loop can't be walked one by one.
     exact = linearize_exact(built, vector, listening) if built.walkable else None
     return PeerGroup(
-        name="+".join(names),
+        name=group_name(parts, exchange),
         count=len(peers),
         parameters=vector,
         jacobians=built,
@@ -128,6 +118,21 @@ def build_group(
         listening=listening,
         gains=gains or {},
     )
+
+
+def group_name(parts: Sequence[tuple[int, Peers]], exchange: Exchange) -> str:
+    """Return `left+right[1,3]`, for peers of the scene's groups; all of a group are its name alone."""
+    counts = np.diff(exchange.starts)
+    names = []
+    for group, peers in parts:
+        name = exchange.groups[group]
+        if len(peers) < counts[group]:
+            more = ["…"] if len(peers) > MOST_NAMED else []
+            name += f"[{','.join([*(str(int(peer) + 1) for peer in peers[:MOST_NAMED]), *more])}]"
+        names.append(name)
+    if len(names) > MOST_NAMED:
+        names = [*names[:MOST_NAMED], "…"]
+    return "+".join(names)
 
 
 def used_ways(schedules: Iterable[Schedule]) -> tuple[Way, ...]:

@@ -11,14 +11,14 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
 import casadi
 
-# Functions whose instructions are kept: an analysis walks the same few of a scene's kinds many times, and asking
-# CasADi for them takes longer than the arithmetic.
+# Functions whose instructions are kept: an analysis walks the same few of a scene's kinds many times, and to
+# ask CasADi for them takes longer than the arithmetic.
 KEPT = 16
 
 _UNARY: dict[int, Callable[[Any], Any]] = {
@@ -71,6 +71,7 @@ def evaluate_exact(
     *,
     number: Callable[[float], Any] = Fraction,
     rounded: Callable[[str, Any], Any] | None = None,
+    rules: Mapping[int, Callable[..., Any]] | None = None,
 ) -> list[list[Any]]:
     """Evaluate an SX function instruction by instruction over another number type.
 
@@ -85,6 +86,8 @@ def evaluate_exact(
     rounded
         Evaluates a transcendental function, by its name in `math`, in the number type. Left out, its
         value is rounded to a double first.
+    rules
+        Operations, by CasADi's code, that this kind of number does in another way than Python's numbers.
 
     Returns
     -------
@@ -97,6 +100,7 @@ def evaluate_exact(
     """
     work: list[Any] = [None] * function.sz_w()
     results: list[list[Any]] = [[number(0.0)] * function.nnz_out(i) for i in range(function.n_out())]
+    own = rules or {}
 
     def transcendental(code: int, a: Any) -> Any:
         function_of = _ROUNDED[code]
@@ -109,6 +113,8 @@ def evaluate_exact(
             results[outputs[0]][outputs[1]] = work[inputs[0]]
         elif code == casadi.OP_CONST:
             work[outputs[0]] = number(constant)
+        elif code in own:
+            work[outputs[0]] = own[code](*(work[place] for place in inputs))
         elif code in (casadi.OP_POW, casadi.OP_CONSTPOW):
             work[outputs[0]] = _power(work[inputs[0]], work[inputs[1]], number)
         elif code in _UNARY:

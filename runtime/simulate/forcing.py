@@ -1,108 +1,95 @@
 """What forces that change with time alone add to a site's motion, exact to rounding.
 
 Takes: the `Rates` of a kind, parameter vectors, when the intervals begin and how long they last.
-Gives: `Forcing`, `forcing_of`, `SiteForcing`, `site_forcing`, `impulses`.
+Gives: `Forcing`, `forcing_of`, `SiteForcing`, `impulses`.
 Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of a
-table), so that what is integrated is smooth; an impulse is within a few roundings of its terms.
+table), so that what is integrated is smooth; an impulse is within a few roundings of its terms, of what pushes
+at all within the interval, and of the instants.
 Does not: integrate what depends on the motion.
 
     c = ∫₀ᵀ e^{A (T − s)} g(t + s) ds
 
-by Gauss and Legendre's rule, whose error for n nodes is T^{2n+1} (n!)⁴ / ((2n + 1) (2n)!³) times the 2n-th
-derivative of the integrand (Davis and Rabinowitz, Methods of Numerical Integration, section 2.7): for a sine
-of half a turn within T, 4e-27 at 10 nodes. Whether 10 nodes are enough is seen from 16; where they differ
-the interval is halved.
+over all intervals of one length at once, by two rules (see `quadrature`); where they differ by more than
+rounding, a panel is halved.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.discretize import UNIT, discretize
 from apc.runtime.frame.guards import guards_of
+from apc.runtime.simulate.instants import at_instants
 from apc.runtime.simulate.propagate import Rates
+from apc.runtime.simulate.quadrature import AGREE, Kernel, Panels, integrate, magnitude, panels, whole
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-COARSE, FINE = (np.polynomial.legendre.leggauss(n) for n in (10, 16))
-# Both rules round each of their terms once or twice: they agree within this many units of their magnitudes.
-AGREE = 16 * UNIT
 MOST_HALVINGS = 30  # below 1e-9 of an interval, what a jump is missed by is far below a rounding
+MOST_PANELS = 256  # integrated at once: what is held of them stays within some MB, however many there are
 LOOKS = 5  # instants of an interval at which a switch that is not linear in time is looked for
+
+# A switch is found to this share of the interval, below a rounding of what it changes, or to that of an instant.
+PLACED = 2.0**-60
+# Where it is looked for between two instants that it lies between: evenly, which leaves 1/32 of them, and nearer and
+# nearer to where a straight line through both would cross 0, which leaves nothing if it is one.
+EVENLY = np.arange(1, 32) / 32
+NEARER = 4.0 ** -np.arange(1, 31)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forcing:
-    """A kind's g(t): `rates`, and where it is not smooth: at sign changes of `switches(p, t)`."""
+    """A kind's g(t): what pushes the states `pushed`, and where it is not smooth.
 
-    rates: Rates
-    switches: Any  # casadi.Function
-    affine: bool  # whether all switches are linear in time
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rule:
-    """∫ e^{A (T − s)} g(s) ds over a panel of an interval is Σ `factors` g(`after`).
-
-    `after` (n,) are seconds from the interval's start, `factors` (n, n_x, n_x).
+    `force(p, t)` is their rows of g, `drift(p, t)` those of t dg/dt: a rounding of t changes g by so many.
+    Not smooth is g at sign changes of `switches(p, t)`; `affine` says that all of them are linear in time.
     """
 
-    after: Floats
-    factors: Floats
+    pushed: tuple[int, ...]
+    force: Any  # casadi.Function
+    drift: Any  # casadi.Function
+    switches: Any  # casadi.Function
+    affine: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteForcing:
-    """The forces on one site: its parameters (n_p,), A, and the two rules of each of `durations`."""
+    """The forces on one site: its parameters (n_p,), and the kernel of each length of intervals."""
 
     forcing: Forcing
     parameters: Floats
-    a: NDArray[Any]
-    durations: tuple[Fraction, ...]
-    rules: tuple[tuple[Rule, Rule], ...]
+    kernels: tuple[Kernel, ...]
 
 
 def forcing_of(rates: Rates) -> Forcing:
-    """Find where a kind's forces switch with time."""
-    found: list[Any] = []
-    p, t = casadi.SX.sym("p", rates.rate.numel_in(0)), casadi.SX.sym("t")
-    if rates.rate.is_a("SXFunction"):  # a nonlinear loop has no switches but those halving finds
-        found = guards_of(rates.rate(p, t), t)
-    column = casadi.vertcat(*found) if found else casadi.SX(0, 1)
-    slopes = casadi.jacobian(column, t)
-    affine = not (found and slopes.nnz() and casadi.depends_on(slopes, t))
-    return Forcing(rates, casadi.Function("switches", [p, t], [casadi.densify(column)]), affine)
+    """Find what a kind's forces push, and where they switch with time."""
+    type_: Any = casadi.SX if rates.rate.is_a("SXFunction") else casadi.MX
+    p, t = type_.sym("p", rates.rate.numel_in(0)), type_.sym("t")
+    g = rates.rate(p, t)
+    pushed, found, affine = tuple(range(g.numel())), [], True
+    if type_ is casadi.SX:  # a nonlinear loop has no switches but those halving finds
+        pushed = tuple(row for row in pushed if not g[row].is_zero())
+        found = guards_of(g, t)
+    g = g[list(pushed)]
+    if found:
+        slopes = casadi.jacobian(casadi.vertcat(*found), t)
+        affine = not (slopes.nnz() and casadi.depends_on(slopes, t))
+    column = casadi.vertcat(*found) if found else type_(0, 1)
+    return Forcing(
+        pushed=pushed,
+        force=casadi.Function("force", [p, t], [casadi.densify(g)]),
+        drift=casadi.Function("drift", [p, t], [casadi.densify(t * casadi.jacobian(g, t))]),
+        switches=casadi.Function("switches", [p, t], [casadi.densify(column)]),
+        affine=affine,
+    )
 
 
-def site_forcing(
-    forcing: Forcing, parameters: Floats, a: NDArray[Any], durations: Sequence[Fraction]
-) -> SiteForcing:
-    """Return the forces on one site.
-
-    Parameters
-    ----------
-    forcing
-        Its kind's.
-    parameters
-        Its vector (n_p,).
-    a
-        Its A (n_x, n_x), exact.
-    durations
-        The different lengths of intervals, in seconds.
-    """
-    rules = tuple(_rules(a, 0.0, float(duration), duration) for duration in durations)
-    return SiteForcing(forcing, parameters, a, tuple(durations), rules)
-
-
-def impulses(site: SiteForcing, starts: Floats, which: NDArray[np.int64]) -> Floats:
+def impulses(site: SiteForcing, starts: Floats, which: Integers) -> Floats:
     """Return c of every interval (intervals, n_x).
 
     Parameters
@@ -112,89 +99,123 @@ def impulses(site: SiteForcing, starts: Floats, which: NDArray[np.int64]) -> Flo
     starts
         When each interval begins, in seconds (intervals,).
     which
-        The place of each interval's length in the site's `durations` (intervals,).
+        The place of each interval's length in the site's `kernels` (intervals,).
     """
-    result = np.zeros((len(starts), len(site.a)))
+    result = np.zeros((len(starts), len(site.kernels[0].a)))
     for place in np.unique(which):
         rows = np.flatnonzero(which == place)
-        result[rows] = _impulses_of_length(site, starts[rows], int(place))
+        result[rows] = _impulses_of_length(site, site.kernels[place], starts[rows])
     return result
 
 
-def _impulses_of_length(site: SiteForcing, starts: Floats, place: int) -> Floats:
-    forcing, length = site.forcing, float(site.durations[place])
-    fine, apart, size = _both(site, site.rules[place], starts)
-    split = (apart > AGREE * size).any(axis=1)
-    looks = np.linspace(0.0, length, 2 if forcing.affine else LOOKS)
-    if forcing.switches.numel_out(0):
-        instants = starts[:, None] + looks
-        many = forcing.switches.map(instants.size)(site.parameters, instants.reshape(1, -1))
-        signs = np.sign(np.asarray(many)).reshape(-1, *instants.shape)
-        split |= (signs[:, :, 1:] != signs[:, :, :-1]).any(axis=(0, 2))
-    for row in np.flatnonzero(split):
-        fine[row] = _split(site, float(starts[row]), site.durations[place], looks, size[row])
-    return fine
-
-
-def _split(site: SiteForcing, start: float, duration: Fraction, looks: Floats, size: Floats) -> Floats:
-    """Return c of one interval, panel by panel between its switches; `size` is what its terms add up to."""
-    edges = {0.0, float(duration)}
-    for low, high in itertools.pairwise(looks):
-        edges |= _roots(site, start, float(low), float(high))
-    work = [(low, high, 0) for low, high in itertools.pairwise(sorted(edges))]
-    total: Floats = np.zeros(len(site.a))
+def _impulses_of_length(site: SiteForcing, kernel: Kernel, starts: Floats) -> Floats:
+    total, off, size = _integrated(site, whole(kernel), starts)
+    rows, at = _switched(site, kernel, starts)
+    off[rows] = True
+    if not off.any():
+        return total
+    total[off] = 0.0
+    work = [(*_between(np.flatnonzero(off), rows, at, float(kernel.duration)), 0)]
     while work:
-        low, high, halvings = work.pop()
-        [fine], [apart], [own] = _both(site, _rules(site.a, low, high, duration), np.array([start]))
-        size = np.maximum(size, own)  # a step at the very end is not seen from afar
-        if (apart <= AGREE * size).all() or halvings >= MOST_HALVINGS:
-            total = total + fine
-        else:
+        rows, low, high, halvings = work.pop()
+        if len(rows) > MOST_PANELS:
+            work.append((rows[MOST_PANELS:], low[MOST_PANELS:], high[MOST_PANELS:], halvings))
+            rows, low, high = rows[:MOST_PANELS], low[:MOST_PANELS], high[:MOST_PANELS]
+        added, off, own = _integrated(site, panels(kernel, low, high), starts[rows], size[rows])
+        np.maximum.at(size, rows, own)  # a step at the very end is not seen from afar
+        off &= halvings < MOST_HALVINGS
+        np.add.at(total, rows[~off], added[~off])
+        if off.any():
+            rows, low, high = rows[off], low[off], high[off]
             middle = (low + high) / 2
-            work += [(low, middle, halvings + 1), (middle, high, halvings + 1)]
+            halves = np.tile(rows, 2), np.append(low, middle), np.append(middle, high)
+            work.append((*halves, halvings + 1))
     return total
 
 
-def _roots(site: SiteForcing, start: float, low: float, high: float) -> set[float]:
-    """Return where switches change sign between two instants after `start`, to the last digit."""
+def _integrated(
+    site: SiteForcing, found: Panels, starts: Floats, size: Floats | float = 0.0
+) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    """Integrate panels of intervals that begin at `starts` (k,), all of one or each of its own.
 
-    def signs(after: float) -> Floats:
-        switches = site.forcing.switches(site.parameters, start + after)
-        return np.asarray(np.sign(np.asarray(switches).ravel()))
-
-    found = set()
-    first, last = signs(low), signs(high)
-    for one in np.flatnonzero(first != last):
-        left, right = low, high
-        while left < (middle := (left + right) / 2) < right and start + left < start + right:
-            if signs(middle)[one] == first[one]:
-                left = middle
-            else:
-                right = middle
-        found.add(right)
-    return found
-
-
-def _rules(a: NDArray[Any], low: float, high: float, duration: Fraction) -> tuple[Rule, Rule]:
-    """Return the coarse and the fine rule of one panel of an interval."""
-    nothing = np.zeros((len(a), 0), dtype=object)
-    rules = []
-    for nodes, weights in (COARSE, FINE):
-        after = low + (high - low) * (nodes + 1) / 2
-        left = [duration - Fraction(float(one)) for one in after]
-        steps = np.array([step.matrix for step in discretize(a, nothing, left)])
-        rules.append(Rule(after, steps * (weights * (high - low) / 2)[:, None, None]))
-    return rules[0], rules[1]
+    Returns
+    -------
+    The integrals (k, n_x); which of them both rules do not agree upon (k,); what their terms add up to (k, n_x),
+    at least `size`.
+    """
+    instants = starts[:, None] + found.after
+    g = at_instants(site.forcing.force, site.parameters, instants)
+    fine, apart = integrate(found, g)
+    size = np.maximum(magnitude(found, g), size)
+    off = ~(apart <= AGREE * size).all(axis=1)
+    if off.any():  # it may be that of rounding the instants, which no halving mends
+        some = found if len(found.after) == 1 else Panels(found.after[off], found.weights[off])
+        drift = at_instants(site.forcing.drift, site.parameters, instants[off])
+        moved = magnitude(some, np.where(np.isfinite(drift), drift, 0.0))
+        off[off] = ~(apart[off] <= AGREE * (size[off] + moved)).all(axis=1)
+    return fine, off, size
 
 
-def _both(site: SiteForcing, rules: tuple[Rule, Rule], starts: Floats) -> tuple[Floats, Floats, Floats]:
-    """Integrate a panel of many intervals: by the finer rule, how far the coarser is, and the magnitudes."""
-    results = []
-    size: Floats = np.zeros(0)
-    for rule in rules:
-        instants = (starts[:, None] + rule.after).reshape(1, -1)
-        rate = np.asarray(site.forcing.rates.rate.map(instants.size)(site.parameters, instants))
-        g = rate.reshape(len(site.a), len(starts), len(rule.after))
-        results.append(np.einsum("nij,jkn->ki", rule.factors, g))
-        size = np.einsum("nij,jkn->ki", np.abs(rule.factors), np.abs(g))
-    return results[1], np.abs(results[1] - results[0]), size
+def _between(again: Integers, rows: Integers, at: Floats, duration: float) -> tuple[Integers, Floats, Floats]:
+    """Return the panels of the intervals `again`: whose they are, and where they begin and end.
+
+    `at` (k,) are instants of the intervals `rows` (k,) at which something switches.
+    """
+    ends = np.concatenate([np.tile([0.0, duration], len(again)), at])
+    whose = np.concatenate([np.repeat(again, 2), rows])
+    order = np.lexsort((ends, whose))
+    ends, whose = ends[order], whose[order]
+    inside = (whose[1:] == whose[:-1]) & (ends[1:] > ends[:-1])
+    return whose[:-1][inside], ends[:-1][inside], ends[1:][inside]
+
+
+def _switched(site: SiteForcing, kernel: Kernel, starts: Floats) -> tuple[Integers, Floats]:
+    """Return the intervals within which something switches, and how long after their beginning."""
+    forcing, length = site.forcing, float(kernel.duration)
+    if not forcing.switches.numel_out(0):
+        return np.empty(0, np.int64), np.empty(0)
+    looks = np.linspace(0.0, length, 2 if forcing.affine else LOOKS)
+    values = at_instants(forcing.switches, site.parameters, starts[:, None] + looks)
+    switch, row, gap = np.nonzero(np.sign(values[:, :, 1:]) != np.sign(values[:, :, :-1]))
+    low, high = looks[gap], looks[gap + 1]
+    ends = values[switch, row, gap], values[switch, row, gap + 1]
+    at = _placed(site, starts[row], switch, low, high, ends, PLACED * length)
+    inside = (at > PLACED * length) & (at < length)
+    return row[inside], at[inside]
+
+
+def _placed(
+    site: SiteForcing,
+    starts: Floats,
+    switch: Integers,
+    low: Floats,
+    high: Floats,
+    ends: tuple[Floats, Floats],
+    enough: float,
+) -> Floats:
+    """Return where a switch changes sign between `low` and `high`, seconds after `starts`; all (k,).
+
+    `ends` are its values there.
+    """
+    first, last = (one.copy() for one in ends)
+    low, high = low.copy(), high.copy()
+    sign = np.sign(first)
+    while True:
+        width = high - low
+        busy = np.flatnonzero((width > enough) & (starts + low < starts + high - np.spacing(starts + high)))
+        if not len(busy):
+            return high
+        with np.errstate(all="ignore"):
+            guess = first[busy] / (first[busy] - last[busy])
+        guess = np.where((guess > 0) & (guess < 1), guess, np.where(first[busy] == 0, 0.0, 0.5))[:, None]
+        shares = np.concatenate([np.tile(EVENLY, (len(busy), 1)), guess - NEARER, guess + NEARER], axis=1)
+        shares = np.sort(np.clip(shares, 0.0, 1.0), axis=1)
+        places = np.clip(low[busy, None] + width[busy, None] * shares, low[busy, None], high[busy, None])
+        places = np.concatenate([low[busy, None], places, high[busy, None]], axis=1)
+        every = at_instants(site.forcing.switches, site.parameters, starts[busy, None] + places)
+        values = every[switch[busy], np.arange(len(busy))]
+        values[:, 0], values[:, -1] = first[busy], last[busy]
+        after = np.argmax(np.sign(values) != sign[busy, None], axis=1)
+        line = np.arange(len(busy))
+        low[busy], high[busy] = places[line, after - 1], places[line, after]
+        first[busy], last[busy] = values[line, after - 1], values[line, after]

@@ -26,7 +26,7 @@ from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.frame.site import LinearSite
 from apc.runtime.frame.timetable import Route, routes_of
 from apc.runtime.simulate.flow import Flow, Tolerance, flow_of, rows_to_move
-from apc.runtime.simulate.forcing import SiteForcing, forcing_of, site_forcing
+from apc.runtime.simulate.forcing import SiteForcing, forcing_of
 from apc.runtime.simulate.local_signals import LocalSignal, local_signals
 from apc.runtime.simulate.member import Member, build_member
 from apc.runtime.simulate.methods import CVODES, DEFAULT, EXACT, WHERE_NEEDED, Method, check_step
@@ -35,6 +35,7 @@ from apc.runtime.simulate.pairs import count_pairs
 from apc.runtime.simulate.population import Population, build_population, exchanges_within, refuse_unheard_of
 from apc.runtime.simulate.program import Program
 from apc.runtime.simulate.propagate import Transitions, rates, shaken, transitions
+from apc.runtime.simulate.quadrature import Kernel, kernel_of
 from apc.runtime.simulate.scales import state_scales
 from apc.runtime.simulate.signals import Choice, Signal, choose, signals_of
 from apc.runtime.simulate.writing import build_program
@@ -329,5 +330,9 @@ def _forces(member: Member) -> tuple[SiteForcing, ...]:
         return ()
     seconds = [length * program.schedule.quantum for length in program.durations]
     forcing = forcing_of(program.rates)
+    kernels: dict[int, tuple[Kernel, ...]] = {}
+    for one in member.transitions:  # equal ones are one object
+        if id(one) not in kernels:
+            kernels[id(one)] = tuple(kernel_of(one.a, forcing.pushed, length) for length in seconds)
     pairs = zip(member.parameters, member.transitions, strict=True)
-    return tuple(site_forcing(forcing, vector, own.a, seconds) for vector, own in pairs)
+    return tuple(SiteForcing(forcing, vector, kernels[id(own)]) for vector, own in pairs)

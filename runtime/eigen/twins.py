@@ -1,6 +1,6 @@
 """Peers that can change places: a loop of many sites as a few small ones.
 
-Takes: a `Loop`.
+Takes: the `Loop` of a whole system.
 Gives: `split_twins`.
 Guarantees: the loops it returns, each as often as its multiplicity says, have together the spectrum of the
 loop.
@@ -21,17 +21,20 @@ from fractions import Fraction
 import numpy as np
 
 from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.peer_group import PeerGroup
+from apc.runtime.eigen.peer_group import PeerGroup, group_name
+from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.schedule import Way
 
 
-def split_twins(loop: Loop) -> tuple[Loop, ...]:
+def split_twins(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
     """Split a loop by its twins.
 
     Parameters
     ----------
     loop
-        Its weights exact; without twins it is returned as it is.
+        Of all peers, one a site, its weights exact; without twins it is returned as it is.
+    exchange
+        The links, for the names of the groups.
     """
     classes: list[list[int]] = []
     for place in range(len(loop.sites)):
@@ -43,7 +46,7 @@ def split_twins(loop: Loop) -> tuple[Loop, ...]:
             found.append(place)
     if loop.doubts or len(classes) == len(loop.sites):
         return (loop,)
-    sites = tuple(_together([loop.sites[place] for place in members]) for members in classes)
+    sites = tuple(_together([loop.sites[place] for place in members], exchange) for members in classes)
     coupling = {
         way: tuple(tuple(_weight_of(loop, way, members, others) for others in classes) for members in classes)
         for way in loop.coupling
@@ -80,10 +83,9 @@ def _weight_of(loop: Loop, way: Way, members: Sequence[int], others: Sequence[in
     return sum((row[place] for place in others), Fraction(0))
 
 
-def _together(sites: Sequence[PeerGroup]) -> PeerGroup:
-    """Return equal sites as one group, named by the first."""
-    if len(sites) == 1:
-        return sites[0]
-    name = f"{sites[0].name} and {len(sites) - 1} like it"
-    peers = [peer for site in sites for peer in site.peers]
-    return replace(sites[0], name=name, count=sum(site.count for site in sites), peers=np.array(peers))
+def _together(sites: Sequence[PeerGroup], exchange: Exchange) -> PeerGroup:
+    """Return equal sites as one group."""
+    peers = np.sort(np.concatenate([np.array(list(site.peers)) for site in sites]))
+    groups = np.searchsorted(exchange.starts, peers, side="right") - 1
+    parts = [(int(group), peers[groups == group] - exchange.starts[group]) for group in np.unique(groups)]
+    return replace(sites[0], name=group_name(parts, exchange), count=len(peers), peers=peers)
