@@ -1,19 +1,21 @@
-"""Text to CasADi. Stages, each with what it is made of; a module imports only what stands before it.
+"""Text to CasADi, a folder a stage; a module imports only what stands before it.
 
-what all are written in   errors words
-source                    nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
-the language              expression, lexer, grammar: text to trees; evaluation: trees to values
-                          dimensions, unit_grammar, unit_names, units, unit_text, unit_check
-                          values, tables, recordings: numbers of a scene, and in CSV files
-components                component, parts, declarations, component_check, definitions, library
-scene                     named_numbers, timebase, instances, sections, channels, graphs, links, groups,
-                          studies: a section each
-flatten                   connections: where connectors meet
-clocks                    reductions: what is heard of the others; clock_inference: what ticks together
-structure                 symbolic, zero_test: SymPy; solution, matching, residuals, elimination,
-                          tearing, blocks: solving; jets, aliases, index: derivatives and states
-functions                 casadi_writer, reached: what is written; exchange, ports: what lies beside
-compiled, store, cache    the compiled model; on disk; whether it still is what its texts compile to
-pipeline                  the stages one after another
-what a person sees        schema, listing; diagram, graphviz, marks, layers, picture, svg
+errors words                what all are written in
+source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
+language                    expression, lexer, grammar: text to trees; evaluation: trees to values
+                            dimensions, unit_grammar, unit_names, units, unit_text, unit_check
+                            values, tables, recordings: numbers of a scene, and in CSV files
+components                  component, parts, declarations, component_check, definitions, library
+scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
+                            studies: a section each; scene: all of them
+equations                   connections: where connectors meet; flatten
+                            reductions: what is heard of the others; clock_inference: what ticks together;
+                            clocks
+                            symbolic, zero_test: SymPy; solution, matching, residuals, elimination, tearing,
+                            blocks: solving; jets, aliases, index: derivatives and states; structure
+functions                   casadi_writer, reached: what is written; exchange, ports: what lies beside;
+                            functions
+compiled, store, cache      the compiled model; on disk; whether it still is what its texts compile to
+pipeline                    the stages one after another
+view                        schema, listing; diagram, graphviz, marks, layers, picture, svg
 """

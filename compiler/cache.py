@@ -144,8 +144,9 @@ def builtin_digest(name: str) -> str:
 def program_digest() -> str:
     """Return the SHA-256 of what compiles: every module of the compiler."""
     whole = hashlib.sha256()
-    for path in sorted(Path(__file__).resolve().parent.glob("*.py")):
-        whole.update(f"\0{path.name}\0".encode())
+    compiler = Path(__file__).resolve().parent
+    for path in sorted(compiler.rglob("*.py")):
+        whole.update(f"\0{path.relative_to(compiler)}\0".encode())
         whole.update(path.read_bytes())
     return whole.hexdigest()
 

@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Literal
 
 from apc.compiler.cache import origin_texts
-from apc.compiler.clocks import ClockedSystem, partition
 from apc.compiler.compiled import CompiledSystem, Origin
-from apc.compiler.flatten import FlatSystem, flatten
-from apc.compiler.functions import build_functions
-from apc.compiler.library import Library
-from apc.compiler.nodes import Mapping, Scalar, Sequence
-from apc.compiler.scene import Scene, build_scene, library_folders
-from apc.compiler.source import Source, read_source
-from apc.compiler.structure import SortedSystem, sort
+from apc.compiler.components.library import Library
+from apc.compiler.equations.clocks import ClockedSystem, partition
+from apc.compiler.equations.flatten import FlatSystem, flatten
+from apc.compiler.equations.structure import SortedSystem, sort
+from apc.compiler.functions.functions import build_functions
+from apc.compiler.scene.scene import Scene, build_scene, library_folders
+from apc.compiler.source.nodes import Mapping, Scalar, Sequence
+from apc.compiler.source.source import Source, read_source
 
 Stage = Literal["source", "scene", "flat", "clocked", "sorted", "compiled"]
 STAGES: tuple[Stage, ...] = ("source", "scene", "flat", "clocked", "sorted", "compiled")

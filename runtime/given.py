@@ -33,7 +33,7 @@ def given(option: str, text: str, *, what: str, unit: str) -> Fraction:
         Those of `units.quantity`.
     """
     # Imported here: reading a unit brings in pint, which most commands do not need.
-    from apc.compiler.units import quantity
+    from apc.compiler.language.units import quantity
 
     try:
         return Fraction(quantity(text, Place(option), what=what, unit=unit).value)

@@ -1,4 +1,4 @@
-"""Claims about `apc.compiler.channels`: what a link can say of its packets, and what it is told."""
+"""Claims about `apc.compiler.scene.channels`: what a link can say of its packets, and what it is told."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.compiler.channels import SceneChannel
 from apc.compiler.compiled import Channel, CompiledSystem, Loss
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.listing import describe
+from apc.compiler.language.recordings import read_trace
+from apc.compiler.language.tables import MOST_MISTAKES
 from apc.compiler.pipeline import compile_topology
-from apc.compiler.recordings import read_trace
+from apc.compiler.scene.channels import SceneChannel
 from apc.compiler.store import load, save
-from apc.compiler.tables import MOST_MISTAKES
+from apc.compiler.view.listing import describe
 from tests.topologies import AVERAGE, compiled, replaced, scene, told
 
 LINK = "  lan: {clock: network, delay: 8 ms}"

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from apc.compiler.clocks import ClockedKind
-from apc.compiler.expression import format_expression
+from apc.compiler.equations.clocks import ClockedKind
+from apc.compiler.language.expression import format_expression
 from tests.topologies import AVERAGE, MESH, ONE_MASS, clocked, library, replaced, told
 
 # A component whose equations are the test's; `s` and `w` may belong to a clock or to none.
@@ -191,7 +191,7 @@ def test_a_value_of_the_others_is_no_value_of_ones_own(tmp_path: Path) -> None:
 
 
 def test_the_time_convention_stands_in_the_docstring_of_this_stage() -> None:
-    import apc.compiler.clocks as stage
+    from apc.compiler.equations import clocks as stage
 
     assert stage.__doc__ is not None
     order = [

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.evaluation import evaluate
-from apc.compiler.expression import (
+from apc.compiler.language.evaluation import evaluate
+from apc.compiler.language.expression import (
     FUNCTIONS,
     Binary,
     Call,
@@ -31,7 +31,7 @@ from apc.compiler.expression import (
     transform,
     walk,
 )
-from apc.compiler.grammar import parse_equation, parse_expression
+from apc.compiler.language.grammar import parse_equation, parse_expression
 
 A, B, C, X = (Name((letter,)) for letter in "abcx")
 TWO = Number(Fraction(2))

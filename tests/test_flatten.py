@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from apc.compiler.flatten import FlatKind
+from apc.compiler.equations.flatten import FlatKind
 from tests.topologies import AVERAGE, MESH, ONE_MASS, flat, library, replaced, scene, told
 
 

@@ -13,15 +13,15 @@ from typing import Any
 
 import pytest
 
-from apc.compiler.clock_inference import CONTINUOUS
-from apc.compiler.clocks import ClockedKind, HoldCrossing, Partition, SampleCrossing
-from apc.compiler.dimensions import DIMENSIONLESS
+from apc.compiler.equations.clock_inference import CONTINUOUS
+from apc.compiler.equations.clocks import ClockedKind, HoldCrossing, Partition, SampleCrossing
+from apc.compiler.equations.flatten import FlatEquation, FlatKind, FlatVariable
+from apc.compiler.equations.solution import ImplicitBlock
+from apc.compiler.equations.structure import SortedKind, sort_kind
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.expression import Number
-from apc.compiler.flatten import FlatEquation, FlatKind, FlatVariable
-from apc.compiler.grammar import parse_equation, parse_expression
-from apc.compiler.solution import ImplicitBlock
-from apc.compiler.structure import SortedKind, sort_kind
+from apc.compiler.language.dimensions import DIMENSIONLESS
+from apc.compiler.language.expression import Number
+from apc.compiler.language.grammar import parse_equation, parse_expression
 
 PLACE = Place("test.yaml", 1, 1)
 MASS = """

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from apc.compiler.component import Number, Option, Reference, option_test
+from apc.compiler.components.component import Number, Option, Reference, option_test
+from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError
-from apc.compiler.library import Library
-from apc.compiler.unit_text import format_dimension
+from apc.compiler.language.unit_text import format_dimension
 from tests.topologies import ROOT, library, told
 
 FILES = [path for path in sorted((ROOT / "models").rglob("*.yaml")) if path.parent.name != "scenes"]

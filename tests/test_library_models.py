@@ -13,8 +13,8 @@ import pytest
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.component import Reference
-from apc.compiler.library import Library
+from apc.compiler.components.component import Reference
+from apc.compiler.components.library import Library
 from apc.compiler.pipeline import compile_topology
 from tests.topologies import MESH, ONE_MASS, compiled, library, replaced, scene, told
 

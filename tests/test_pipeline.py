@@ -6,13 +6,13 @@ import hashlib
 
 import pytest
 
-from apc.compiler.clocks import ClockedSystem
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.flatten import FlatSystem
+from apc.compiler.equations.clocks import ClockedSystem
+from apc.compiler.equations.flatten import FlatSystem
+from apc.compiler.equations.structure import SortedSystem
 from apc.compiler.pipeline import STAGES, Stage, compile_topology, run_stages
-from apc.compiler.scene import Scene
-from apc.compiler.source import Source
-from apc.compiler.structure import SortedSystem
+from apc.compiler.scene.scene import Scene
+from apc.compiler.source.source import Source
 from tests.topologies import SCENES
 
 PATH = SCENES / "three-users-average.yaml"

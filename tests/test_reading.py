@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.nodes import Mapping, Node, Scalar
-from apc.compiler.reading import (
+from apc.compiler.source.nodes import Mapping, Node, Scalar
+from apc.compiler.source.reading import (
     add_unknown,
     brief,
     check_keys,
@@ -16,7 +16,7 @@ from apc.compiler.reading import (
     read_name,
     read_text,
 )
-from apc.compiler.source import parse_source
+from apc.compiler.source.source import parse_source
 
 HERE = Place("a.yaml", 1, 1)
 

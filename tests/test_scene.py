@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 
 from apc.compiler.compiled import Experiment
-from apc.compiler.groups import LARGEST_COUNT
+from apc.compiler.scene.groups import LARGEST_COUNT
 from tests.topologies import AVERAGE, MESH, ONE_MASS, replaced, scene, told
 
 GROUPS = replaced(

@@ -9,7 +9,7 @@ import pytest
 
 import apc
 from apc.compiler.pipeline import compile_topology, run_stages
-from apc.compiler.scene import Scene
+from apc.compiler.scene.scene import Scene
 from apc.runtime.analysis.selfcheck import check_frame
 from tests.topologies import SCENES, compiled, replaced
 

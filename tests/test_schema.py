@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from apc.__main__ import run
-from apc.compiler.instances import PART_KEYS
-from apc.compiler.library import Library
-from apc.compiler.nodes import Mapping, Node, Scalar
-from apc.compiler.scene import KEYS
-from apc.compiler.schema import ABOUT, DIALECT, topology_schema
-from apc.compiler.source import parse_source
+from apc.compiler.components.library import Library
+from apc.compiler.scene.instances import PART_KEYS
+from apc.compiler.scene.scene import KEYS
+from apc.compiler.source.nodes import Mapping, Node, Scalar
+from apc.compiler.source.source import parse_source
+from apc.compiler.view.schema import ABOUT, DIALECT, topology_schema
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
 jsonschema = pytest.importorskip("jsonschema")

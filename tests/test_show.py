@@ -12,10 +12,10 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.diagram import Diagram, build_diagram
-from apc.compiler.marks import Box, Line, Picture, Text
-from apc.compiler.picture import place
-from apc.compiler.svg import draw_svg
+from apc.compiler.view.diagram import Diagram, build_diagram
+from apc.compiler.view.marks import Box, Line, Picture, Text
+from apc.compiler.view.picture import place
+from apc.compiler.view.svg import draw_svg
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, scene, told
 
 AVERAGE_FILE = SCENES / "three-users-average.yaml"

@@ -10,9 +10,9 @@ import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apc.compiler.matching import match_columns, strong_components
-from apc.compiler.structure import SortedKind, sort
-from apc.compiler.symbolic import symbol
+from apc.compiler.equations.matching import match_columns, strong_components
+from apc.compiler.equations.structure import SortedKind, sort
+from apc.compiler.equations.symbolic import symbol
 from tests.topologies import AVERAGE, MESH, ONE_MASS, clocked, library, ordered, replaced, told
 
 GRAPHS = st.integers(1, 6).flatmap(

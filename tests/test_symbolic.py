@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import sympy
 
+from apc.compiler.equations.symbolic import derivative_symbol, head, symbol, to_sympy
 from apc.compiler.errors import Place
-from apc.compiler.grammar import parse_expression
-from apc.compiler.symbolic import derivative_symbol, head, symbol, to_sympy
+from apc.compiler.language.grammar import parse_expression
 
 X, Y = symbol("x"), symbol("y")
 

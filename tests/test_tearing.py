@@ -11,17 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apc.compiler.blocks import solve_blocks
-from apc.compiler.casadi_writer import Writer
 from apc.compiler.compiled import Kind, SendPartition, State
+from apc.compiler.equations.blocks import solve_blocks
+from apc.compiler.equations.flatten import FlatEquation
+from apc.compiler.equations.matching import match_columns, strong_components
+from apc.compiler.equations.residuals import Residual
+from apc.compiler.equations.solution import ImplicitBlock
+from apc.compiler.equations.symbolic import no_derivative, symbol, to_sympy
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.expression import Name
-from apc.compiler.flatten import FlatEquation
-from apc.compiler.grammar import parse_equation
-from apc.compiler.matching import match_columns, strong_components
-from apc.compiler.residuals import Residual
-from apc.compiler.solution import ImplicitBlock
-from apc.compiler.symbolic import no_derivative, symbol, to_sympy
+from apc.compiler.functions.casadi_writer import Writer
+from apc.compiler.language.expression import Name
+from apc.compiler.language.grammar import parse_equation
 from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.linearize import linearize
 

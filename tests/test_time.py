@@ -1,4 +1,4 @@
-"""The time convention of `compiler/clocks.py`, mirrored event by event.
+"""The time convention of `compiler/equations/clocks.py`, mirrored event by event.
 
 A scene of two peers, compiled, against a loop written from the convention's four sentences alone: one force
 clock, one network clock, one damped mass a peer in closed form. The loop looks values up by the time they

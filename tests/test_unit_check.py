@@ -2,12 +2,12 @@
 
 import pytest
 
-from apc.compiler.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.expression import Name
-from apc.compiler.grammar import parse_equation, parse_expression
-from apc.compiler.unit_check import ANY, check_equation, dimension_of
-from apc.compiler.units import parse_unit
+from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
+from apc.compiler.language.expression import Name
+from apc.compiler.language.grammar import parse_equation, parse_expression
+from apc.compiler.language.unit_check import ANY, check_equation, dimension_of
+from apc.compiler.language.units import parse_unit
 
 HERE = Place("a.yaml")
 UNITS = {

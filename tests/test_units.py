@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apc.compiler import unit_names
-from apc.compiler.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.unit_text import format_dimension, format_si
-from apc.compiler.units import NO_UNIT, parse_quantity, parse_unit, quantity
+from apc.compiler.language import unit_names
+from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+from apc.compiler.language.unit_text import format_dimension, format_si
+from apc.compiler.language.units import NO_UNIT, parse_quantity, parse_unit, quantity
 
 HERE = Place("a.yaml", 1, 1)
 LENGTH, TIME = Dimension((("m", 1),)), Dimension((("s", 1),))
@@ -206,8 +206,8 @@ def test_any_text_is_a_quantity_or_refused_and_nothing_else(text: str) -> None:
 
 def test_pint_is_imported_only_when_a_rare_unit_is_read() -> None:
     code = (
-        "import sys; from apc.compiler.errors import Place; from apc.compiler.units import parse_quantity;"
-        " parse_quantity('500 N*s/m', Place('x', 1, 1)); assert 'pint' not in sys.modules;"
+        "import sys; from apc.compiler.errors import Place;"
+        " from apc.compiler.language.units import parse_quantity; parse_quantity('500 N*s/m', Place('x', 1, 1)); assert 'pint' not in sys.modules;"
         " parse_quantity('1 inch', Place('x', 1, 1)); assert 'pint' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from apc.compiler.clocks import ClockedSystem, partition
 from apc.compiler.compiled import CompiledSystem, Origin
+from apc.compiler.components.library import Library
+from apc.compiler.equations.clocks import ClockedSystem, partition
+from apc.compiler.equations.flatten import FlatSystem, flatten
+from apc.compiler.equations.structure import SortedSystem, sort
 from apc.compiler.errors import ApcError
-from apc.compiler.flatten import FlatSystem, flatten
-from apc.compiler.functions import build_functions
-from apc.compiler.library import Library
-from apc.compiler.scene import Scene, build_scene
-from apc.compiler.source import Source, parse_source
-from apc.compiler.structure import SortedSystem, sort
+from apc.compiler.functions.functions import build_functions
+from apc.compiler.scene.scene import Scene, build_scene
+from apc.compiler.source.source import Source, parse_source
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ROOT / "models" / "scenes"

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.evaluation import OPERATORS, Operation, compute
-from apc.compiler.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not
+from apc.compiler.language.evaluation import OPERATORS, Operation, compute
+from apc.compiler.language.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not
 from apc.runtime.analysis.analysis import lifted_groups, prepare
 from apc.runtime.analysis.ranges import Range
 from apc.runtime.eigen.closing import ClosedSystem
@@ -75,7 +75,7 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
         of `names.find` and `units.quantity`.
     """
     # Imported here: reading a unit brings in pint, which an analysis without a box never needs.
-    from apc.compiler.units import quantity
+    from apc.compiler.language.units import quantity
 
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (equals and name and value):
@@ -219,8 +219,8 @@ def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field
         return known[name]
 
     def evaluated(parameter: Parameter) -> Any:
-        from apc.compiler.expression import names
-        from apc.compiler.grammar import parse_expression
+        from apc.compiler.language.expression import names
+        from apc.compiler.language.grammar import parse_expression
 
         if parameter.name in varying or parameter.expression is None:
             return Fraction(parameter.value)

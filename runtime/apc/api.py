@@ -447,7 +447,7 @@ def show(path: str | Path, *, format: Format = "text") -> str:
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of topologies, generated from the language and the library."""
-    from apc.compiler.library import Library
-    from apc.compiler.schema import topology_schema
+    from apc.compiler.components.library import Library
+    from apc.compiler.view.schema import topology_schema
 
     return topology_schema(Library())

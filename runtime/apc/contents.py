@@ -13,18 +13,18 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.clocks import ClockedSystem
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.diagram import Diagram, build_diagram, common_period, one_of, seconds
-from apc.compiler.flatten import FlatKind, FlatSystem
-from apc.compiler.graphviz import draw_dot
-from apc.compiler.listing import plain, step_lines
+from apc.compiler.equations.clocks import ClockedSystem
+from apc.compiler.equations.flatten import FlatKind, FlatSystem
+from apc.compiler.equations.solution import ImplicitBlock
+from apc.compiler.equations.structure import SortedKind, SortedSystem
+from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.pipeline import each_stage, run_stages
-from apc.compiler.scene import Scene
-from apc.compiler.solution import ImplicitBlock
-from apc.compiler.structure import SortedKind, SortedSystem
-from apc.compiler.svg import draw_svg
-from apc.compiler.unit_text import format_dimension
+from apc.compiler.scene.scene import Scene
+from apc.compiler.view.diagram import Diagram, build_diagram, common_period, one_of, seconds
+from apc.compiler.view.graphviz import draw_dot
+from apc.compiler.view.listing import plain, step_lines
+from apc.compiler.view.svg import draw_svg
 from apc.compiler.words import counted, wrapped
 
 PAIRWISE = ("max", "min")

@@ -55,7 +55,9 @@ def find_input(*, compiled_too: bool) -> Path:
 
 
 def _is_topology(path: Path) -> bool:
-    from apc.compiler.source import MAX_BYTES  # with a YAML parser, which a compiled model does without
+    from apc.compiler.source.source import (
+        MAX_BYTES,  # with a YAML parser, which a compiled model does without
+    )
 
     try:
         if not path.is_file():

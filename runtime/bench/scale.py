@@ -22,10 +22,10 @@ from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.groups import LARGEST_COUNT
-from apc.compiler.nodes import Mapping, Scalar
 from apc.compiler.pipeline import stages_of
-from apc.compiler.source import parse_source, read_source
+from apc.compiler.scene.groups import LARGEST_COUNT
+from apc.compiler.source.nodes import Mapping, Scalar
+from apc.compiler.source.source import parse_source, read_source
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.bench.reference import Truth, spectral_truth
 from apc.runtime.threads import single_threaded

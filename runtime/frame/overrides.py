@@ -38,7 +38,7 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
         and those of `units.quantity`: the unit has to fit.
     """
     # Imported here: reading a unit brings in pint, which an analysis without overrides never needs.
-    from apc.compiler.units import quantity
+    from apc.compiler.language.units import quantity
 
     name, equals, value = text.partition("=")
     name, value = name.strip(), value.strip()
@@ -148,9 +148,9 @@ class _Scope:
 
     def _evaluate(self, name: str, text: str) -> Fraction | None:
         """Evaluate an expression if an override reaches one of its names."""
-        from apc.compiler.evaluation import evaluate
-        from apc.compiler.expression import names
-        from apc.compiler.grammar import parse_expression
+        from apc.compiler.language.evaluation import evaluate
+        from apc.compiler.language.expression import names
+        from apc.compiler.language.grammar import parse_expression
 
         place = Place(name, 1, 1, text)
         tree = parse_expression(text, place)

@@ -17,8 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from apc.compiler.evaluation import OPERATORS, Operation, compute
-from apc.compiler.expression import Binary, Call, Compare, Conditional, Expr, Logic, Name, Negate, Not
+from apc.compiler.language.evaluation import OPERATORS, Operation, compute
+from apc.compiler.language.expression import (
+    Binary,
+    Call,
+    Compare,
+    Conditional,
+    Expr,
+    Logic,
+    Name,
+    Negate,
+    Not,
+)
 
 
 def compute_rows(tree: Expr, value_of: Callable[[str], Any]) -> Any:

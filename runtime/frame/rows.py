@@ -41,8 +41,8 @@ class Columns:
         return self._found[name]
 
     def _evaluated(self, name: str, text: str) -> Floats | None:
-        from apc.compiler.expression import names
-        from apc.compiler.grammar import parse_expression
+        from apc.compiler.language.expression import names
+        from apc.compiler.language.grammar import parse_expression
         from apc.runtime.frame.row_arithmetic import compute_rows
 
         tree = parse_expression(text, Place(name, 1, 1, text))
@@ -118,8 +118,8 @@ def free_rows(
         if parameter is None:
             return timings[name]
         if parameter.expression and name not in given:
-            from apc.compiler.expression import names
-            from apc.compiler.grammar import parse_expression
+            from apc.compiler.language.expression import names
+            from apc.compiler.language.grammar import parse_expression
             from apc.runtime.frame.row_arithmetic import compute_rows
 
             tree = parse_expression(parameter.expression, Place(name, 1, 1, parameter.expression))

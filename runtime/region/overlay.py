@@ -92,7 +92,7 @@ def parse_overlay(system: CompiledSystem, text: str) -> Overlay:
 
 def _role(system: CompiledSystem, symbol: str, player: str) -> Role:
     """Read what plays a symbol: a quantity begins with a digit, sign or point, a parameter never does."""
-    from apc.compiler.units import parse_unit, quantity
+    from apc.compiler.language.units import parse_unit, quantity
 
     if player[0] in "+-.0123456789":
         value = quantity(player, _PLACE, what=symbol, unit=UNITS[symbol]).value

@@ -102,9 +102,9 @@ def impulses(site: SiteForcing, starts: Floats, which: Integers) -> Floats:
         The place of each interval's length in the site's `kernels` (intervals,).
     """
     result = np.zeros((len(starts), len(site.kernels[0].a)))
-    for place in np.unique(which):
+    for place, kernel in enumerate(site.kernels):
         rows = np.flatnonzero(which == place)
-        result[rows] = _impulses_of_length(site, site.kernels[place], starts[rows])
+        result[rows] = _impulses_of_length(site, kernel, starts[rows])
     return result
 
 

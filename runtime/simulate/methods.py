@@ -87,7 +87,7 @@ def parse_method(text: str) -> Method:
     if name == CVODES:
         return Method(CVODES, tolerance=_tolerance(size, place))
     # Imported here: reading a unit brings in pint, which most runs do not need.
-    from apc.compiler.units import quantity
+    from apc.compiler.language.units import quantity
 
     if not size:
         expected = "a step"

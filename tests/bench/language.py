@@ -13,10 +13,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from apc.compiler.components.library import Library
 from apc.compiler.errors import Place
-from apc.compiler.library import Library
+from apc.compiler.language.tables import read_table
 from apc.compiler.pipeline import STAGES, each_stage
-from apc.compiler.tables import read_table
 from apc.runtime.threads import single_threaded
 from tests.topologies import AVERAGE, SCENES, replaced
 

@@ -13,9 +13,9 @@ from fractions import Fraction
 from pathlib import Path
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.equations.structure import SortedSystem
+from apc.compiler.functions.reached import Reached
 from apc.compiler.pipeline import each_stage
-from apc.compiler.reached import Reached
-from apc.compiler.structure import SortedSystem
 from apc.runtime.analysis.analysis import prepare
 from apc.runtime.frame.parameters import resolve
 from apc.runtime.frame.schedule import Schedule

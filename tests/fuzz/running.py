@@ -27,8 +27,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from apc.compiler import pipeline
+from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError, Mistake
-from apc.compiler.library import Library
 from apc.compiler.pipeline import run_stages
 from tests.fuzz.inputs import SENTINEL, TOPOLOGY, Input, make_input
 

@@ -1,0 +1,1 @@
+"""The component library: what a component declares, checked, extended, found."""

@@ -1,0 +1,204 @@
+"""What a component is: its declarations and equations, in its own names.
+
+Takes: nothing (data types). Gives: `Component` and its parts.
+Guarantees: plain frozen data.
+Does not: read or check text (see `library`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+
+from apc.compiler.errors import Place
+from apc.compiler.language.dimensions import Dimension
+from apc.compiler.language.expression import FUNCTIONS, KEYWORDS, Compare, Equation, Expr, Name, walk
+from apc.compiler.language.units import Unit
+from apc.compiler.language.values import Binding, Bounds
+from apc.compiler.source.nodes import Node
+
+OTHERS = "others"
+# Words of the language, which nothing may have as its name.
+RESERVED = frozenset(
+    {"peers", "others", "time", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
+)
+# A parameter of one of these roles isn't a number: it names, or describes, something of the scene.
+ROLES = ("clock", "link", "graph", "delays", "loss", "trace", "table")
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """A variable of a component or connector; `start` is None for one that needs no start value."""
+
+    name: str
+    unit: Unit
+    start: Fraction | None
+    about: str
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class Connector:
+    """A connector type: potentials are equal where connectors meet, flows sum to zero."""
+
+    name: str
+    about: str
+    potentials: tuple[Variable, ...]
+    flows: tuple[Variable, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A parameter that is a number, in SI; with `divided`, a shared part divides it among the peers.
+
+    `words` gives names to values, such as left: -1.
+    """
+
+    name: str
+    unit: Unit
+    default: Fraction | None
+    minimum: Fraction | None
+    open_minimum: bool
+    maximum: Fraction | None
+    divided: bool
+    words: tuple[tuple[str, Fraction], ...]
+    about: str
+    place: Place
+
+    @property
+    def bounds(self) -> Bounds:
+        """Where its values must lie."""
+        return Bounds(self.unit.text, self.unit.scale, self.minimum, self.open_minimum, self.maximum)
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """A parameter that is a word, decided when the scene is compiled."""
+
+    name: str
+    words: tuple[str, ...]
+    default: str | None
+    about: str
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """A parameter of a role: it names a clock or link, or describes a graph, delays, loss or a table."""
+
+    name: str
+    role: str
+    about: str
+    place: Place
+    unit: Unit | None = None  # of a table's numbers
+
+
+Parameter = Number | Option | Reference
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """A value that a component sends to the other peers over its link."""
+
+    name: str
+    expression: Expr
+    text: str
+    place: Place
+    dimension: Dimension
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What a part's entry says, in the terms of what surrounds it.
+
+    `described` are the nodes of parameters that describe something (a graph, a table). `connections` join a
+    connector to (part, connector); the part "ground" is fixed, an empty part is the component around.
+    """
+
+    values: tuple[tuple[str, Binding], ...]
+    options: tuple[tuple[str, str], ...]
+    references: tuple[tuple[str, str], ...]
+    described: tuple[tuple[str, Node], ...]
+    starts: tuple[tuple[str, Binding], ...]
+    connections: tuple[tuple[str, str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Inner:
+    """A part inside a component; its entry is in the terms of the outer component."""
+
+    name: str
+    component: Component
+    entry: Entry
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """A component, whole.
+
+    `locals` are names that stand alone on the left of an equation without being declared; they take the
+    dimension of the right-hand side. `passed` are the connectors that belong to an inner part: (connector,
+    inner part, its connector).
+    """
+
+    name: str
+    about: str
+    source: str
+    connectors: tuple[tuple[str, Connector], ...]
+    parameters: tuple[Parameter, ...]
+    variables: tuple[Variable, ...]
+    locals: tuple[tuple[str, Dimension], ...]
+    sends: tuple[Send, ...]
+    equations: tuple[Equation, ...]
+    inner: tuple[Inner, ...]
+    passed: tuple[tuple[str, str, str], ...]
+    place: Place
+
+    def parameter(self, name: str) -> Parameter | None:
+        """Return the parameter of this name, or None."""
+        return next((parameter for parameter in self.parameters if parameter.name == name), None)
+
+    def variable(self, name: str) -> Variable | None:
+        """Return the declared variable of this name, or None."""
+        return next((variable for variable in self.variables if variable.name == name), None)
+
+    @property
+    def numbers(self) -> Iterator[Number]:
+        """The parameters that are numbers."""
+        return (parameter for parameter in self.parameters if isinstance(parameter, Number))
+
+    @property
+    def depth(self) -> int:
+        """How deep parts stand inside parts: 1 for a component without any."""
+        return 1 + max((inner.component.depth for inner in self.inner), default=0)
+
+    @property
+    def hears_others(self) -> bool:
+        """Whether an equation, here or in an inner part, reads the other peers."""
+        own = any(
+            isinstance(node, Name) and node.parts[0] == OTHERS
+            for equation in self.equations
+            for side in (equation.left, equation.right)
+            for node in walk(side)
+        )
+        return own or any(inner.component.hears_others for inner in self.inner)
+
+
+Settable = Number | Option | Reference | Variable  # what a group of peers can set for itself
+
+
+def option_test(node: Expr, options: dict[str, Option]) -> tuple[Option, str] | None:
+    """Return the option and the word that a comparison such as `delays == all` is about."""
+    if (
+        isinstance(node, Compare)
+        and node.operator in ("==", "!=")
+        and isinstance(node.left, Name)
+        and isinstance(node.right, Name)
+        and len(node.left.parts) == len(node.right.parts) == 1
+    ):
+        option = options.get(node.left.parts[0])
+        if option is not None and node.right.parts[0] in option.words:
+            return option, node.right.parts[0]
+    return None

@@ -1,0 +1,205 @@
+"""Whether a component is sound: names, units, reductions and balance, checked once, before any use of it.
+
+Takes: a component as it was read. Gives: `ComponentNames`, which infers what is not declared and checks the
+equations; `check_balance`.
+Guarantees: every name in an equation is declared and every equation's units agree; a mistake is said once.
+Does not: read text (see `definitions`).
+
+A component is locally balanced in Modelica's sense (Modelica Language Specification 3.6, section 4.8): it
+gives one equation for each of its variables and one for each flow of its connectors; the connections of a
+scene give the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+
+from apc.compiler.components.component import (
+    OTHERS,
+    Component,
+    Option,
+    Reference,
+    Send,
+    option_test,
+)
+from apc.compiler.components.declarations import Sends
+from apc.compiler.errors import ApcError, Mistakes, Place, place_in
+from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
+from apc.compiler.language.expression import (
+    Call,
+    Compare,
+    Equation,
+    Expr,
+    Name,
+    format_expression,
+    names,
+    transform,
+    walk,
+)
+from apc.compiler.language.expression import Number as Literal
+from apc.compiler.language.unit_check import ANY, check_equation, dimension_of
+from apc.compiler.language.values import PEERS
+from apc.compiler.source.reading import (
+    add_unknown,
+    brief,
+)
+from apc.compiler.words import counted
+
+_TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
+
+
+class ComponentNames:
+    """Resolves a component's names to dimensions, and finds the locals on the way."""
+
+    def __init__(self, component: Component) -> None:
+        self.component = component
+        self.dimensions: dict[tuple[str, ...], Dimension | None] = {PEERS: DIMENSIONLESS, ("time",): SECOND}
+        self.dimensions.update(dict(_visible_names(component)))
+        for parameter in component.numbers:
+            self.dimensions[(parameter.name,)] = parameter.unit.dimension
+            for word, _ in parameter.words:
+                self.dimensions.setdefault((word,), parameter.unit.dimension)
+        passed = {connector for connector, _, _ in component.passed}
+        for name, connector in component.connectors:
+            if name not in passed:
+                for flow in connector.flows:
+                    self.dimensions[(name, flow.name)] = flow.unit.dimension
+        self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
+        for send in component.sends:
+            self.dimensions[(OTHERS, send.name)] = send.dimension
+        for table in component.parameters:
+            if isinstance(table, Reference) and table.role == "table" and table.unit is not None:
+                self.dimensions[(table.name,)] = table.unit.dimension
+
+    def infer_sends(self, sends: Sends, mistakes: Mistakes) -> tuple[Send, ...]:
+        """Return the sends with the dimension of what they send."""
+        return tuple(
+            Send(name, expression, text, place, _known(self._dimension(expression, text, place, mistakes)))
+            for name, expression, text, place in sends
+        )
+
+    def infer_locals(self, sends: Sends) -> tuple[tuple[str, Dimension], ...]:
+        """Return the undeclared names that stand alone on the left of an equation."""
+        for name, expression, text, place in sends:
+            self.dimensions[(OTHERS, name)] = self._dimension(expression, text, place, Mistakes())
+        found: list[tuple[str, Dimension]] = []
+        for equation in self.component.equations:
+            left = equation.left
+            if isinstance(left, Name) and len(left.parts) == 1 and left.parts not in self.dimensions:
+                # An unknown name on the right is reported once, by `check`; a local may still be undecided.
+                dimension = self._dimension(equation.right, equation.text, equation.place, Mistakes())
+                self.dimensions[left.parts] = dimension
+                found.append((left.parts[0], _known(dimension)))
+        return tuple(found)
+
+    def check(self, component: Component, mistakes: Mistakes) -> None:
+        """Check the names, then the units, of every equation."""
+        for equation in component.equations:
+            unknown = False
+            left, right = self._decided(equation.left), self._decided(equation.right)
+            for side in (left, right):
+                unknown |= self._check_names(side, equation.text, equation.place, mistakes)
+                unknown |= self._check_reductions(side, equation.text, equation.place, mistakes)
+            if not unknown:
+                try:
+                    check_equation(
+                        Equation(left, right, equation.text, equation.place),
+                        lambda name: self.dimensions.get(name.parts),
+                    )
+                except ApcError as error:
+                    mistakes.take(error)
+
+    def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
+        """Record a reduction that doesn't run over the other peers."""
+        wrong = False
+        for node in walk(expression):
+            if not isinstance(node, Call) or any(name.parts[0] == OTHERS for name in names(node)):
+                continue
+            if node.function in ("mean", "sum", "count"):
+                what, expected = f"{node.function} runs over the other peers and", "others.x in it"
+            elif node.function in ("max", "min") and len(node.arguments) == 1:
+                what, expected = node.function, "two values, or one of the other peers"
+            else:
+                continue
+            wrong = True
+            hint = "count(others)" if node.function == "count" else f"{node.function}(others.x)"
+            where, got = place_in(place, text, node.start), format_expression(node)
+            mistakes.add("E506", where, what, expected=expected, got=got, hint=hint)
+        return wrong
+
+    def _decided(self, expression: Expr) -> Expr:
+        """Return the expression with each test of an option replaced by a true statement.
+
+        Both branches of such a test are checked; the words of an option have no dimension.
+        """
+        options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
+        return transform(expression, lambda node: _TRUE if option_test(node, options) else None)
+
+    def _dimension(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> Dimension | None:
+        expression = self._decided(expression)
+        if self._check_names(expression, text, place, mistakes):
+            return None
+        try:
+            return dimension_of(expression, lambda name: self.dimensions.get(name.parts), text, place)
+        except ApcError as error:
+            mistakes.take(error)
+            return None
+
+    def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
+        wrong = False
+        for node in walk(expression):
+            if isinstance(node, Name) and node.parts not in self.dimensions:
+                wrong = True
+                shown = ".".join(node.parts)
+                if node.parts[0] == OTHERS:
+                    what = f"{self.component.name} sends nothing called {brief('.'.join(node.parts[1:]))}"
+                    mistakes.add(
+                        "E303", place_in(place, text, node.start), what, hint="sends: {x: sample(object.x)}"
+                    )
+                    continue
+                known = sorted(".".join(parts) for parts in self.dimensions)
+                what = f"{self.component.name} has no {brief(shown)}"
+                add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)
+        return wrong
+
+
+def _visible_names(component: Component) -> Iterator[tuple[tuple[str, ...], Dimension]]:
+    """Yield what may be named of a component from outside: its variables and its connectors' potentials."""
+    for variable in component.variables:
+        yield (variable.name,), variable.unit.dimension
+    for name, dimension in component.locals:
+        yield (name,), dimension
+    for name, connector in component.connectors:
+        for potential in connector.potentials:
+            yield (name, potential.name), potential.unit.dimension
+    for inner in component.inner:
+        for path, dimension in _visible_names(inner.component):
+            yield (inner.name, *path), dimension
+
+
+def _known(dimension: Dimension | None) -> Dimension:
+    """Return a dimension that was inferred; what fits every dimension, such as 0, has none."""
+    return DIMENSIONLESS if dimension in (None, ANY) else dimension
+
+
+def check_balance(component: Component, mistakes: Mistakes) -> None:
+    """Record E501 for a component with more or fewer equations than it must have."""
+    passed = {connector for connector, _, _ in component.passed}
+    flows = [
+        f"{name}.{flow.name}"
+        for name, connector in component.connectors
+        if name not in passed
+        for flow in connector.flows
+    ]
+    unknowns = [variable.name for variable in component.variables]
+    unknowns += [name for name, _ in component.locals] + flows
+    if len(component.equations) == len(unknowns):
+        return
+    mistakes.add(
+        "E501",
+        component.place,
+        f"{component.name} is unbalanced: {counted(len(component.equations), 'equation')} for "
+        f"{counted(len(unknowns), 'unknown')} ({', '.join(unknowns) or 'none'})",
+        hint="one equation for each variable and one for each flow of a connector",
+    )

@@ -1,0 +1,229 @@
+"""The declarations of a component: equations, what it sends, variables and parameters; YAML to typed data.
+
+Takes: the sections of a definition.
+Gives: `read_equations`, `read_sends`, `read_variables`, `read_parameters`.
+Guarantees: a number is in SI and of its declared unit's dimension; a fault is reported and its item left out.
+Does not: look at how the declarations fit together (see `definitions`).
+"""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+
+from apc.compiler.components.component import ROLES, Number, Option, Parameter, Reference, Variable
+from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.language.expression import Equation, Expr
+from apc.compiler.language.grammar import parse_equation, parse_expression
+from apc.compiler.language.units import Unit, parse_quantity, parse_unit, quantity
+from apc.compiler.language.values import text_place
+from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
+from apc.compiler.source.reading import (
+    add_unknown,
+    brief,
+    check_keys,
+    entries,
+    form,
+    read_mapping,
+    read_name,
+    read_text,
+)
+
+Sends = tuple[tuple[str, Expr, str, Place], ...]
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
+
+
+def read_equations(node: Node | None, mistakes: Mistakes) -> tuple[Equation, ...]:
+    """Read `equations: [a + b = c]`."""
+    if node is None:
+        return ()
+    if not isinstance(node, Sequence):
+        mistakes.add(
+            "E203", node.place, "equations", expected="a list", got=form(node), hint="equations: [a + b = c]"
+        )
+        return ()
+    found = []
+    for item in node.items:
+        text = read_text(item, "an equation", mistakes, hint="- a + b = c")
+        if text is not None:
+            try:
+                found.append(parse_equation(text, text_place(item)))
+            except ApcError as error:
+                mistakes.take(error)
+    return tuple(found)
+
+
+def read_sends(node: Node | None, mistakes: Mistakes) -> Sends:
+    """Read `sends: {x: sample(object.x)}` as (name, expression, its text, its place)."""
+    found = []
+    for key, value in entries(read_mapping(node, "sends", mistakes, hint="sends: {x: sample(object.x)}")):
+        name = read_name(key, "what is sent", mistakes)
+        text = read_text(value, key.text, mistakes, hint=f"{key.text}: sample(object.x)")
+        if name is None or text is None:
+            continue
+        place = text_place(value)
+        try:
+            found.append((name, parse_expression(text, place), text, place))
+        except ApcError as error:
+            mistakes.take(error)
+    return tuple(found)
+
+
+def read_variables(node: Node | None, mistakes: Mistakes) -> tuple[Variable, ...]:
+    """Read `variables: {x: {unit: m}}`, or a connector's potentials or flows."""
+    found = []
+    for key, value in entries(read_mapping(node, "variables", mistakes, hint="variables: {x: {unit: m}}")):
+        name = read_name(key, "a variable", mistakes)
+        body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{unit: m}}")
+        if name is None or body is None:
+            continue
+        body = check_keys(body, ("unit", "start", "about"), f"variable {name}", mistakes)
+        unit = _unit(body, name, mistakes)
+        start = _declared(body.get("start"), name, unit, mistakes)
+        about = read_text(body.get("about"), "about", mistakes) or ""
+        if unit is not None:
+            found.append(Variable(name, unit, start, about, key.place))
+    return tuple(found)
+
+
+def read_parameters(node: Node | None, mistakes: Mistakes) -> tuple[Parameter, ...]:
+    """Read `parameters: {stiffness: {unit: N/m, min: 0}}`: numbers, options, tables and roles."""
+    found: list[Parameter] = []
+    hint = "parameters: {stiffness: {unit: N/m, min: 0}}"
+    for key, value in entries(read_mapping(node, "parameters", mistakes, hint=hint)):
+        name = read_name(key, "a parameter", mistakes)
+        if name is None:
+            continue
+        parameter: Parameter | None
+        if isinstance(value, Scalar):
+            parameter = _reference(name, value, mistakes)
+        else:
+            body = read_mapping(value, f"parameter {name}", mistakes, hint=f"{name}: {{unit: N/m}}")
+            if body is None:
+                continue
+            if body.get("table") is not None:
+                parameter = _table(name, body, mistakes)
+            elif _has_words(body):
+                parameter = _option(name, body, mistakes)
+            else:
+                parameter = _number(name, body, mistakes)
+        if parameter is not None:
+            found.append(parameter)
+    return tuple(found)
+
+
+def _has_words(body: Mapping) -> bool:
+    return isinstance(body.get("options"), Sequence)
+
+
+def _reference(name: str, value: Scalar, mistakes: Mistakes) -> Reference | None:
+    if value.text in ROLES:
+        return Reference(name, value.text, "", value.place)
+    mistakes.add(
+        "E203",
+        value.place,
+        f"parameter {name}",
+        expected=f"{', '.join(ROLES)}, or a mapping with its unit",
+        got=brief(value.text) or "nothing",
+        hint=f"{name}: {{unit: N/m, min: 0}}",
+    )
+    return None
+
+
+def _option(name: str, body: Mapping, mistakes: Mistakes) -> Option | None:
+    body = check_keys(body, ("options", "default", "about"), f"parameter {name}", mistakes)
+    options = body.get("options")
+    assert isinstance(options, Sequence)
+    words = tuple(text for item in options.items if (text := read_text(item, "an option", mistakes)))
+    default = read_text(body.get("default"), "default", mistakes)
+    node = body.get("default")
+    if default is not None and node is not None and default not in words:
+        what = f"{name} has no option {brief(default)}"
+        add_unknown("E206", node.place, what, default, words, mistakes)
+    about = read_text(body.get("about"), "about", mistakes) or ""
+    return Option(name, words, default, about, options.place)
+
+
+def _table(name: str, body: Mapping, mistakes: Mistakes) -> Reference | None:
+    """Read `{table: N}`: a file of numbers over time, in a unit of the same dimension."""
+    body = check_keys(body, ("table", "about"), f"parameter {name}", mistakes)
+    node = body.get("table")
+    text = read_text(node, "table", mistakes, hint="table: N")
+    about = read_text(body.get("about"), "about", mistakes) or ""
+    if node is None or text is None:
+        return None
+    try:
+        return Reference(name, "table", about, body.place, parse_unit(text, node.place))
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+
+
+def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
+    keys = ("unit", "min", "above", "max", "default", "about", "shared", "options")
+    body = check_keys(body, keys, f"parameter {name}", mistakes)
+    unit = _unit(body, name, mistakes)
+    shared = read_text(body.get("shared"), "shared", mistakes)
+    node = body.get("shared")
+    if shared not in (None, "divided", "whole") and node is not None:
+        mistakes.add("E203", node.place, "shared", expected="divided or whole", got=brief(shared or ""))
+    minimum = _declared(body.get("min"), name, unit, mistakes)
+    above = _declared(body.get("above"), name, unit, mistakes)
+    maximum = _declared(body.get("max"), name, unit, mistakes)
+    words = []
+    for key, value in entries(read_mapping(body.get("options"), "options", mistakes)):
+        number = _declared(value, key.text, unit, mistakes)
+        if number is not None:
+            words.append((key.text, number))
+    node = body.get("default")
+    named = dict(words).get(node.text) if isinstance(node, Scalar) else None
+    default = named if named is not None else _declared(node, name, unit, mistakes)
+    about = read_text(body.get("about"), "about", mistakes) or ""
+    if unit is None:
+        return None
+    return Number(
+        name,
+        unit,
+        default,
+        above if above is not None else minimum,
+        above is not None,
+        maximum,
+        shared == "divided",
+        tuple(words),
+        about,
+        body.place,
+    )
+
+
+def _unit(body: Mapping, name: str, mistakes: Mistakes) -> Unit | None:
+    node = body.get("unit")
+    if node is None:
+        mistakes.add(
+            "E201",
+            body.place,
+            f"{name} has no unit",
+            hint=f"{name}: {{unit: N/m}}  (unit: 1 when it has none)",
+        )
+        return None
+    text = read_text(node, "unit", mistakes, hint="unit: N/m")
+    if text is None:
+        return None
+    try:
+        return parse_unit(text, node.place)
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+
+
+def _declared(node: Node | None, name: str, unit: Unit | None, mistakes: Mistakes) -> Fraction | None:
+    """Read a number of a declaration: bare, it is in the unit declared beside it."""
+    text = read_text(node, name, mistakes)
+    if node is None or text is None or unit is None:
+        return None
+    try:
+        if _NUMBER.match(text):
+            return parse_quantity(text, node.place).value * unit.scale
+        return quantity(text, node.place, what=name, unit=unit.text).value
+    except ApcError as error:
+        mistakes.take(error)
+        return None

@@ -1,0 +1,326 @@
+"""Component and connector definitions: YAML text to typed data, checked once per component.
+
+Takes: the YAML source of a definition, and the library it stands in. Gives: `Component`, `Connector`.
+Guarantees: what a definition extends and contains is there and read before it; a component that isn't sound
+(see `component_check`) is never handed out.
+Does not: know any topology, or which component is used where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Protocol, TypeVar
+
+from apc.compiler.components.component import (
+    RESERVED,
+    Component,
+    Connector,
+    Inner,
+    Parameter,
+    Reference,
+    Variable,
+)
+from apc.compiler.components.component_check import ComponentNames, check_balance
+from apc.compiler.components.declarations import read_equations, read_parameters, read_sends, read_variables
+from apc.compiler.components.parts import Scope, read_entry
+from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+from apc.compiler.language.values import PEERS
+from apc.compiler.source.nodes import Mapping, Node, Scalar
+from apc.compiler.source.reading import (
+    add_unknown,
+    brief,
+    check_keys,
+    entries,
+    read_mapping,
+    read_name,
+    read_text,
+)
+from apc.compiler.source.source import Source
+
+COMPONENT_KEYS = (
+    "component",
+    "about",
+    "source",
+    "extends",
+    "connectors",
+    "parameters",
+    "variables",
+    "parts",
+    "connect",
+    "sends",
+    "equations",
+)
+DEEPEST = 10  # levels of parts inside parts
+
+
+def read_connector(source: Source) -> Connector:
+    """Read a connector definition. Raises ApcError with all its mistakes."""
+    mistakes = Mistakes()
+    root = read_mapping(source.root, "a connector definition", mistakes)
+    mistakes.raise_if_any()
+    assert root is not None
+    root = check_keys(root, ("connector", "about", "source", "potentials", "flows"), "a connector", mistakes)
+    potentials = read_variables(root.get("potentials"), mistakes)
+    flows = read_variables(root.get("flows"), mistakes)
+    name = read_text(root.get("connector"), "connector", mistakes) or ""
+    about = read_text(root.get("about"), "about", mistakes) or ""
+    mistakes.raise_if_any()
+    return Connector(name, about, potentials, flows)
+
+
+class Definitions(Protocol):
+    """Where a definition finds the others it names."""
+
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """The names of the components that can be asked for."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Everything that can be asked for."""
+
+    def component(self, name: str) -> Component | None:
+        """Return a component, or None if there is no such name."""
+
+    def connector(self, name: str) -> Connector | None:
+        """Return a connector type, or None if there is no such name."""
+
+
+def read_component(source: Source, library: Definitions) -> Component:
+    """Read and check a component definition. Raises ApcError with all its mistakes."""
+    mistakes = Mistakes()
+    root = read_mapping(source.root, "a component definition", mistakes)
+    mistakes.raise_if_any()
+    assert root is not None
+    root = check_keys(root, COMPONENT_KEYS, "a component", mistakes)
+    draft = _read_declarations(root, library, mistakes)
+    mistakes.raise_if_any()
+    names = ComponentNames(draft)
+    sends = read_sends(root.get("sends"), mistakes)
+    locals_, found = names.infer_locals(sends), names.infer_sends(sends, mistakes)
+    component = replace(draft, locals=(*draft.locals, *locals_), sends=(*draft.sends, *found))
+    mistakes.raise_if_any()
+    names.check(component, mistakes)
+    mistakes.raise_if_any()
+    check_balance(component, mistakes)
+    mistakes.raise_if_any()
+    return component
+
+
+def _read_declarations(root: Mapping, library: Definitions, mistakes: Mistakes) -> Component:
+    """Read everything but what has to be inferred; what the component extends comes first."""
+    title = root.get("component")
+    name = (read_name(title, "a component", mistakes) if isinstance(title, Scalar) else None) or "?"
+    base = _base(root.get("extends"), library, mistakes)
+    connectors = _connectors(root.get("connectors"), library, mistakes)
+    parameters = read_parameters(root.get("parameters"), mistakes)
+    variables = read_variables(root.get("variables"), mistakes)
+    equations = read_equations(root.get("equations"), mistakes)
+    about = read_text(root.get("about"), "about", mistakes) or ""
+    cited = read_text(root.get("source"), "source", mistakes) or ""
+    place = title.place if title is not None else root.place
+    _check_distinct(connectors, parameters, variables, mistakes)
+    if base is None:
+        draft = Component(
+            name, about, cited, connectors, parameters, variables, (), (), equations, (), (), place
+        )
+    else:
+        draft = replace(
+            base,
+            name=name,
+            about=about,
+            source=cited,
+            connectors=(*base.connectors, *connectors),
+            parameters=_overridden(base.parameters, parameters),
+            variables=_overridden(base.variables, variables),
+            equations=(*base.equations, *equations),
+            place=place,
+        )
+    if root.get("parts") is None and root.get("connect") is None:
+        return draft
+    inner, passed = _read_inner(root, draft, library, mistakes)
+    return replace(draft, inner=(*draft.inner, *inner), passed=(*draft.passed, *passed))
+
+
+def _base(node: Node | None, library: Definitions, mistakes: Mistakes) -> Component | None:
+    hint = "extends: Mass"
+    text = read_text(node, "extends", mistakes, hint=hint)
+    return None if node is None or text is None else _found(text, node.place, library, mistakes, hint)
+
+
+def _found(name: str, place: Place, library: Definitions, mistakes: Mistakes, hint: str) -> Component | None:
+    try:
+        component = library.component(name)
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+    if component is None and name in library.names:
+        mistakes.add("E206", place, f"{name} is a connector type, not a component", hint=hint)
+    elif component is None:
+        known = library.component_names
+        add_unknown("E206", place, f"there is no component {brief(name)}", name, known, mistakes)
+    return component
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+Declared = TypeVar("Declared", bound=_Named)
+
+
+def _overridden(base: tuple[Declared, ...], own: tuple[Declared, ...]) -> tuple[Declared, ...]:
+    """Return the inherited declarations, those declared again replaced in their place, then the new ones."""
+    merged = {item.name: item for item in base}
+    merged.update({item.name: item for item in own})
+    return tuple(merged.values())
+
+
+def _read_inner(
+    root: Mapping, outer: Component, library: Definitions, mistakes: Mistakes
+) -> tuple[tuple[Inner, ...], tuple[tuple[str, str, str], ...]]:
+    """Read the parts inside a component and the connectors it passes on to them."""
+    bodies: dict[str, tuple[Mapping, Component, Place]] = {}
+    faulty: set[str] = set()
+    hint = "parts: {tip: {type: Mass}}"
+    for key, value in entries(read_mapping(root.get("parts"), "parts", mistakes, hint=hint)):
+        name = read_name(key, "a part", mistakes)
+        body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{type: Mass}}")
+        faulty.add(key.text)
+        component = None if name is None or body is None else read_type(key, body, None, library, mistakes)
+        if name is not None and body is not None and component is not None:
+            bodies[name] = (body, component, key.place)
+            faulty.discard(name)
+    dimensions: dict[tuple[str, ...], Dimension] = {(p.name,): p.unit.dimension for p in outer.numbers}
+    dimensions[PEERS] = DIMENSIONLESS
+
+    def references(role: str, word: str, place: Place) -> Collection[str]:
+        return [p.name for p in outer.parameters if isinstance(p, Reference) and p.role == role]
+
+    scope = Scope(
+        dimension=lambda parts: dimensions.get(parts),
+        names=[".".join(parts) for parts in dimensions],
+        references=references,
+        parts={name: component for name, (_, component, _) in bodies.items()},
+        counts={},
+        faulty=faulty,
+        whole=f"the parts of {outer.name}",
+        outer=outer,
+    )
+    inner = []
+    for name, (body, component, place) in bodies.items():
+        free = [connector for connector, _ in component.connectors]
+        entry = read_entry(name, body, component, place, scope, mistakes, free_connectors=free)
+        inner.append(Inner(name, component, entry, place))
+    deepest = max((component.depth for _, component, _ in bodies.values()), default=0)
+    if deepest >= DEEPEST:  # each level may double the parts
+        what = f"the parts of {outer.name} stand inside one another more than {DEEPEST} deep"
+        mistakes.add("E216", outer.place, what, hint="fewer components around one another")
+    passed = [
+        (theirs, part.name, own)
+        for part in inner
+        for own, other, theirs in part.entry.connections
+        if not other
+    ]
+    passed += _read_connect(root.get("connect"), outer, bodies, mistakes)
+    return tuple(inner), tuple(passed)
+
+
+def _read_connect(
+    node: Node | None,
+    outer: Component,
+    bodies: dict[str, tuple[Mapping, Component, Place]],
+    mistakes: Mistakes,
+) -> list[tuple[str, str, str]]:
+    """Read `connect: {flange: tip.flange}`: connectors of the component that are those of an inner part."""
+    found = []
+    own = dict(outer.connectors)
+    known = [f"{p}.{c}" for p, (_, component, _) in bodies.items() for c, _ in component.connectors]
+    hint = "connect: {flange: tip.flange}"
+    for key, value in entries(read_mapping(node, "connect", mistakes, hint=hint)):
+        text = read_text(value, key.text, mistakes, hint=f"{key.text}: tip.flange")
+        if text is None:
+            continue
+        if key.text not in own:
+            what = f"connect names {brief(key.text)}, which is no connector of this component"
+            add_unknown("E206", key.place, what, key.text, list(own), mistakes)
+        elif text not in known:
+            what = f"connect names {brief(text)}, which is no connector of an inner part"
+            add_unknown("E206", value.place, what, text, known, mistakes)
+        else:
+            part, _, connector = text.partition(".")
+            found.append((key.text, part, connector))
+    return found
+
+
+def read_type(
+    key: Scalar,
+    body: Mapping,
+    default: str | None,
+    library: Definitions,
+    mistakes: Mistakes,
+    *,
+    example: str = "Mass",
+) -> Component | None:
+    """Return the component that a part's entry is of.
+
+    Parameters
+    ----------
+    key, body
+        The part's name and its entry.
+    default
+        The type that serves when the entry has none.
+    library
+        Where components are found.
+    mistakes
+        Takes E201 when there is no type, and what `library` says of one that can't be had.
+    example
+        A type to show in a message.
+    """
+    node = body.get("type")
+    name = default if node is None else read_text(node, "type", mistakes, hint=f"type: {example}")
+    if node is None and name is None:
+        mistakes.add("E201", key.place, f"{key.text} has no type", hint=f"type: {example}")
+    if name is None:
+        return None
+    place = node.place if node is not None else key.place
+    return _found(name, place, library, mistakes, f"type: {example}")
+
+
+def _check_distinct(
+    connectors: tuple[tuple[str, Connector], ...],
+    parameters: tuple[Parameter, ...],
+    variables: tuple[Variable, ...],
+    mistakes: Mistakes,
+) -> None:
+    seen = {name for name, _ in connectors}
+    for item in (*parameters, *variables):
+        if item.name in seen:
+            mistakes.add("E205", item.place, f"the name {item.name} is used twice in this component")
+        if item.name in RESERVED:
+            mistakes.add("E205", item.place, f"{item.name} is a word of the language and can't be a name")
+        seen.add(item.name)
+
+
+def _connectors(
+    node: Node | None, library: Definitions, mistakes: Mistakes
+) -> tuple[tuple[str, Connector], ...]:
+    found = []
+    for key, value in entries(
+        read_mapping(node, "connectors", mistakes, hint="connectors: {flange: Flange}")
+    ):
+        name = read_name(key, "a connector", mistakes)
+        type_name = read_text(value, key.text, mistakes, hint=f"{key.text}: Flange")
+        if name is None or type_name is None:
+            continue
+        connector = library.connector(type_name)
+        if connector is None:
+            what = f"there is no connector type {brief(type_name)}"
+            known = [known for known in library.names if library.connector(known)]
+            add_unknown("E206", value.place, what, type_name, known, mistakes)
+        else:
+            found.append((name, connector))
+    return tuple(found)

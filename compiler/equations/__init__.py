@@ -1,0 +1,1 @@
+"""Equations flattened, put on clocks, sorted and solved."""

@@ -1,0 +1,126 @@
+"""Which equation computes which unknown, in which order, and how each block of them is solved.
+
+Takes: equations as residuals, and the unknowns. Gives: `solve_blocks`: assignments and `ImplicitBlock`s.
+Guarantees: every unknown is assigned once, from what was assigned before; linear blocks come out explicit.
+Does not: differentiate anything (see `index`), or know of states and clocks.
+
+Matched and sorted by `matching`; a block of linear equations is solved by `elimination`, a nonlinear loop is
+left to an iteration over the few unknowns that `tearing` chooses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import sympy
+
+from apc.compiler.equations.elimination import ZeroTests, eliminate
+from apc.compiler.equations.matching import match_columns, strong_components
+from apc.compiler.equations.residuals import MOST_LISTED, Residual, listed, report_singular
+from apc.compiler.equations.solution import Assignment, Step
+from apc.compiler.equations.symbolic import linear_form, symbol
+from apc.compiler.equations.tearing import tear
+from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
+from apc.compiler.errors import Mistakes
+
+
+def solve_blocks(
+    residuals: Sequence[Residual],
+    unknowns: Sequence[sympy.Symbol],
+    where: str,
+    mistakes: Mistakes,
+    *,
+    nonzero: Collection[sympy.Symbol] = (),
+    vanishes: Vanishing = NOTHING_VANISHES,
+) -> tuple[Step, ...]:
+    """Match, sort and solve.
+
+    Parameters
+    ----------
+    residuals, unknowns
+        As many equations as unknowns; a mistake if not.
+    where
+        What to call the equations in a message: "the continuous equations".
+    mistakes
+        Takes E502 equations or unknowns left over, E503 a loop without an unknown to solve for, E511 linear
+        equations that depend on each other.
+    nonzero
+        Parameters that no number can make zero; divisors stay when all others are zero, where possible.
+    vanishes
+        Whether an expression is zero with the scene's numbers; what is divided by must not be.
+    """
+    columns = {unknown: j for j, unknown in enumerate(unknowns)}
+    incidence = [sorted(columns[s] for s in r.expression.free_symbols & columns.keys()) for r in residuals]
+    match = match_columns(incidence, len(unknowns))
+    if len(residuals) != len(unknowns) or None in match:
+        report_singular(residuals, [u.name for u in unknowns], incidence, match, where, mistakes)
+        return ()
+    computes = {row: column for column, row in enumerate(match) if row is not None}
+    # Row i computes column computes[i]; it needs the rows that compute its other unknowns.
+    needs = [
+        [row for j in columns_of if (row := match[j]) is not None and row != i]
+        for i, columns_of in enumerate(incidence)
+    ]
+    tests = ZeroTests(ZeroTest(), ZeroTest(frozenset(nonzero)), vanishes)
+    solver = _Solver(where, mistakes, tests)
+    steps: list[Step] = []
+    for block in strong_components(needs):
+        rows = sorted(block)
+        own = [unknowns[column] for column in sorted(computes[row] for row in rows)]
+        steps += solver.solve([residuals[row] for row in rows], own)
+    return tuple(steps)
+
+
+class _Solver:
+    """Solves blocks; keeps what they share: the zero tests, and where mistakes go."""
+
+    def __init__(self, where: str, mistakes: Mistakes, tests: ZeroTests) -> None:
+        self.where = where
+        self.mistakes = mistakes
+        self.tests = tests
+
+    def solve(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
+        """Return what gives the unknowns of one block, explicit where it is linear in them."""
+        known = frozenset(unknowns)
+        forms = [linear_form(residual.expression, known) for residual in block]
+        linear = [form for form in forms if form is not None]
+        if len(linear) < len(forms):
+            return self._loop(block, unknowns)
+        if len(block) > 1:
+            steps, free = eliminate(linear, unknowns, self.tests)
+            if free:
+                self._report_dependent(block, free)
+            return list(steps)
+        [(coefficients, rest)] = linear
+        coefficient = coefficients[unknowns[0]]
+        if self.tests.is_zero(coefficient) or self.tests.vanishes(coefficient):
+            self._report_dependent(block, unknowns)
+            return []
+        return [(unknowns[0].name, -rest / coefficient)]
+
+    def _loop(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
+        """Tear a nonlinear block; every residual of it must be one that the guesses can make zero."""
+        made = tear(block, unknowns, self.tests.is_zero)
+        if all(_moves(residual, made.inner) for residual in made.residuals):
+            return [made]
+        what = (
+            f"{self.where} hold a loop without an unknown left to solve for: {made.chain}, "
+            f"by {listed(made.equations)}"
+        )
+        self.mistakes.add("E503", block[0].equation.place, what)
+        return []
+
+    def _report_dependent(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> None:
+        what = (
+            f"{self.where} depend on each other and don't determine {listed([u.name for u in unknowns])}: "
+            f"{listed([residual.shown for residual in block])}"
+        )
+        self.mistakes.add("E511", block[0].equation.place, what)
+
+
+def _moves(residual: sympy.Expr, inner: Sequence[Assignment]) -> bool:
+    """Return whether a residual still holds a guess after the inner values are put in (when they are few)."""
+    if len(inner) <= MOST_LISTED:
+        for name, expression in reversed(inner):
+            residual = residual.xreplace({symbol(name): expression})
+    return bool(residual.free_symbols)

@@ -1,0 +1,292 @@
+"""A scene to equations: per kind of peer, the scalar equations after connection.
+
+Takes: `Scene`. Gives: `FlatSystem`.
+Guarantees: peers of one structure share one `FlatKind`, whatever their numbers and their count; every name
+is whole (`contact.a.x`); potentials that meet are equal, flows that meet sum to zero; options are decided.
+Does not: put a number in the place of a parameter, or look at clocks beyond naming them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from apc.compiler.components.component import OTHERS, Component, Option, Reference, Send, option_test
+from apc.compiler.components.component import Number as NumberParameter
+from apc.compiler.equations.connections import connection_equations
+from apc.compiler.errors import Mistakes, Place, place_in
+from apc.compiler.language.dimensions import Dimension
+from apc.compiler.language.expression import (
+    Binary,
+    Call,
+    Conditional,
+    Equation,
+    Expr,
+    Name,
+    Number,
+    format_expression,
+    transform,
+    walk,
+)
+from apc.compiler.language.values import Value
+from apc.compiler.scene.instances import Part
+from apc.compiler.scene.scene import Scene, SceneGroup
+
+PEERS = Name(("peers",))
+
+
+@dataclass(frozen=True, slots=True)
+class FlatVariable:
+    """A scalar unknown of one site; `start` says whether it has a start value, a parameter of its name."""
+
+    name: str
+    dimension: Dimension
+    start: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FlatEquation:
+    """`left = right` in whole names, from a part or a connection; `clock` is the clock its part names."""
+
+    left: Expr
+    right: Expr
+    origin: str
+    clock: str | None
+    place: Place
+
+    @property
+    def text(self) -> str:
+        """The equation as text."""
+        return f"{format_expression(self.left)} = {format_expression(self.right)}"
+
+
+@dataclass(frozen=True, slots=True)
+class FlatSend:
+    """What a part sends to the other peers over a link, sampled at the ticks of the link's clock."""
+
+    name: str
+    link: str
+    expression: Expr
+    dimension: Dimension
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class FlatKind:
+    """The equations of all peers of one structure.
+
+    `delays` are computational delays that these groups set for themselves: (whole name, group, value).
+    """
+
+    name: str
+    groups: tuple[str, ...]
+    delays: tuple[tuple[str, str, Value], ...]
+    parts: tuple[str, ...]
+    variables: tuple[FlatVariable, ...]
+    equations: tuple[FlatEquation, ...]
+    sends: tuple[FlatSend, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FlatSystem:
+    """The scene as equations; every group of peers belongs to one kind."""
+
+    scene: Scene
+    kinds: tuple[FlatKind, ...]
+
+
+def flatten(scene: Scene) -> FlatSystem:
+    """Write out the equations of every kind. Raises ApcError with every mistake found on the way."""
+    mistakes = Mistakes()
+    delays = _delay_names(scene)
+    structures: dict[object, list[SceneGroup]] = {}
+    for group in scene.groups:
+        structures.setdefault(_structure(scene, group, delays), []).append(group)
+    kinds = tuple(_flatten_kind(scene, groups, delays, mistakes) for groups in structures.values())
+    mistakes.raise_if_any()
+    return FlatSystem(scene, kinds)
+
+
+def _structure(scene: Scene, group: SceneGroup, delays: set[str]) -> object:
+    """Return what must be equal for two groups to share their equations: parts, words and delays."""
+    present = tuple(part.name for part in scene.parts if group.name in part.groups)
+    own = tuple((name, value.number) for name, value in group.values if name in delays)
+    return present, tuple(sorted(group.words)), tuple(sorted(own))
+
+
+def _delay_names(scene: Scene) -> set[str]:
+    """Return the parameters that are the delay of a hold: part of the schedule, not of the equations."""
+    found = set()
+    for part in scene.parts:
+        for equation in part.component.equations:
+            for side in (equation.left, equation.right):
+                for node in walk(side):
+                    if isinstance(node, Call) and node.function == "hold":
+                        for delay in node.arguments[1:]:
+                            names = (one for one in walk(delay) if isinstance(one, Name))
+                            found |= {f"{part.name}.{name.parts[0]}" for name in names}
+    return found
+
+
+def _flatten_kind(scene: Scene, groups: list[SceneGroup], delays: set[str], mistakes: Mistakes) -> FlatKind:
+    first = groups[0]
+    words = dict(first.words)
+    parts = [part for part in scene.parts if first.name in part.groups]
+    variables: list[FlatVariable] = []
+    equations: list[FlatEquation] = []
+    sends: list[FlatSend] = []
+    for part in parts:
+        instance = _Instance(part, words, mistakes)
+        variables += instance.variables()
+        equations += instance.equations()
+        sends += instance.sends()
+    equations += [
+        FlatEquation(left, right, "connection", None, place)
+        for left, right, place in connection_equations(parts, mistakes)
+    ]
+    for group in groups:
+        for name, _ in group.columns:
+            if name in delays:
+                what = f"{name} can't differ from peer to peer within a group"
+                mistakes.add("E211", group.place, what, hint="a group of its own for each delay")
+    own = tuple((name, first.name, value) for name, value in first.values if name in delays)
+    return FlatKind(
+        " and ".join(group.name for group in groups),
+        tuple(group.name for group in groups),
+        own,
+        tuple(part.name for part in parts),
+        tuple(variables),
+        tuple(equations),
+        tuple(sends),
+    )
+
+
+class _Instance:
+    """One part: its component's text in whole names."""
+
+    def __init__(self, part: Part, words: dict[str, str], mistakes: Mistakes) -> None:
+        self.part = part
+        self.component: Component = part.component
+        self.mistakes = mistakes
+        self.options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
+        own = {
+            name.rpartition(".")[2]: word
+            for name, word in words.items()
+            if name.rpartition(".")[0] == part.name
+        }
+        self.chosen = dict(part.options) | own
+        self.references = dict(part.references) | {n: w for n, w in own.items() if n not in self.options}
+        roles = {p.name: p.role for p in self.component.parameters if isinstance(p, Reference)}
+        self.clocks = {name for name, role in roles.items() if role == "clock"}
+        self.clock = self._only("clock", roles)
+        self.link = self._only("link", roles)
+        self.passed = {connector: (inner, its) for connector, inner, its in self.component.passed}
+        self.words = {
+            word: value
+            for p in self.component.parameters
+            if isinstance(p, NumberParameter)
+            for word, value in p.words
+        }
+        self.divided = {
+            p.name for p in self.component.parameters if isinstance(p, NumberParameter) and p.divided
+        }
+
+    def _only(self, wanted: str, roles: dict[str, str]) -> str | None:
+        """Return the clock or link that is named, when there is exactly one."""
+        named = [
+            self.references[name]
+            for name, role in roles.items()
+            if role == wanted and name in self.references
+        ]
+        return named[0] if len(named) == 1 else None
+
+    def variables(self) -> Iterator[FlatVariable]:
+        for variable in self.component.variables:
+            yield FlatVariable(
+                self._whole(variable.name), variable.unit.dimension, variable.start is not None
+            )
+        for name, dimension in self.component.locals:
+            yield FlatVariable(self._whole(name), dimension, False)
+        for name, connector in self.component.connectors:
+            if name in self.passed:
+                continue  # it is the inner part's
+            for variable in (*connector.potentials, *connector.flows):
+                yield FlatVariable(self._whole(name, variable.name), variable.unit.dimension, False)
+
+    def equations(self) -> Iterator[FlatEquation]:
+        for equation in self.component.equations:
+            left = self._qualified(equation.left, equation, self.clock)
+            right = self._qualified(equation.right, equation, self.clock)
+            yield FlatEquation(left, right, self.part.name, self.clock, equation.place)
+
+    def sends(self) -> Iterator[FlatSend]:
+        for send in self.component.sends:
+            if self.link is None:
+                what = f"{self.component.name} sends {send.name} but has no parameter that names one link"
+                self.mistakes.add("E504", send.place, what, hint="parameters: {link: link}")
+                continue
+            expression = self._qualified(send.expression, send, self.link)
+            yield FlatSend(self._whole(send.name), self.link, expression, send.dimension, send.place)
+
+    def _whole(self, *parts: str) -> str:
+        return ".".join((self.part.name, *parts))
+
+    def _qualified(self, expression: Expr, where: Equation | Send, clock: str | None) -> Expr:
+        def replace(node: Expr) -> Expr | None:
+            if isinstance(node, Conditional):
+                return self._decided(node, where, clock)
+            if isinstance(node, Call) and node.function == "sample":
+                return self._sample(node, where, clock)
+            if isinstance(node, Name):
+                return self._name(node)
+            return None
+
+        return transform(expression, replace)
+
+    def _decided(self, node: Conditional, where: Equation | Send, clock: str | None) -> Expr | None:
+        test = option_test(node.condition, self.options)
+        if test is None:
+            return None
+        option, word = test
+        equal = self.chosen[option.name] == word
+        holds = equal == (getattr(node.condition, "operator", "==") == "==")
+        return self._qualified(node.then if holds else node.otherwise, where, clock)
+
+    def _sample(self, node: Call, where: Equation | Send, clock: str | None) -> Expr:
+        argument = self._qualified(node.arguments[0], where, clock)
+        if len(node.arguments) == 2:
+            named = node.arguments[1]
+            if isinstance(named, Name) and named.parts[0] in self.clocks:
+                clock = self.references[named.parts[0]]
+            else:
+                self.mistakes.add(
+                    "E504",
+                    place_in(where.place, where.text, named.start),
+                    "the second argument of sample",
+                    expected="a parameter of this component that is a clock",
+                    got=format_expression(named),
+                )
+        if clock is None:
+            what = f"{self.component.name} samples but has no parameter that names one clock"
+            place = place_in(where.place, where.text, node.start)
+            self.mistakes.add("E504", place, what, hint="parameters: {clock: clock}")
+            clock = "?"
+        return Call("sample", (argument, Name((clock,))))
+
+    def _name(self, node: Name) -> Expr:
+        head = node.parts[0]
+        if node.parts in (("peers",), ("time",)):
+            return Name(node.parts)
+        if any(table.name == head for table in self.part.tables) and len(node.parts) == 1:
+            return Name((*self.part.name.split("."), head))
+        if head == OTHERS:
+            return Name((OTHERS, *self.part.name.split("."), *node.parts[1:]))
+        if len(node.parts) == 1 and head in self.words and self.component.parameter(head) is None:
+            return Number(self.words[head])
+        if head in self.passed:
+            inner, its = self.passed[head]
+            node = Name((inner, its, *node.parts[1:]))
+        whole = Name((*self.part.name.split("."), *node.parts))
+        if self.part.shared and len(node.parts) == 1 and head in self.divided:
+            return Binary("/", whole, PEERS)
+        return whole

@@ -1,0 +1,291 @@
+"""Index reduction: equations differentiated until every derivative can be solved for, and states chosen.
+
+Takes: residuals in variables and their derivatives (see `jets`). Gives: `reduce_index`: the equations to
+solve, their unknowns, and the states.
+Guarantees: as many equations as unknowns; the states are independent and chosen once and for all.
+Does not: solve anything (see `blocks`).
+
+Two masses joined rigidly have one position: `a.x = b.x` is a constraint between states, and the force between
+the masses follows only from its second derivative. Pantelides (SIAM J. Sci. Stat. Comput. 1988) finds which
+equations to differentiate; the method of dummy derivatives (Mattsson and Söderlind, SIAM J. Sci. Comput.
+1993) keeps the equation and its derivatives, and makes an unknown of as many derivatives as there are
+constraints, so that no constraint drifts.
+
+Among the choices of states it prefers variables with a declared start value, then those named first. The
+start value of a chosen state counts; the variables that depend on it follow, whatever their own start values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence, Set
+from dataclasses import dataclass
+
+import sympy
+
+from apc.compiler.equations.jets import TIME, Jet, Jets
+from apc.compiler.equations.matching import match_columns
+from apc.compiler.equations.residuals import Residual, report_singular
+from apc.compiler.equations.symbolic import NoDerivativeError, linear_form
+from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
+from apc.compiler.errors import Mistakes
+
+# More derivatives than this of one variable: no mechanical model needs them (a constraint on a position
+# needs two), so the equations do not end.
+HIGHEST_ORDER = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Reduced:
+    """Equations to solve for the unknowns. `states` are x, and der(x) where der(der(x)) is solved."""
+
+    residuals: tuple[Residual, ...]
+    unknowns: tuple[sympy.Symbol, ...]
+    states: tuple[sympy.Symbol, ...]
+
+
+def reduce_index(
+    residuals: Sequence[Residual],
+    names: Sequence[str],
+    started: Set[str],
+    jets: Jets,
+    where: str,
+    mistakes: Mistakes,
+    vanishes: Vanishing = NOTHING_VANISHES,
+) -> Reduced | None:
+    """Differentiate what must be and choose the states; None if the equations can't be solved.
+
+    Parameters
+    ----------
+    residuals, names
+        The equations, and the variables they hold, in the order of preference as states.
+    started
+        The variables with a declared start value.
+    jets
+        Knows the symbols of `names` and of their derivatives.
+    where
+        What to call the equations in a message.
+    mistakes
+        Takes E502 equations or unknowns left over or constraints that say the same, E508 the derivative of a
+        value that jumps, E509 states that can't be chosen once and for all.
+    vanishes
+        Whether an expression is zero with the scene's numbers.
+    """
+    column = {name: j for j, name in enumerate(names)}
+    incidence = [sorted({column[n] for n, _ in jets.jets(r.expression).values()}) for r in residuals]
+    match = match_columns(incidence, len(names))
+    if len(residuals) != len(names) or None in match:
+        report_singular(residuals, names, incidence, match, where, mistakes)
+        return None
+    system = _System(residuals, names, jets, vanishes)
+    if not system.differentiate_constraints(mistakes):
+        return None
+    dummies = system.choose_dummies(started, where, mistakes)
+    if dummies is None:
+        return None
+    states: list[sympy.Symbol] = []
+    unknowns: list[sympy.Symbol] = []
+    for name in names:
+        top = system.order[name]
+        # The orders made unknowns of begin here; the one below is solved for as the derivative of a state.
+        first = min((k for k in range(top + 1) if (name, k) in dummies), default=top + 1)
+        split = max(first - 1, 0)
+        states += [jets.symbol(name, k) for k in range(split)]
+        unknowns += [jets.symbol(name, k) for k in range(split, top + 1)]
+    return Reduced(tuple(system.residuals), tuple(unknowns), tuple(states))
+
+
+class _System:
+    """The equations as they grow: each may have a derivative, which then takes its place in the matching."""
+
+    def __init__(
+        self, residuals: Sequence[Residual], names: Sequence[str], jets: Jets, vanishes: Vanishing
+    ) -> None:
+        self.vanishes = vanishes
+        self.residuals = list(residuals)
+        self.names = names
+        self.jets = jets
+        self.held: list[dict[str, int]] = []  # for each equation, its variables and their highest orders
+        self.derivative: dict[int, int] = {}  # equation -> its derivative
+        self.integral: dict[int, int] = {}  # and back
+        # A derivative with a name of its own is asked for, even if no equation holds it.
+        self.order = {name: jets.named_order(name) for name in names}
+        for residual in residuals:
+            self._hold(residual)
+        for orders in self.held:
+            for name, order in orders.items():
+                self.order[name] = max(self.order[name], order)
+
+    def _hold(self, residual: Residual) -> None:
+        orders: dict[str, int] = {}
+        for name, order in self.jets.jets(residual.expression).values():
+            orders[name] = max(orders.get(name, 0), order)
+        self.held.append(orders)
+
+    # ---- Pantelides ----
+
+    def differentiate_constraints(self, mistakes: Mistakes) -> bool:
+        """Match every equation to a highest derivative, differentiating those that hold none of their own."""
+        computed_by: dict[str, int] = {}
+        computes: dict[int, str] = {}
+        for start in range(len(self.residuals)):
+            row = start
+            while (stuck := self._augment(row, computed_by, computes)) is not None:
+                rows, names = stuck
+                for name in names:
+                    self.order[name] += 1
+                    if self.order[name] > HIGHEST_ORDER:
+                        self._report_endless(rows, mistakes)
+                        return False
+                for each in rows:
+                    if not self._differentiate(each, mistakes):
+                        return False
+                for name in names:
+                    computed_by[name] = self.derivative[computed_by[name]]
+                    computes[computed_by[name]] = name
+                row = self.derivative[row]
+        return True
+
+    def _augment(
+        self, start: int, computed_by: dict[str, int], computes: dict[int, str]
+    ) -> tuple[list[int], list[str]] | None:
+        """Match one more equation; else return the equations and variables that block one another."""
+        came_from: dict[str, int] = {}
+        queue = [start]
+        for row in queue:
+            for name, order in self.held[row].items():
+                if name in came_from or order < self.order[name]:
+                    continue
+                came_from[name] = row
+                if name in computed_by:
+                    queue.append(computed_by[name])
+                    continue
+                while True:
+                    row = came_from[name]
+                    before = computes.get(row)
+                    computed_by[name], computes[row] = row, name
+                    if row == start:
+                        return None
+                    assert before is not None
+                    name = before
+        return queue, list(came_from)
+
+    def _differentiate(self, row: int, mistakes: Mistakes) -> bool:
+        residual = self.residuals[row]
+        try:
+            expression = self.jets.differentiate(residual.expression)
+        except NoDerivativeError as missing:
+            report_no_derivative(residual, missing, mistakes)
+            return False
+        self.derivative[row], self.integral[len(self.residuals)] = len(self.residuals), row
+        made = Residual(expression, residual.equation)
+        self.residuals.append(made)
+        self._hold(made)
+        return True
+
+    def _report_endless(self, rows: Iterable[int], mistakes: Mistakes) -> None:
+        roots = list(dict.fromkeys(self.residuals[row].equation for row in rows))
+        texts = ", ".join(f"`{equation.text}` ({equation.origin})" for equation in roots)
+        what = f"no number of derivatives of these equations determines what they hold: {texts}"
+        mistakes.add("E509", roots[0].place, what)
+
+    # ---- dummy derivatives ----
+
+    def choose_dummies(self, started: Set[str], where: str, mistakes: Mistakes) -> set[Jet] | None:
+        """Return the derivatives that become unknowns, level by level from the highest order down.
+
+        At each level as many as there are constraints, so that the constraints' Jacobian in them is regular.
+        """
+        rank = {name: j for j, name in enumerate(self.names)}
+
+        def wanted_last(jet: Jet) -> tuple[bool, int, int]:
+            name, order = jet
+            return self.jets.symbol(name, order - 1).name in started, -order, -rank[name]
+
+        chosen: set[Jet] = set()
+        rows = [row for row in self.integral if row not in self.derivative]
+        candidates: Iterable[Jet] = [(name, order) for name, order in self.order.items() if order]
+        while rows:
+            level = self._regular_columns(rows, sorted(candidates, key=wanted_last), where, mistakes)
+            if level is None:
+                return None
+            chosen |= set(level)
+            rows = [self.integral[row] for row in rows if self.integral[row] in self.integral]
+            candidates = [(name, order - 1) for name, order in level if order > 1]
+        return chosen
+
+    def _regular_columns(
+        self, rows: Sequence[int], candidates: Sequence[Jet], where: str, mistakes: Mistakes
+    ) -> list[Jet] | None:
+        """Return the first columns, in the order given, in which the rows' Jacobian is regular.
+
+        Elimination column by column; a factor that moves, such as 2·x, may vanish and is no pivot.
+        """
+        symbols = {self.jets.symbol(*jet): jet for jet in candidates}
+        is_zero = ZeroTest()
+        matrix: dict[int, dict[Jet, sympy.Expr]] = {}
+        for row in rows:
+            form = linear_form(self.residuals[row].expression, symbols.keys())
+            assert form is not None, "a derivative is linear in the highest derivatives"
+            matrix[row] = {symbols[s]: c for s, c in form[0].items() if not is_zero(c)}
+        columns: dict[Jet, dict[int, None]] = {jet: {} for jet in candidates}
+        for row, entries in matrix.items():
+            for jet in entries:
+                columns[jet][row] = None
+        chosen: list[Jet] = []
+        for jet in candidates:
+            still = [row for row in columns[jet] if row in matrix and jet in matrix[row]]
+            fixed = [
+                row
+                for row in still
+                if not self._moves(matrix[row][jet]) and not self.vanishes(matrix[row][jet])
+            ]
+            if not fixed:
+                continue
+            pivot = min(fixed, key=lambda row: (not matrix[row][jet].is_Number, len(matrix[row]), row))
+            entries = matrix.pop(pivot)
+            chosen.append(jet)
+            for row in still:
+                if row == pivot:
+                    continue
+                factor = matrix[row][jet] / entries[jet]
+                for other, value in entries.items():
+                    left = matrix[row].get(other, sympy.S.Zero) - factor * value
+                    if other == jet or is_zero(left):
+                        matrix[row].pop(other, None)
+                    else:
+                        matrix[row][other] = left
+                        columns[other][row] = None
+        if matrix:
+            self._report_no_choice(matrix, where, mistakes)
+            return None
+        return chosen
+
+    def _moves(self, expression: sympy.Expr) -> bool:
+        return TIME in expression.free_symbols or bool(self.jets.jets(expression))
+
+    def _report_no_choice(
+        self, matrix: dict[int, dict[Jet, sympy.Expr]], where: str, mistakes: Mistakes
+    ) -> None:
+        """Say which constraints are left without a variable that follows from them."""
+        for row, entries in matrix.items():
+            residual = self.residuals[row]
+            if entries and not all(self.vanishes(c) for c in entries.values()):
+                factors = ", ".join(
+                    f"{name} (by the factor {sympy.sstr(c)})" for (name, _), c in sorted(entries.items())
+                )
+                what = (
+                    f"{where}: no variable follows from the constraint {residual.shown} in every position, "
+                    f"since the factor moves and may vanish: {factors}"
+                )
+                hint = "the constraint with an angle or another coordinate that gives every position"
+                mistakes.add("E509", residual.equation.place, what, hint=hint)
+            else:
+                what = f"{where}: the constraint {residual.shown} says what other constraints say already"
+                mistakes.add("E502", residual.equation.place, what)
+
+
+def report_no_derivative(residual: Residual, missing: NoDerivativeError, mistakes: Mistakes) -> None:
+    """Add the mistake E508: an equation's derivative is needed, and what it holds has none."""
+    what = f"{residual.shown} needs the derivative of {missing}"
+    why = "a position follows such a force only through a mass"
+    mistakes.add("E508", residual.equation.place, f"{what}; {why}")

@@ -1,0 +1,93 @@
+"""The symbols of variables and of their time derivatives, both ways, and differentiation by them.
+
+Takes: names of variables, and which of them are others' derivatives. Gives: `Jet`, `Jets`.
+Guarantees: one symbol for each derivative of each variable.
+Does not: choose states (see `index`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import sympy
+
+from apc.compiler.equations.symbolic import (
+    NoDerivativeError,
+    derivative_symbol,
+    differential,
+    symbol,
+)
+
+TIME = symbol("time")
+Jet = tuple[str, int]  # a variable and how often it is differentiated
+
+
+class Jets:
+    """The symbols of variables and of their derivatives, `x`, `der(x)`, `der(der(x))`, both ways.
+
+    `velocities` gives derivatives their own names: with {x: v} they are `x`, `v`, `der(v)`, and v is no
+    variable of its own. `jumping` are the symbols of held forces.
+    """
+
+    def __init__(
+        self, names: Iterable[str], jumping: Iterable[str], velocities: Mapping[str, str] | None = None
+    ) -> None:
+        velocities = velocities or {}
+        derived = set(velocities.values())
+        self.names = [name for name in names if name not in derived]
+        self._jets: dict[sympy.Symbol, Jet] = {}
+        self._named: dict[str, int] = {}
+        for name in self.names:
+            self._jets[symbol(name)] = (name, 0)
+            own, order = name, 0
+            while own in velocities:
+                own, order = velocities[own], order + 1
+                self._jets[symbol(own)] = (name, order)
+                self._named[name] = order
+        self._symbols = {jet: s for s, jet in self._jets.items()}
+        self._jumping = {symbol(name) for name in jumping}
+
+    def renamed(self, names: Iterable[str], velocities: Mapping[str, str]) -> Jets:
+        """Return the jets of some of the variables, where `velocities` name derivatives."""
+        kept = Jets(names, (), velocities)
+        kept._jumping = self._jumping
+        for name, order in self._symbols:
+            if symbol(name) in kept._jets:
+                root, first = kept._jets[symbol(name)]
+                kept.symbol(root, first + order)
+        return kept
+
+    def named_order(self, name: str) -> int:
+        """Return how many derivatives of a variable have names of their own."""
+        return self._named.get(name, 0)
+
+    def add(self, name: str) -> sympy.Symbol:
+        """Add a variable and return its symbol."""
+        self.names.append(name)
+        return self.symbol(name, 0)
+
+    def symbol(self, name: str, order: int) -> sympy.Symbol:
+        """Return the symbol of a derivative of a variable."""
+        known = self._symbols.get((name, order))
+        if known is None:
+            known = derivative_symbol(self.symbol(name, order - 1).name) if order else symbol(name)
+            self._jets[known] = (name, order)
+            self._symbols[name, order] = known
+        return known
+
+    def jets(self, expression: sympy.Expr) -> dict[sympy.Symbol, Jet]:
+        """Return the variables and derivatives an expression holds, in the order of their names."""
+        found = [s for s in expression.free_symbols if s in self._jets]
+        return {s: self._jets[s] for s in sorted(found, key=str)}
+
+    def differentiate(self, expression: sympy.Expr) -> sympy.Expr:
+        """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""
+        return differential(expression, self._rate)
+
+    def _rate(self, s: sympy.Symbol) -> sympy.Expr:
+        if s in self._jumping:
+            raise NoDerivativeError(s.name, "a force that jumps at its ticks")
+        if s in self._jets:
+            name, order = self._jets[s]
+            return self.symbol(name, order + 1)
+        return sympy.S.One if s == TIME else sympy.S.Zero

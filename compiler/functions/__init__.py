@@ -1,0 +1,1 @@
+"""Equations written as CasADi functions, each computing only what is asked of it."""

@@ -1,0 +1,327 @@
+"""The numbers of a scene by name, its groups, and who hears whom: all of a compiled model but its functions.
+
+Takes: `Scene`, and the kinds once they are written. Gives: `Timings`, parameters, groups, links, clocks.
+Guarantees: periods, phases and delays stay exact; what depends on a name keeps its expression.
+Does not: write functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import (
+    PEERS,
+    Channel,
+    Clock,
+    Column,
+    Group,
+    Kind,
+    Link,
+    Loss,
+    PairDelay,
+    Parameter,
+    Timing,
+)
+from apc.compiler.components.component import Number as NumberParameter
+from apc.compiler.equations.clocks import HoldCrossing
+from apc.compiler.equations.flatten import FlatKind
+from apc.compiler.equations.reductions import count_of
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.language.evaluation import evaluate
+from apc.compiler.language.expression import Expr, Name, Number, format_expression, transform
+from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.language.values import Value
+from apc.compiler.scene.channels import SceneChannel
+from apc.compiler.scene.links import SceneLink
+from apc.compiler.scene.scene import Scene, SceneGroup
+
+NO_DELAY = "no delay"
+COUNT_ABOUT = "peers heard over the link, counted with their weights"
+LOSS_ABOUT = (
+    "probability that a good link turns bad after a packet",
+    "probability that a bad link turns good after a packet",
+    "probability that a bad link loses a packet",
+    "probability that a good link loses a packet",
+)
+
+
+class Timings:
+    """The periods, phases and delays that the model refers to, each once."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._parts = {part.name: dict(part.values) for part in scene.parts}
+        self._found: dict[str, Timing] = {}
+
+    @property
+    def found(self) -> tuple[Timing, ...]:
+        """All timings in use, in the order of first use."""
+        return tuple(self._found.values())
+
+    def use(self, name: str, value: Value) -> str:
+        """Register a timing and return its name."""
+        self._found.setdefault(name, Timing(name, value.number, value.expression))
+        return name
+
+    def delay(self, hold: HoldCrossing, kind: FlatKind) -> str:
+        """Register the delay of a hold: none, a parameter of a part, or an expression over such."""
+        expression = hold.delay
+        own = {name: (group, value) for name, group, value in kind.delays}
+        if isinstance(expression, Number) and expression.value == 0:
+            self._found.setdefault(NO_DELAY, Timing(NO_DELAY, Fraction(0)))
+            return NO_DELAY
+        if isinstance(expression, Name):
+            return self._parameter(".".join(expression.parts), own)
+        named: list[str] = []
+
+        def register(node: Expr) -> Expr | None:
+            if isinstance(node, Name) and node.parts != (PEERS,):
+                named.append(self._parameter(".".join(node.parts), own))
+                return Name(tuple(named[-1].split(".")))
+            return None
+
+        tree = transform(expression, register)
+        text = format_expression(tree)
+        number = Fraction(evaluate(tree, self._number, place=Place(self.scene.name)))
+        name = f"delay of {hold.variable}" + (f" at {kind.name}" if own else "")
+        self._found.setdefault(name, Timing(name, number, text))
+        return name
+
+    def _parameter(self, name: str, own: dict[str, tuple[str, Value]]) -> str:
+        """Register a delay parameter, under the group's name if it sets its own."""
+        if name in own:
+            group, value = own[name]
+            return self.use(f"{group}.{name}", value)
+        part, _, parameter = name.rpartition(".")
+        return self.use(name, self._parts[part][parameter])
+
+    def _number(self, parts: tuple[str, ...]) -> Fraction:
+        return Fraction(self.scene.peers) if parts == (PEERS,) else self._found[".".join(parts)].value
+
+
+def used_links(
+    scene: Scene, kinds: Sequence[Kind], timings: Timings
+) -> tuple[list[Link], list[tuple[str, str]]]:
+    """Return the links over which something is heard, and those left out with the reason.
+
+    Parameters
+    ----------
+    scene, kinds
+        All links, and who hears over which.
+    timings
+        Takes the delays of the links that are used.
+    """
+    heard = {receive.link for kind in kinds for clock in kind.clocks for receive in clock.receives}
+    links, dropped = [], []
+    for link in scene.links:
+        if link.name in heard:
+            links.append(_link(link, timings))
+        else:
+            dropped.append((link.name, "nobody hears what it would carry"))
+    return links, dropped
+
+
+def _link(link: SceneLink, timings: Timings) -> Link:
+    delays = tuple(
+        PairDelay(
+            pair.sender,
+            pair.receiver,
+            timings.use(f"{link.name}.delays.{pair.sender}.{pair.receiver}", pair.delay),
+        )
+        for pair in link.delays
+    )
+    delay = timings.use(f"{link.name}.delay", link.delay)
+    channel = None if link.channel is None else _channel(link.name, link.channel, timings)
+    return Link(link.name, link.clock, delay, link.graph, delays, channel)
+
+
+def _channel(link: str, channel: SceneChannel, timings: Timings) -> Channel:
+    return Channel(
+        Loss(*(name for name, _ in channel.loss)) if channel.loss else None,
+        None if channel.jitter is None else timings.use(f"{link}.jitter", channel.jitter),
+        channel.distribution,
+        channel.reorder,
+        channel.on_loss,
+        channel.trace,
+    )
+
+
+def used_clocks(
+    scene: Scene, kinds: Sequence[Kind], links: Sequence[Link], timings: Timings
+) -> tuple[list[Clock], list[tuple[str, str]]]:
+    """Return the clocks that something ticks with, and those left out with the reason.
+
+    Parameters
+    ----------
+    scene
+        The scene, all of its clocks.
+    kinds, links
+        What ticks.
+    timings
+        Takes the periods and phases that are used.
+    """
+    used = {link.clock for link in links} | {clock.clock for kind in kinds for clock in kind.clocks}
+    clocks, dropped = [], []
+    for clock in scene.clocks:
+        if clock.name in used:
+            period = timings.use(f"{clock.name}.period", clock.period)
+            clocks.append(Clock(clock.name, period, timings.use(f"{clock.name}.phase", clock.phase)))
+        else:
+            dropped.append((clock.name, "nothing ticks with it"))
+    return clocks, dropped
+
+
+def compiled_groups(
+    scene: Scene, kinds: Sequence[Kind], kind_of: Mapping[str, int], links: Sequence[Link], timings: Timings
+) -> tuple[Group, ...]:
+    """Return the groups: a setting that is a timing is in the schedule and no parameter.
+
+    How many peers each peer hears over a link, `count(LINK)`, is a parameter of its group, or a column where
+    it differs from peer to peer.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    kinds, kind_of
+        The kinds of peers, and the place among them of each group's.
+    links
+        The links that are used.
+    timings
+        What is in the schedule.
+
+    Raises
+    ------
+    ApcError
+        E215 a graph some of whose peers send nothing.
+    """
+    exact = {timing.name for timing in timings.found}
+    found = []
+    start = 0
+    for group in scene.groups:
+        values = [
+            compiled_parameter(scene, name, value)
+            for name, value in group.values
+            if f"{group.name}.{name}" not in exact
+        ]
+        columns = [Column(name, numbers) for name, numbers in group.columns]
+        kind = kinds[kind_of[group.name]]
+        for link in links:
+            name = count_of(link.name)
+            if name not in kind.parameters:
+                continue
+            counts = _counts(scene, kinds, kind_of, link, group, start)
+            if (counts == counts[0]).all():
+                values.append(Parameter(name, "1", float(counts[0]), about=COUNT_ABOUT))
+            else:
+                columns.append(Column(name, counts))
+        found.append(Group(group.name, group.count, kind_of[group.name], tuple(values), tuple(columns)))
+        start += group.count
+    return tuple(found)
+
+
+def _counts(
+    scene: Scene,
+    kinds: Sequence[Kind],
+    kind_of: Mapping[str, int],
+    link: Link,
+    group: SceneGroup,
+    start: int,
+) -> NDArray[np.float64]:
+    """Return the summed weights of what each peer of a group hears: one number if they are all alike."""
+    sends = {
+        one.name: any(sending.link == link.name for sending in kinds[kind_of[one.name]].sends)
+        for one in scene.groups
+    }
+    if link.graph.shape == "complete":
+        total = sum(one.count for one in scene.groups if sends[one.name])
+        return np.array([float(total - sends[group.name])])
+    silent = [name for name, does in sends.items() if not does]
+    if silent:
+        place = next(part.place for part in scene.links if part.name == link.name)
+        what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
+        raise ApcError(Mistake("E215", place, what))
+    if link.graph.shape == "ring":
+        return np.array([float(min(2, scene.peers - 1))])
+    if link.graph.shape == "star":
+        counts = np.ones(group.count)
+        if start == 0:
+            counts[0] = scene.peers - 1
+        return counts
+    received = np.zeros(scene.peers)
+    np.add.at(received, link.graph.arcs[:, 1], link.graph.weights)
+    return received[start : start + group.count]
+
+
+def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
+    """Return a number of the scene as a parameter, with its unit, bounds and what it is about.
+
+    Parameters
+    ----------
+    scene
+        Knows what the component of a part declares.
+    name
+        The whole name: `contact.stiffness`, or that of a named number, which has no bounds.
+    value
+        The number, in SI.
+    """
+    unit = format_dimension(value.dimension)
+    number = float(value.number)
+    part, _, own = name.rpartition(".")
+    if not part:
+        return Parameter(name, unit, number, value.expression)
+    component = scene.part(part).component
+    declared = component.parameter(own)
+    if isinstance(declared, NumberParameter):
+        return Parameter(
+            name,
+            unit,
+            number,
+            value.expression,
+            None if declared.minimum is None else float(declared.minimum),
+            declared.open_minimum,
+            None if declared.maximum is None else float(declared.maximum),
+            declared.about,
+        )
+    variable = component.variable(own)
+    assert variable is not None
+    return Parameter(name, unit, number, value.expression, about=f"start value: {variable.about}")
+
+
+def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
+    """Return every parameter of the scene: named ones, each part's, start values in use, those of links.
+
+    Parameters
+    ----------
+    scene
+        Their values.
+    kinds, links
+        What is compiled: whose start values and counts are in use, and which links.
+    """
+    found = {name: compiled_parameter(scene, name, value) for name, value in scene.parameters}
+    needed = {name for kind in kinds for name in kind.parameters}
+    for part in scene.parts:
+        for own, value in part.values:
+            name = f"{part.name}.{own}"
+            found[name] = compiled_parameter(scene, name, value)
+        given = dict(part.starts)
+        for variable in part.component.variables:
+            name = f"{part.name}.{variable.name}"
+            if name in needed and variable.start is not None:
+                default = Value(variable.start, variable.unit.dimension, None, part.place)
+                found[name] = compiled_parameter(scene, name, given.get(variable.name, default))
+    for link in scene.links:
+        if count_of(link.name) in needed:  # every group has its own value
+            name = count_of(link.name)
+            found[name] = Parameter(name, "1", float(scene.peers - 1), about=COUNT_ABOUT)
+        if link.channel is not None and any(used.name == link.name for used in links):
+            found |= {
+                name: Parameter(name, "1", float(value.number), value.expression, 0.0, False, 1.0, about)
+                for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
+            }
+    found[PEERS] = Parameter(PEERS, "1", float(scene.peers), about="number of peers")
+    return tuple(found.values())

@@ -1,0 +1,295 @@
+"""Explicit equations to CasADi functions, and the exchange between sites as structure.
+
+Takes: `SortedSystem`. Gives: `CompiledSystem`.
+Guarantees: a kind's functions hold only what its states, its samples and what it sends depend on; what the
+scene named but nothing reads is listed in `dropped`. They are SX functions, unless the kind has a nonlinear
+loop: then they are MX functions, with a Newton solver for each loop inside.
+Does not: write files, or put numbers in the place of parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+
+from apc.compiler.compiled import (
+    ClockPartition,
+    CompiledSystem,
+    Hold,
+    Kind,
+    Origin,
+    Ports,
+    Receive,
+    SendPartition,
+    State,
+)
+from apc.compiler.components.component import OTHERS
+from apc.compiler.equations.clocks import HoldCrossing, ReceiveCrossing
+from apc.compiler.equations.structure import SortedKind, SortedSystem
+from apc.compiler.equations.symbolic import derivative_symbol, symbol
+from apc.compiler.functions.casadi_writer import Writer
+from apc.compiler.functions.exchange import Timings, all_parameters, compiled_groups, used_clocks, used_links
+from apc.compiler.functions.ports import held_ports
+from apc.compiler.functions.reached import Reached
+from apc.compiler.language.recordings import TimeTable
+from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.scene.scene import Scene
+
+
+def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
+    """Write every kind as CasADi functions, and what lies between the sites beside them."""
+    scene = system.scene
+    timings = Timings(scene)
+    builders = [_KindBuilder(scene, kind, timings) for kind in system.kinds]
+    rows = _shared_rows([builder.reached for builder in builders])
+    kinds = [builder.build(rows) for builder in builders]
+    dropped = [item for builder in builders for item in builder.dropped]
+    links, unheard = used_links(scene, kinds, timings)
+    clocks, silent = used_clocks(scene, kinds, links, timings)
+    numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
+    return CompiledSystem(
+        scene.name,
+        scene.about,
+        tuple(clocks),
+        tuple(links),
+        timings.found,
+        all_parameters(scene, kinds, links),
+        tuple(kinds),
+        compiled_groups(scene, kinds, numbers, links, timings),
+        tuple(dict.fromkeys([*dropped, *unheard, *silent])),
+        origin,
+        scene.experiment,
+        scene.region,
+    )
+
+
+def _shared_rows(kinds: Sequence[Reached]) -> dict[str, str]:
+    """Return, for each send that some kind hears, the send whose row it travels in.
+
+    Two sends over one link share a row when every kind sends the same under both names.
+    """
+    rows: dict[str, str] = {}
+    for kind in kinds:
+        for name in kind.heard:
+            if name not in rows:
+                known = dict.fromkeys(rows.values())
+                rows[name] = next((row for row in known if _same_everywhere(name, row, kinds)), name)
+    return rows
+
+
+def _same_everywhere(name: str, other: str, kinds: Sequence[Reached]) -> bool:
+    for kind in kinds:
+        one, two = kind.sends.get(name), kind.sends.get(other)
+        if one is None and two is None:
+            continue
+        if one is None or two is None or one.link != two.link or one.expression != two.expression:
+            return False
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class _Inputs:
+    """The columns that every function of a kind takes: states, held values, parameters, and the time."""
+
+    x: Any
+    u: Any
+    p: Any
+    t: Any
+
+
+_Channels = dict[str, tuple[str, int]]  # of each send: its link, and its row in what the kind sends over it
+
+
+class _KindBuilder:
+    """One kind's functions: what is read of it was found before, and is written."""
+
+    def __init__(self, scene: Scene, kind: SortedKind, timings: Timings) -> None:
+        self.kind = kind
+        self.scene = scene
+        self.tables: dict[str, TimeTable] = {
+            f"{part.name}.{table.name}": table
+            for part in scene.parts
+            if part.name in kind.clocked.flat.parts
+            for table in part.tables
+        }
+        self.timings = timings
+        self.dropped: list[tuple[str, str]] = []
+        self.reached = Reached(kind)
+
+    def build(self, rows: dict[str, str]) -> Kind:
+        """Write the kind's functions; `rows` says in which row each send that is heard travels."""
+        reached = self.reached
+        self.dropped += [(hold.variable, "nobody reads this held value") for hold in reached.idle_holds]
+        self.dropped += [(name, "nobody hears it") for name in reached.sends if name not in rows]
+        names = reached.parameters(self.tables)
+        writer, inputs = self._writer(names)
+        channels = self._channels(rows)
+        outputs = reached.outputs
+        return Kind(
+            self.kind.clocked.flat.name,
+            tuple(State(name, self._unit(name), name) for name in self.kind.states),
+            self._holds(outputs),
+            tuple(names),
+            casadi.Function(
+                "derivative",
+                [inputs.x, inputs.u, inputs.p, inputs.t],
+                [writer.column(writer.write(derivative_symbol(name)) for name in self.kind.states)],
+                ["x", "u", "p", "t"],
+                ["dx"],
+            ),
+            tuple(
+                self._clock(part.clock, outputs[part.clock], channels, writer, inputs)
+                for part in self.kind.partitions[1:]
+                if outputs[part.clock]
+            ),
+            tuple(
+                self._send(link, channels, writer, inputs)
+                for link in dict.fromkeys(link for link, _ in channels.values())
+            ),
+            self._ports(writer, inputs),
+        )
+
+    def _writer(self, names: Iterable[str]) -> tuple[Writer, _Inputs]:
+        """Return a writer of continuous quantities, and the inputs they are written in."""
+        reached = self.reached
+        type_: Any = casadi.MX if reached.loops else casadi.SX
+        x = {symbol(name): type_.sym(name) for name in self.kind.states}
+        u = {s: type_.sym(hold.symbol) for s, hold in reached.holds.items()}
+        p = {name: type_.sym(name) for name in names}
+        time = type_.sym("time")
+        # A start value has the name of its variable; the name itself is what is computed.
+        computed = {*reached.continuous, *reached.clocked}
+        known = {symbol(name): value for name, value in p.items() if symbol(name) not in computed}
+        known |= {symbol(f"initial({name})"): value for name, value in p.items()}
+        known |= {**x, **u, symbol("time"): time}
+        writer = Writer(type_, known, {**reached.continuous, **reached.samples}, self.tables, p)
+        inputs = _Inputs(
+            writer.column(x.values()), writer.column(u.values()), writer.column(p.values()), time
+        )
+        return writer, inputs
+
+    def _holds(self, outputs: dict[str, list[str]]) -> tuple[Hold, ...]:
+        """Return the held values that are read, each with the delay from which it acts."""
+        holds = list(self.reached.holds.values())
+        return tuple(
+            Hold(
+                _hold_name(hold, holds),
+                hold.clock,
+                outputs[hold.clock].index(hold.variable),
+                self.timings.delay(hold, self.kind.clocked.flat),
+            )
+            for hold in holds
+        )
+
+    def _ports(self, writer: Writer, inputs: _Inputs) -> Ports | None:
+        """Write where held values act, of those that anything reads."""
+        written = writer.known.keys()
+        found = [port for port in held_ports(self.scene, self.kind) if port.symbols <= written]
+        if not found:
+            return None
+        rows = [port.potential for port in found] + [port.flow for port in found]
+        port = casadi.Function(
+            "port",
+            [inputs.x, inputs.u, inputs.p, inputs.t],
+            [writer.column(writer.translate(row) for row in rows)],
+            ["x", "u", "p", "t"],
+            ["potentials_flows"],
+        )
+        return Ports(tuple(port.part for port in found), port)
+
+    def _unit(self, name: str) -> str:
+        variable = next(v for v in self.kind.clocked.flat.variables if v.name == name)
+        return format_dimension(variable.dimension)
+
+    def _channels(self, rows: dict[str, str]) -> _Channels:
+        """Return for each send that is heard its link and its row among what this kind sends over it."""
+        sends = self.reached.sends
+        own = [name for name in rows if name in sends]
+        by_link: dict[str, list[str]] = {}
+        for name in own:
+            listed = by_link.setdefault(sends[name].link, [])
+            if rows[name] not in listed:
+                listed.append(rows[name])
+        return {name: (sends[name].link, by_link[sends[name].link].index(rows[name])) for name in own}
+
+    def _clock(
+        self, clock: str, outputs: list[str], channels: _Channels, writer: Writer, inputs: _Inputs
+    ) -> ClockPartition:
+        """Write what one clock's tick computes, from what is remembered and heard as well."""
+        reached = self.reached
+        heard = {s: receive for s, receive in reached.receives.items() if receive.clock == clock}
+        remembered = {s: previous for s, previous in reached.previous.items() if previous.clock == clock}
+        r = {s: writer.type_.sym(s.name) for s in heard}
+        m = {s: writer.type_.sym(s.name) for s in remembered}
+        own = writer.extended({**r, **m}, reached.clocked)
+        alone = writer.extended(m, reached.clocked)  # what one pair of peers knows: nothing that is heard
+        remembering = own.column(m.values())
+        tick = casadi.Function(
+            f"tick_{clock}",
+            [inputs.x, inputs.u, remembering, own.column(r.values()), inputs.p, inputs.t],
+            [own.column(own.write(symbol(name)) for name in outputs)],
+            ["x", "u", "m", "r", "p", "t"],
+            ["y"],
+        )
+        return ClockPartition(
+            clock,
+            tuple(outputs),
+            tuple(self._unit(name) for name in outputs),
+            tuple(outputs.index(previous.variable) for previous in remembered.values()),
+            tuple(previous.variable for previous in remembered.values()),
+            tuple(
+                Receive(
+                    receive.symbol,
+                    receive.operator,
+                    receive.link,
+                    channels[receive.send][1],
+                    self._edge(receive, channels, alone, remembering, inputs),
+                )
+                for receive in heard.values()
+            ),
+            tick,
+        )
+
+    def _edge(
+        self, receive: ReceiveCrossing, channels: _Channels, writer: Writer, remembering: Any, inputs: _Inputs
+    ) -> Any | None:
+        """Write what a reduction runs over, for one peer that hears and one that is heard, if anything."""
+        expression = self.reached.edges.get(symbol(receive.symbol))
+        if expression is None:
+            return None
+        rows = {name: row for name, (link, row) in channels.items() if link == receive.link}
+        sent = writer.type_.sym("s", 1 + max(rows.values()))
+        theirs = {symbol(f"{OTHERS}.{name}"): sent[row] for name, row in rows.items()}
+        return casadi.Function(
+            "edge",
+            [inputs.x, inputs.u, remembering, sent, inputs.p, inputs.t],
+            [writer.extended(theirs, {}).translate(expression)],
+            ["x", "u", "m", "s", "p", "t"],
+            ["value"],
+        )
+
+    def _send(self, link: str, channels: _Channels, writer: Writer, inputs: _Inputs) -> SendPartition:
+        """Write what the kind sends over one link, a row for each send that travels in its own."""
+        sends = self.reached.sends
+        first: dict[int, str] = {}
+        for name, (its_link, row) in channels.items():
+            if its_link == link:
+                first.setdefault(row, name)
+        names = [first[row] for row in sorted(first)]
+        send = casadi.Function(
+            f"send_{link}",
+            [inputs.x, inputs.u, inputs.p, inputs.t],
+            [writer.column(writer.translate(sends[name].expression) for name in names)],
+            ["x", "u", "p", "t"],
+            ["s"],
+        )
+        return SendPartition(link, tuple(names), tuple(sends[name].unit for name in names), send)
+
+
+def _hold_name(hold: HoldCrossing, holds: Sequence[HoldCrossing]) -> str:
+    """Return the name of what is held; with its delay, where one value is held twice."""
+    same = sum(other.variable == hold.variable for other in holds)
+    return hold.variable if same == 1 else hold.symbol

@@ -1,0 +1,1 @@
+"""What is written inside the YAML: expressions, units, numbers, tables."""

@@ -1,0 +1,157 @@
+"""What was recorded of a quantity or of packets: time tables and traces in CSV files.
+
+Takes: a path. Gives: `TimeTable`, `Trace`, in SI.
+Guarantees: times rise; a delay is 0 or more, or says that its packet was lost; a mistake names its file, line
+and column.
+Does not: know what reads them.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.language.dimensions import SECOND
+from apc.compiler.language.tables import MOST_MISTAKES, open_rows, read_headings, read_table
+from apc.compiler.language.units import NO_UNIT, Unit
+from apc.compiler.source.reading import brief
+
+LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with nothing in it
+
+
+@dataclass(frozen=True, slots=True)
+class TimeTable:
+    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI.
+
+    `digest` is the SHA-256 of the file's bytes.
+    """
+
+    name: str
+    times: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+    digest: str
+
+
+def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeTable:
+    """Read a quantity over time: two columns, time and the quantity, and two or more rows of rising time.
+
+    Parameters
+    ----------
+    path
+        The CSV file.
+    name, unit
+        What the quantity is called, and a unit of its dimension.
+    named_at
+        Where the topology names the file.
+
+    Raises
+    ------
+    ApcError
+        As `read_table`, and when the columns or times are not as they must be.
+    """
+    table = read_table(path, named_at)
+    first = table.columns[0]
+    if len(table.columns) != 2 or first.unit.dimension != SECOND:
+        expected = f"two columns, time [s] and {name} [{unit.text}]"
+        raise ApcError(Mistake("E702", first.place, "a table over time", expected))
+    times, numbers = table.columns
+    if numbers.unit.dimension != unit.dimension:
+        raise ApcError(Mistake("E702", numbers.place, numbers.name, unit.text, numbers.unit.text))
+    if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
+        expected = "two or more rows of rising time"
+        raise ApcError(Mistake("E703", times.place, "a table over time", expected))
+    return TimeTable(name, times.numbers, numbers.numbers, table.digest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """Recorded one-way delays: `delays` (n,) in seconds, one a packet, infinite for one that was lost.
+
+    `digest` is the SHA-256 of the file's bytes.
+    """
+
+    delays: NDArray[np.float64]
+    digest: str
+
+
+def read_trace(path: Path, named_at: Place) -> Trace:
+    """Read the column `delay` of a CSV file: 0 or more a packet; `lost`, or nothing, if it was lost.
+
+    Other columns may say anything. A line without a character is no packet.
+
+    Parameters
+    ----------
+    path
+        The CSV file.
+    named_at
+        Where the topology names it, for a file that can't be read.
+
+    Raises
+    ------
+    ApcError
+        E701 it can't be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is at
+        fault, or there is none.
+    """
+    reader, digest = open_rows(path, named_at)
+    file = str(path)
+    mistakes = Mistakes()
+    delays: list[float] = []
+    try:
+        names = read_headings(reader, file, mistakes)
+        mistakes.raise_if_any()
+        own = _delay_column(names)
+        faults = 0
+        for cells in reader:
+            if not cells or (len(cells) == 1 and cells[0].isspace()):
+                continue
+            delay = _delay(cells, own, names, Place(file, reader.line_num), mistakes)
+            delays.append(delay)
+            faults += math.isnan(delay)
+            if faults >= MOST_MISTAKES:
+                break
+    except csv.Error as error:
+        raise ApcError(Mistake("E703", Place(file, reader.line_num or 1, 1), f"is no CSV: {error}")) from None
+    mistakes.raise_if_any()
+    if not delays:
+        raise ApcError(Mistake("E703", Place(file, 2, 1), "the table has headings but no rows"))
+    return Trace(np.array(delays), digest)
+
+
+def _delay_column(names: list[tuple[str, Unit, Place]]) -> int:
+    """Return which column is called delay. Raises ApcError if there is none, or it is in no unit of time."""
+    got, place = ", ".join(name for name, _, _ in names), names[0][2]
+    for column, (name, unit, at) in enumerate(names):
+        if name == "delay":
+            if unit.dimension == SECOND:
+                return column
+            got, place = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
+    expected = "a column delay in a unit of time"
+    raise ApcError(Mistake("E702", place, "a trace", expected, brief(got), "delay [ms]"))
+
+
+def _delay(
+    cells: list[str], own: int, names: list[tuple[str, Unit, Place]], row: Place, mistakes: Mistakes
+) -> float:
+    """Return a packet's delay in seconds: infinite if it was lost, not a number if its row is at fault."""
+    if len(cells) != len(names):
+        what = f"the row has {len(cells)} cells and there are {len(names)} headings"
+        mistakes.add("E703", row.shifted(1), what)
+        return math.nan
+    cell = cells[own].strip()
+    if cell in ("", LOST):
+        return math.inf
+    try:
+        number = float(cell)
+    except ValueError:
+        number = math.nan
+    if 0 <= number < math.inf:
+        return number * float(names[own][1].scale)
+    place = row.shifted(sum(len(other) + 1 for other in cells[:own]) + 1)
+    mistakes.add("E703", place, "a delay", expected=f"a time of 0 or more, or {LOST}", got=brief(cell))
+    return math.nan

@@ -1,0 +1,209 @@
+"""Units checked through expressions and equations.
+
+Takes: `Expr` and `Equation`, and the dimension of every name. Gives: the dimension of an expression.
+Guarantees: every term of an expression that does not fit is reported, each once, at its own column; a part
+whose dimension is unknown complains about nothing.
+Does not: know scales (all is SI by now), or look names up.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from fractions import Fraction
+
+from apc.compiler.errors import Mistakes, Place, place_in
+from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
+from apc.compiler.language.expression import (
+    Binary,
+    Call,
+    Compare,
+    Conditional,
+    Equation,
+    Expr,
+    Logic,
+    Name,
+    Negate,
+    Not,
+    Number,
+    format_expression,
+)
+from apc.compiler.language.unit_text import format_dimension
+
+ANY = Dimension((("any", 1),))
+"""The dimension of the literal 0, which fits every other."""
+
+Lookup = Callable[[Name], Dimension | None]
+
+
+def dimension_of(expr: Expr, lookup: Lookup, text: str, place: Place) -> Dimension | None:
+    """Return the dimension of an expression.
+
+    Parameters
+    ----------
+    expr
+        The tree; its offsets count in `text`.
+    lookup
+        Gives the dimension of a name, None when it isn't known.
+    text, place
+        The text, and where it starts.
+
+    Returns
+    -------
+    Dimension or None
+        `ANY` for a literal 0, `DIMENSIONLESS` for every other literal and for a condition; None when it hangs
+        on a name without a dimension. A sum with one known term has that term's.
+
+    Raises
+    ------
+    ApcError
+        E402 a term that doesn't fit its sum, E403 an argument that has to be a plain number, E404 branches,
+        arguments or sides of a comparison that differ, E405 a delay that is no time.
+    """
+    checker = _Checker(lookup, text, place)
+    dimension = checker.dimension(expr)
+    checker.mistakes.raise_if_any()
+    return dimension
+
+
+def check_equation(equation: Equation, lookup: Lookup) -> None:
+    """Check that both sides of an equation, and all terms in them, have the same dimension.
+
+    The terms of both sides are compared together, so that in `m*der(v) = f - d*x`
+    the one that is wrong is named.
+
+    Raises
+    ------
+    ApcError
+        E401 a term that doesn't fit the equation; and those of `dimension_of`.
+    """
+    checker = _Checker(lookup, equation.text, equation.place)
+    checker.agree("E401", [*_terms(equation.left), *_terms(equation.right)])
+    checker.mistakes.raise_if_any()
+
+
+def _terms(expr: Expr) -> list[Expr]:
+    """Return what a sum adds up, signs and parentheses taken apart."""
+    match expr:
+        case Binary("+" | "-", left, right):
+            return [*_terms(left), *_terms(right)]
+        case Negate(operand):
+            return _terms(operand)
+        case _:
+            return [expr]
+
+
+class _Checker:
+    """Finds dimensions and collects mistakes; a part with a mistake counts as unknown, to say it once."""
+
+    def __init__(self, lookup: Lookup, text: str, place: Place) -> None:
+        self.lookup, self.text, self.place = lookup, text, place
+        self.mistakes = Mistakes()
+
+    def said(self, expr: Expr) -> str:
+        """Return a part as it is written, or as it would be when it comes from somewhere else."""
+        written = self.text[expr.start : expr.end] or format_expression(expr)
+        return written if len(written) <= 60 else written[:57] + "…"
+
+    def add(self, code: str, expr: Expr, expected: str, got: Dimension) -> None:
+        place = place_in(self.place, self.text, expr.start)
+        unit = "a plain number" if got == DIMENSIONLESS else format_dimension(got)
+        self.mistakes.add(code, place, self.said(expr), expected=expected, got=unit)
+
+    def agree(self, code: str, parts: list[Expr]) -> Dimension | None:
+        """Return the dimension most parts have, the first of them in a tie; report the others."""
+        found = [(part, self.dimension(part)) for part in parts]
+        known = [(part, dimension) for part, dimension in found if dimension not in (None, ANY)]
+        if not known:
+            unknown = any(dimension is None for _, dimension in found)
+            return None if unknown else ANY
+        usual = Counter(dimension for _, dimension in known).most_common(1)[0][0]
+        assert usual is not None
+        like = next(part for part, dimension in known if dimension == usual)
+        unit = "a plain number" if usual == DIMENSIONLESS else format_dimension(usual)
+        for part, dimension in known:
+            if dimension is not None and dimension != usual:
+                self.add(code, part, f"{unit} like {self.said(like)}", dimension)
+        return usual
+
+    def plain(self, expr: Expr) -> None:
+        """Report an argument that is no plain number."""
+        dimension = self.dimension(expr)
+        if dimension not in (None, ANY, DIMENSIONLESS):
+            assert dimension is not None
+            self.add("E403", expr, "a plain number", dimension)
+
+    def factor(self, expr: Expr) -> Dimension | None:
+        """Return the dimension of a part of a product, in which a literal 0 is a number like any other."""
+        dimension = self.dimension(expr)
+        return DIMENSIONLESS if dimension == ANY else dimension
+
+    def dimension(self, expr: Expr) -> Dimension | None:
+        match expr:
+            case Number(value):
+                return DIMENSIONLESS if value else ANY
+            case Name():
+                return self.lookup(expr)
+            case Binary("+" | "-") | Negate():
+                return self.agree("E402", _terms(expr))
+            case Binary():
+                return self.product(expr)
+            case Compare(_, left, right):
+                self.agree("E404", [left, right])
+                return DIMENSIONLESS
+            case Logic(_, left, right):
+                self.dimension(left)
+                self.dimension(right)
+                return DIMENSIONLESS
+            case Not(operand):
+                self.dimension(operand)
+                return DIMENSIONLESS
+            case Conditional(condition, then, otherwise):
+                self.dimension(condition)
+                return self.agree("E404", [then, otherwise])
+            case Call():
+                return self.call(expr)
+
+    def product(self, expr: Binary) -> Dimension | None:
+        left = self.factor(expr.left)
+        if expr.operator == "^":
+            if isinstance(expr.right, Number):
+                return None if left is None else left.power(expr.right.value)
+            self.plain(expr.right)
+            self.plain(expr.left)  # x^n has a unit only for a written n
+            return DIMENSIONLESS
+        right = self.factor(expr.right)
+        if left is None or right is None:
+            return None
+        return left.multiply(right) if expr.operator == "*" else left.divide(right)
+
+    def call(self, expr: Call) -> Dimension | None:
+        first = expr.arguments[0]
+        match expr.function:
+            case "max" | "min":
+                return self.agree("E404", list(expr.arguments))
+            case "exp" | "log" | "sin" | "cos" | "tanh" | "floor":
+                self.plain(first)
+                return DIMENSIONLESS
+            case "sign" | "count":
+                self.dimension(first)
+                return DIMENSIONLESS
+            case "sqrt":
+                inside = self.factor(first)
+                return None if inside is None else inside.power(Fraction(1, 2))
+            case "der":
+                inside = self.dimension(first)
+                return inside if inside is None or inside == ANY else inside.divide(SECOND)
+            case "hold":
+                for delay in expr.arguments[1:]:
+                    if (found := self.dimension(delay)) not in (None, ANY, SECOND):
+                        assert found is not None
+                        self.add("E405", delay, "s, as a delay", found)
+                return self.dimension(first)
+            case "interpolate":
+                if (found := self.dimension(expr.arguments[1])) not in (None, ANY, SECOND):
+                    assert found is not None
+                    self.add("E405", expr.arguments[1], "s, as tables are over time", found)
+                return self.dimension(first)
+            case _:  # sample, previous, initial, mean, sum, abs: the same quantity
+                return self.dimension(first)

@@ -1,0 +1,148 @@
+"""What the name of a unit stands for.
+
+Takes: a name such as `ms`. Gives: `look_up`, its scale and dimension; `spelled`, its long name; `COMMON`.
+Guarantees: exact scales (an angle in degrees uses π to 50 digits); the units that scenes are written in are
+known here; pint, which knows what every unit is, is imported when the first rare one is read.
+Does not: know the grammar of units (see `unit_grammar`).
+"""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any
+
+from apc.compiler.errors import nearest
+from apc.compiler.language.dimensions import Dimension, product
+from apc.compiler.language.unit_grammar import Factor, FaultError
+from apc.compiler.words import cut
+
+_BASES = {
+    "gram": "kg",
+    "meter": "m",
+    "second": "s",
+    "ampere": "A",
+    "kelvin": "K",
+    "mole": "mol",
+    "candela": "cd",
+    "radian": "",  # a ratio of two lengths: the number 1
+}
+
+# What a scene is likely to use: proposed for a misspelt name, and told apart by case.
+COMMON = (
+    *("N", "mN", "kN", "kg", "g", "m", "mm", "cm", "um", "s", "ms", "us", "min", "Hz", "kHz", "rad", "deg"),
+    *("A", "mA", "V", "W", "kW", "J", "K", "Pa", "mol", "cd", "lb", "inch", "ft", "kgf", "rpm", "percent"),
+    *(
+        "newton",
+        "meter",
+        "second",
+        "gram",
+        "kilogram",
+        "hertz",
+        "radian",
+        "degree",
+        "millisecond",
+        "millimeter",
+    ),
+)
+
+
+@lru_cache(maxsize=1)
+def _registry() -> Any:
+    """Return pint's registry with exact numbers; it takes a third of a second to build."""
+    import pint
+
+    return pint.UnitRegistry(non_int_type=Fraction)
+
+
+def _full_name(name: str) -> str | None:
+    """Return pint's long name of a unit: `megasiemens` for MS; None when it knows none."""
+    if name == "°":
+        return "degree"
+    found = _registry().parse_unit_name(name)
+    # Nm is a yarn count to pint, and a slip for N*m to everyone else.
+    names = [prefix + unit for prefix, unit, _ in found if unit != "number_meter"]
+    return names[0] if names else None
+
+
+def spelled(name: str) -> str:
+    """Return the long name of a unit, as pint has it: `megasiemens` for MS."""
+    return _full_name(name) or name
+
+
+@lru_cache(maxsize=1024)
+def _scaled(name: str) -> Factor | None:
+    """Return scale and dimension of one name, or None when a value in it is no multiple of an SI unit."""
+    registry = _registry()
+    units = registry.UnitsContainer({spelled(name): 1})
+    try:
+        zero = registry.Quantity(Fraction(0), units).to_root_units().magnitude
+        one = registry.Quantity(Fraction(1), units).to_root_units()
+    except (TypeError, ValueError, ArithmeticError):  # pint takes the logarithm of a Fraction
+        return None
+    if zero != 0:
+        return None
+    scale, factors = Fraction(one.magnitude), []
+    for base, power in one._units.items():
+        if base not in _BASES:
+            return None
+        if base == "gram":
+            scale /= Fraction(1000) ** int(power)
+        if _BASES[base]:
+            factors.append((_BASES[base], int(power) if power == int(power) else Fraction(power)))
+    return scale, product(tuple(factors))
+
+
+def _of_haptics() -> dict[str, Factor]:
+    """Return the units that scenes are written in; pint says the same of each, and need not be loaded."""
+    newton = (("kg", 1), ("m", 1), ("s", -2))
+    units: dict[str, tuple[tuple[tuple[str, Fraction | int], ...], Fraction]] = {
+        "m": ((("m", 1),), Fraction(1)),
+        "s": ((("s", 1),), Fraction(1)),
+        "g": ((("kg", 1),), Fraction(1, 1000)),
+        "N": (newton, Fraction(1)),
+        "Hz": ((("s", -1),), Fraction(1)),
+    }
+    prefixes = {"": Fraction(1), "m": Fraction(1, 1000), "k": Fraction(1000), "u": Fraction(1, 10**6)}
+    return {
+        prefix + name: (factor * scale, Dimension(exponents))
+        for name, (exponents, scale) in units.items()
+        for prefix, factor in prefixes.items()
+    }
+
+
+_OF_HAPTICS = _of_haptics()
+
+
+def look_up(name: str, offset: int) -> Factor:
+    """Return the scale and dimension of a name that stands at `offset` of its text.
+
+    Raises
+    ------
+    FaultError
+        E223 no such unit, E224 a value in it is no multiple of an SI unit.
+    """
+    if name in _OF_HAPTICS:
+        return _OF_HAPTICS[name]
+    if len(name) > 40 or _full_name(name) is None:
+        hint = _proposal(name)
+        raise FaultError("E223", offset, f"there is no unit {cut(name)}", hint=hint)
+    factor = _scaled(name)
+    if factor is None:
+        what = f"{name} ({spelled(name)}) is no multiple of an SI unit"
+        raise FaultError("E224", offset, what, hint="K" if "degree_" in spelled(name) else "")
+    return factor
+
+
+def _proposal(name: str) -> str:
+    """Return what was probably meant: another case, an exponent, a product, or the nearest common name."""
+    for other in COMMON:
+        if other.lower() == name.lower():
+            return other
+    if (power := re.fullmatch(r"([^\W\d_]+)([2-9])", name)) and power.group(1) in COMMON:
+        return f"{power.group(1)}^{power.group(2)}"
+    for at in range(1, len(name)):
+        if name[:at] in COMMON and name[at:] in COMMON:
+            return f"{name[:at]}*{name[at:]}"
+    return nearest(name, COMMON)

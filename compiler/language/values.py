@@ -1,0 +1,334 @@
+"""Numbers in the text: quantities, words that stand for numbers, and expressions over named numbers.
+
+Takes: scalars of YAML. Gives: `Binding` (what was written) and `Value` (what it comes to).
+Guarantees: dimensions agree and bounds hold, or a mistake says so at its place.
+Does not: know sections, parts or peers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from graphlib import CycleError, TopologicalSorter
+
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, place_in
+from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+from apc.compiler.language.evaluation import evaluate
+from apc.compiler.language.expression import Expr, Name, format_expression, names, transform
+from apc.compiler.language.grammar import parse_expression
+from apc.compiler.language.unit_check import ANY, dimension_of
+from apc.compiler.language.unit_text import format_dimension, format_si
+from apc.compiler.language.units import parse_quantity, parse_unit, quantity
+from apc.compiler.source.nodes import Node, Scalar
+from apc.compiler.source.reading import add_unknown, brief, read_text
+
+PEERS = ("peers",)
+
+# A quantity starts with a number; what follows is nothing, a unit, or a ratio such as 1/90 s. An operator
+# behind the number makes it an expression.
+_QUANTITY = re.compile(
+    r"[+-]?\s*(\d|\.\d)[\d.]*([eE][+-]?\d+)?(\s*/\s*\d[\d.]*)?\s*([^\W\d_].*|[°%µΩ].*)?\Z", re.DOTALL
+)
+_WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """A number as written: `number` in SI, or an `expression` over names."""
+
+    number: Fraction | None
+    expression: Expr | None
+    dimension: Dimension
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A number, in SI; `expression` is its text when it depends on other parameters."""
+
+    number: Fraction
+    dimension: Dimension
+    expression: str | None
+    place: Place
+
+    def __str__(self) -> str:
+        """Return the number with its SI unit."""
+        return format_si(float(self.number), self.dimension)
+
+
+class AlreadyReportedError(Exception):
+    """Raised by a look-up for a name whose own fault was reported: what depends on it needs no message."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Where a number must lie, in SI; `unit` is the one its messages use."""
+
+    unit: str
+    scale: Fraction
+    minimum: Fraction | None = None
+    open_minimum: bool = False
+    maximum: Fraction | None = None
+
+    def fault(self, number: Fraction) -> str:
+        """Return what the bounds ask for if the number breaks them, else an empty text."""
+        least = self.minimum
+        if least is not None and (number < least or (self.open_minimum and number == least)):
+            shown = f"{self._shown(least)} {self.unit}"
+            return f"more than {shown}" if self.open_minimum else f"{shown} or more"
+        if self.maximum is not None and number > self.maximum:
+            return f"{self._shown(self.maximum)} {self.unit} or less"
+        return ""
+
+    def check(self, value: Value, what: str, mistakes: Mistakes) -> None:
+        """Record a number that breaks the bounds."""
+        expected = self.fault(value.number)
+        if expected:
+            got = f"{self._shown(value.number)} {self.unit}"
+            mistakes.add("E207", value.place, what, expected=expected, got=got)
+
+    def _shown(self, number: Fraction) -> str:
+        return f"{float(number / self.scale):.12g}"
+
+
+def is_quantity(text: str) -> bool:
+    """Return whether a text is meant as a number with or without a unit, not as an expression."""
+    return bool(_QUANTITY.match(text) or _WORD_NUMBER.match(text))
+
+
+def text_place(node: Node) -> Place:
+    """Return where a scalar's text starts: behind the opening quote, if it has one."""
+    quoted = isinstance(node, Scalar) and not node.plain
+    return node.place.shifted(1) if quoted else node.place
+
+
+def read_binding(
+    node: Node | None,
+    what: str,
+    dimension: Dimension,
+    unit: str,
+    known: Callable[[tuple[str, ...]], Dimension | None],
+    names_known: Collection[str],
+    mistakes: Mistakes,
+    *,
+    words: Collection[tuple[str, Fraction]] = (),
+) -> Binding | None:
+    """Read a number: a quantity, a word that stands for one, or an expression.
+
+    Parameters
+    ----------
+    node
+        Where it stands; None if it isn't there.
+    what
+        What it is, for messages.
+    dimension, unit
+        What it must be in.
+    known
+        The dimension of a name an expression may use, or None.
+    names_known
+        All these names, for messages.
+    mistakes
+        Where faults go.
+    words
+        Words that stand for numbers.
+    """
+    text = read_text(node, what, mistakes, hint=f"{what}: 1 {unit}")
+    if node is None or text is None:
+        return None
+    named = dict(words)
+    if text in named:
+        return Binding(named[text], None, dimension, node.place)
+    try:
+        if is_quantity(text):
+            _refuse_mixture(text, node.place, what, names_known)
+            number = quantity(text, node.place, what=what, unit=unit).value
+            return Binding(number, None, dimension, node.place)
+        return Binding(
+            None,
+            _expression(text, text_place(node), what, dimension, unit, known, names_known),
+            dimension,
+            text_place(node),
+        )
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+    except AlreadyReportedError:
+        return None
+
+
+def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
+    """Raise ApcError for a quantity with a unit that goes on as an expression, as 500 N/m/(peers - 1)."""
+    for word in re.finditer(r"[A-Za-z]\w*", text):
+        before = text[: word.start()].rstrip(" (")
+        if word.group() in names_known and before[-1:] in ("*", "/", "+", "-"):
+            number, rest = before[:-1].strip(), text[len(before) - 1 :].strip()
+            try:
+                parse_unit(word.group(), place)
+            except ApcError:
+                pass
+            else:
+                return
+            hint = f"{what}: total{rest}, with parameters: {{total: {number}}}"
+            expected = "a number with its unit, or an expression without units"
+            raise ApcError(Mistake("E204", place, what, expected, brief(text), hint))
+
+
+def _expression(
+    text: str,
+    place: Place,
+    what: str,
+    dimension: Dimension,
+    unit: str,
+    known: Callable[[tuple[str, ...]], Dimension | None],
+    names_known: Collection[str],
+) -> Expr:
+    tree = parse_expression(text, place)
+    check_names(tree, text, place, what, known, names_known)
+    found = dimension_of(tree, lambda name: known(name.parts), text, place)
+    if found not in (None, ANY, dimension):
+        its = "has no unit" if found == DIMENSIONLESS else f"is in {format_dimension(found or dimension)}"
+        got = f"{brief(text)}, which {its}"
+        raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: 1 {unit}"))
+    return tree
+
+
+def check_names(
+    tree: Expr,
+    text: str,
+    place: Place,
+    what: str,
+    known: Callable[[tuple[str, ...]], Dimension | None],
+    names_known: Collection[str],
+) -> None:
+    """Refuse the names of an expression that aren't known.
+
+    Parameters
+    ----------
+    tree, text, place
+        The expression, as it was written, and where.
+    what
+        What it is the value of, for a message.
+    known
+        Gives a name's dimension, None if there is no such name.
+    names_known
+        The names there are, to find the nearest.
+
+    Raises
+    ------
+    ApcError
+        E206 for every name that isn't known.
+    """
+    mistakes = Mistakes()
+    for node in names(tree):
+        if known(node.parts) is None:
+            shown = ".".join(node.parts)
+            told = f"{what} names {brief(shown)}, which is no parameter here"
+            add_unknown("E206", place_in(place, text, node.start), told, shown, names_known, mistakes)
+    mistakes.raise_if_any()
+
+
+def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -> Value:
+    """Return what a binding comes to, given what its names come to. Raises ApcError if it has no value."""
+    if binding.expression is None:
+        assert binding.number is not None
+        return Value(binding.number, binding.dimension, None, binding.place)
+    number = Fraction(evaluate(binding.expression, number_of, place=binding.place))
+    return Value(number, binding.dimension, format_expression(binding.expression), binding.place)
+
+
+def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | None:
+    """Read a number of any unit: a quantity, or an expression whose names are checked later."""
+    text = read_text(node, what, mistakes, hint=f"{what}: 2000 N/m")
+    if node is None or text is None:
+        return None
+    try:
+        if is_quantity(text):
+            found = parse_quantity(text, node.place)
+            return Binding(found.value, None, found.unit.dimension, node.place)
+        return Binding(None, parse_expression(text, text_place(node)), DIMENSIONLESS, text_place(node))
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+
+
+def resolve_in_order(
+    waiting: Mapping[str, Binding], peers: int, mistakes: Mistakes
+) -> tuple[dict[str, Value], set[str]]:
+    """Settle named numbers that depend on each other, in the order in which they can be known.
+
+    Parameters
+    ----------
+    waiting
+        The numbers as written, by name.
+    peers
+        What the name `peers` stands for.
+    mistakes
+        Takes E206 a name that isn't known, E209 a circle, and those of evaluating.
+
+    Returns
+    -------
+    settled
+        The values, in the order of `waiting`.
+    faulty
+        The names without one; each fault was reported once, where it is.
+    """
+    settled: dict[str, Value] = {}
+    faulty: set[str] = set()
+
+    def dimension(parts: tuple[str, ...]) -> Dimension | None:
+        if parts == PEERS:
+            return DIMENSIONLESS
+        name = ".".join(parts)
+        return settled[name].dimension if name in settled else None
+
+    def number(parts: tuple[str, ...]) -> Fraction:
+        return Fraction(peers) if parts == PEERS else settled[".".join(parts)].number
+
+    needs = {name: {n for n in _needed(binding) if n in waiting} for name, binding in waiting.items()}
+    sorter = TopologicalSorter(needs)
+    try:
+        order = list(sorter.static_order())
+    except CycleError as error:
+        chain = list(reversed(error.args[1]))
+        first = min(range(len(chain) - 1), key=lambda i: list(waiting).index(chain[i]))
+        chain = [*chain[first:-1], *chain[:first], chain[first]]
+        mistakes.add("E209", waiting[chain[0]].place, f"parameters depend in a circle: {' → '.join(chain)}")
+        return {}, set(waiting)
+    for name in order:
+        if needs[name] & faulty:
+            faulty.add(name)
+            continue
+        try:
+            settled[name] = _settled(name, waiting[name], dimension, number, ("peers", *settled))
+        except ApcError as error:
+            faulty.add(name)
+            mistakes.take(error)
+    return {name: settled[name] for name in waiting if name in settled}, faulty
+
+
+def _settled(
+    name: str,
+    binding: Binding,
+    dimension: Callable[[tuple[str, ...]], Dimension | None],
+    number: Callable[[tuple[str, ...]], Fraction],
+    known: Collection[str],
+) -> Value:
+    if binding.expression is None:
+        return settle(binding, number)
+    text = format_expression(binding.expression)
+    place = binding.place
+    check_names(binding.expression, text, place, name, dimension, known)
+    found = dimension_of(binding.expression, lambda n: dimension(n.parts), text, place)
+    known_dimension = DIMENSIONLESS if found is None or found == ANY else found
+    return settle(Binding(None, binding.expression, known_dimension, place), number)
+
+
+def _needed(binding: Binding) -> list[str]:
+    return [] if binding.expression is None else [".".join(n.parts) for n in names(binding.expression)]
+
+
+def renamed(tree: Expr, whole: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Expr:
+    """Return an expression with every name made whole."""
+    return transform(tree, lambda node: Name(whole(node.parts)) if isinstance(node, Name) else None)

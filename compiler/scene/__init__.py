@@ -1,0 +1,1 @@
+"""A topology section by section: who is there, what couples them, what carries."""

@@ -1,0 +1,263 @@
+"""Groups of peers: how many, and what each sets for itself.
+
+Takes: the `peers` section. Gives: `GroupBody` (counts), then `Settings` once the parts are known.
+Guarantees: a list or table of settings has one value a peer, each with the right unit and within bounds.
+Does not: know sections other than `peers`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.components.component import Number, Option, Reference, Settable, Variable
+from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.language.tables import Column, Table, read_table
+from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.language.values import Value
+from apc.compiler.source.nodes import Mapping as MappingNode
+from apc.compiler.source.nodes import Node, Scalar, Sequence
+from apc.compiler.source.reading import (
+    add_unknown,
+    brief,
+    check_keys,
+    entries,
+    form,
+    read_mapping,
+    read_name,
+    read_text,
+)
+
+LARGEST_COUNT = 10**9
+
+# By whole name, one number a peer, in SI.
+Columns = tuple[tuple[str, NDArray[np.float64]], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class GroupBody:
+    """A group before its settings are read."""
+
+    name: str
+    count: int
+    body: MappingNode
+    table: Table | None
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What a group sets: numbers, words (options and clocks), and numbers that differ from peer to peer."""
+
+    values: tuple[tuple[str, Value], ...]
+    words: tuple[tuple[str, str], ...]
+    columns: Columns
+
+
+def read_counts(
+    node: Node | None, folder: Path, mistakes: Mistakes, texts: dict[str, str]
+) -> dict[str, GroupBody]:
+    """Read how many peers each group has.
+
+    A group says `count`, or has a `table` with a row a peer, or lists in `set` with a value a peer.
+
+    Parameters
+    ----------
+    node
+        The section `peers`.
+    folder
+        Where its tables are found.
+    mistakes
+        Takes what is at fault.
+    texts
+        Takes the digest of each table read, by its name.
+    """
+    found: dict[str, GroupBody] = {}
+    hint = "peers: {user: {count: 3}}"
+    section = read_mapping(node, "peers", mistakes, hint=hint)
+    if section is not None and not section.entries:
+        mistakes.add("E201", section.place, "peers names no group", hint=hint)
+    for key, value in entries(section):
+        name = read_name(key, "a group of peers", mistakes)
+        body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{count: 3}}")
+        if name is None or body is None:
+            continue
+        body = check_keys(body, ("count", "set", "table"), f"group {name}", mistakes)
+        table = _read_table(body.get("table"), folder, mistakes, texts)
+        count = _read_count(body, name, table, mistakes)
+        if count is not None:
+            found[name] = GroupBody(name, count, body, table)
+    return found
+
+
+def _read_table(node: Node | None, folder: Path, mistakes: Mistakes, texts: dict[str, str]) -> Table | None:
+    text = read_text(node, "table", mistakes, hint="table: users.csv")
+    if node is None or text is None:
+        return None
+    try:
+        table = read_table(folder / text, node.place)
+    except ApcError as error:
+        mistakes.take(error)
+        return None
+    texts[text] = table.digest
+    return table
+
+
+def _read_count(body: MappingNode, name: str, table: Table | None, mistakes: Mistakes) -> int | None:
+    node = body.get("count")
+    if node is None:
+        if table is not None:
+            return table.rows
+        settings = body.get("set")
+        lists = [
+            len(value.items)
+            for _, value in (settings.entries if isinstance(settings, MappingNode) else ())
+            if isinstance(value, Sequence) and value.items
+        ]
+        if lists:
+            return lists[0]
+        if body.get("table") is None:
+            mistakes.add("E201", body.place, f"group {name} has no count", hint="count: 3")
+        return None
+    count = node.value if isinstance(node, Scalar) and node.plain else None
+    if isinstance(count, int) and not isinstance(count, bool) and 1 <= count <= LARGEST_COUNT:
+        if table is not None and table.rows != count:
+            what = f"group {name} has a count of {count} and a table of {table.rows} rows"
+            mistakes.add("E208", node.place, what, hint=f"count: {table.rows}")
+            return None
+        return count
+    expected = f"a whole number from 1 to {LARGEST_COUNT}"
+    mistakes.add("E208", node.place, "count", expected=expected, got=form(node), hint="count: 3")
+    return None
+
+
+def read_settings(
+    group: GroupBody,
+    settable: Mapping[str, list[tuple[str, Settable]]],
+    clocks: Collection[str],
+    read_number: Callable[[Node, str, Settable], Value | None],
+    explained: Callable[[str, Place], bool],
+    mistakes: Mistakes,
+) -> Settings:
+    """Read what a group sets.
+
+    Parameters
+    ----------
+    group
+        The group.
+    settable
+        What can be set: by the name a person writes, the whole names it stands for.
+    clocks
+        The clocks of the scene.
+    read_number
+        Reads a value for what is set.
+    explained
+        Says of a name that can't be set, and its place, whether a better message than ours was given.
+    mistakes
+        Where faults go.
+    """
+    values: list[tuple[str, Value]] = []
+    words: list[tuple[str, str]] = []
+    columns: dict[str, NDArray[np.float64]] = {}
+    section = read_mapping(group.body.get("set"), "set", mistakes, hint="set: {device.mass: 0.2 kg}")
+    for key, node in entries(section):
+        items = settable.get(key.text)
+        if items is None and explained(key.text, key.place):
+            continue
+        if items is None:
+            what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
+            add_unknown("E206", key.place, what, key.text, list(settable), mistakes)
+            continue
+        for whole, item in items:
+            if isinstance(item, Option | Reference):
+                word = _word(node, key.text, item, clocks, mistakes)
+                if word is not None:
+                    words.append((whole, word))
+            elif isinstance(node, Sequence):
+                column = _listed(node, key.text, item, group.count, read_number, mistakes)
+                if column is not None:
+                    columns[whole] = column
+            elif (value := read_number(node, key.text, item)) is not None:
+                values.append((whole, value))
+    for column_ in group.table.columns if group.table is not None else ():
+        for whole, item in _items_of(column_, settable, explained, mistakes):
+            if whole in columns or whole in dict(values):
+                mistakes.add("E702", column_.place, f"{whole} is given by set and by the table")
+            columns[whole] = column_.numbers
+            _check_column(column_, group.table.lines if group.table is not None else (), item, mistakes)
+    return Settings(tuple(values), tuple(words), tuple(columns.items()))
+
+
+def _word(
+    node: Node, what: str, item: Option | Reference, clocks: Collection[str], mistakes: Mistakes
+) -> str | None:
+    known = item.words if isinstance(item, Option) else clocks
+    word = read_text(node, what, mistakes, hint=f"{what}: {next(iter(known), 'name')}")
+    if word is None or word in known:
+        return word
+    role = "option" if isinstance(item, Option) else "clock"
+    add_unknown("E206", node.place, f"{what} has no {role} {brief(word)}", word, list(known), mistakes)
+    return None
+
+
+def _listed(
+    node: Sequence,
+    what: str,
+    item: Number | Variable,
+    count: int,
+    read_number: Callable[[Node, str, Settable], Value | None],
+    mistakes: Mistakes,
+) -> NDArray[np.float64] | None:
+    if len(node.items) != count:
+        expected, got = f"a value a peer, {count} in all", f"{len(node.items)}"
+        mistakes.add("E208", node.place, f"the list of {what}", expected=expected, got=got)
+        return None
+    values = [read_number(one, what, item) for one in node.items]
+    if any(value is None for value in values):
+        return None
+    return np.array([float(value.number) for value in values if value is not None])
+
+
+def _items_of(
+    column: Column,
+    settable: Mapping[str, list[tuple[str, Settable]]],
+    explained: Callable[[str, Place], bool],
+    mistakes: Mistakes,
+) -> list[tuple[str, Number | Variable]]:
+    items = settable.get(column.name)
+    numbers = [(whole, i) for whole, i in items or () if isinstance(i, Number | Variable)]
+    if not numbers and not explained(column.name, column.place):
+        known = [name for name, found in settable.items() if isinstance(found[0][1], Number | Variable)]
+        what = f"a heading names {brief(column.name)}, which is no number of a part"
+        add_unknown("E702", column.place, what, column.name, known, mistakes)
+    return numbers
+
+
+def _check_column(
+    column: Column, lines: tuple[int, ...], item: Number | Variable, mistakes: Mistakes
+) -> None:
+    """Check a column's unit, and each of its numbers against the parameter's bounds."""
+    if column.unit.dimension != item.unit.dimension:
+        expected = format_dimension(item.unit.dimension)
+        got = f"[{column.unit.text}]" if column.unit.text != "1" else "no unit"
+        hint = f"{column.name} [{item.unit.text}]"
+        mistakes.add(
+            "E702", column.place, f"the heading {column.name}", expected=f"[{expected}]", got=got, hint=hint
+        )
+        return
+    if not isinstance(item, Number):
+        return
+    bounds = item.bounds
+    low = -np.inf if bounds.minimum is None else float(bounds.minimum)
+    high = np.inf if bounds.maximum is None else float(bounds.maximum)
+    numbers = column.numbers
+    outside = (numbers < low) | (numbers > high) | (bounds.open_minimum & (numbers == low))
+    for row in np.flatnonzero(outside)[:5]:
+        number = Fraction(float(numbers[row]))
+        place = Place(column.place.file, lines[int(row)], 1)
+        got = f"{float(number / bounds.scale):.12g} {bounds.unit}"
+        mistakes.add("E207", place, column.name, expected=bounds.fault(number), got=got)

@@ -1,0 +1,1 @@
+"""YAML to nodes with places, and typed values out of them."""

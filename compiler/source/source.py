@@ -1,0 +1,147 @@
+"""A file, or its bytes, to the YAML nodes in it.
+
+Takes: a path, or bytes. Gives: `Source`: the text, its digest and its tree of nodes (see `nodes`).
+Guarantees: a regular file of bounded size, UTF-8 without control characters, one YAML document; nothing is
+waited for (a named pipe is refused).
+Does not: know what a topology is, or what any key means.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import stat
+import unicodedata
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.source.compose import compose
+from apc.compiler.source.nodes import Lines, Node
+
+MAX_BYTES = 1 << 20  # 1 MiB; the largest scene we know of is a hundredth of it
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A text that was read: `file` is its name in messages, `digest` the SHA-256 of its bytes (hex)."""
+
+    file: str
+    path: Path | None
+    text: str
+    digest: str
+    root: Node
+
+
+def read_source(path: Path, *, shown: str | None = None) -> Source:
+    """Read a YAML file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    shown
+        Its name in messages; the path as given by default.
+
+    Raises
+    ------
+    ApcError
+        E101 no such file, E102 a folder, E103 not readable, E104 not a regular file;
+        and those of `parse_source`.
+    """
+    file = str(path) if shown is None else shown
+    place = Place(file)
+    try:
+        if path.is_dir():
+            raise ApcError(Mistake("E102", place, "this", "a YAML file", "a folder"))
+        with path.open("rb") if os.name == "nt" else _open(path) as stream:
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                raise ApcError(Mistake("E104", place, "this", "a YAML file", "a device, pipe or socket"))
+            data = stream.read(MAX_BYTES + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        raise ApcError(Mistake("E101", place, _missing(path))) from None
+    except PermissionError:
+        raise ApcError(Mistake("E103", place, "this file may not be read (no permission)")) from None
+    except (OSError, ValueError) as error:  # a name too long, a loop of links, a NUL in the name
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ApcError(Mistake("E103", place, f"this file cannot be read: {reason}")) from None
+    return parse_source(data, file=file, path=path)
+
+
+def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
+    """Parse the bytes of a YAML file.
+
+    Parameters
+    ----------
+    data
+        UTF-8, with or without a byte order mark; lines end with LF, CRLF or CR.
+    file
+        The name shown in messages.
+    path
+        Where it came from, if from a file.
+
+    Raises
+    ------
+    ApcError
+        E105 too large, E106 not UTF-8, E107 control character, E108 empty, E109 not YAML,
+        E110 several documents, E111 a key twice, E112 a key that is no name, E113 a tag,
+        E114 an alias without end or without anchor, E115 nested too deep, E116 a merge key,
+        E117 too many nodes.
+    """
+    if len(data) > MAX_BYTES:
+        what = f"this file is larger than {MAX_BYTES} bytes, the most a YAML file may have here"
+        raise ApcError(Mistake("E105", Place(file), what))
+    text = _decode(data, file)
+    lines = Lines(file, text)
+    _refuse_control_characters(text, lines)
+    root = compose(text, lines)
+    return Source(file, path, text, hashlib.sha256(data).hexdigest(), root)
+
+
+def _open(path: Path) -> IO[bytes]:
+    """Open for reading without waiting: a named pipe nobody writes to would block for ever."""
+    return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+
+
+def _missing(path: Path) -> str:
+    """Say that a file is not there, with the nearest name in its folder."""
+    folder = path.parent
+    try:
+        known = sorted(entry.name for entry in folder.iterdir())
+    except OSError:
+        return f"there is no folder {str(folder)!r}"
+    close = nearest(path.name, known)
+    return (
+        f"there is no such file; did you mean {str(folder / close)!r}?" if close else "there is no such file"
+    )
+
+
+def _decode(data: bytes, file: str) -> str:
+    """Return the text without its byte order mark, or say which byte is not UTF-8."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        # With a mark in front, Python counts from behind it.
+        start = error.start + (len(data) - len(error.object))
+        before = re.split(rb"\r\n|\n|\r", data[:start])
+        line, column = len(before), len(before[-1].decode("utf-8-sig", "replace")) + 1
+        got = f"byte 0x{data[start]:02x} at offset {start}"
+        raise ApcError(Mistake("E106", Place(file, line, column), "a YAML file", "UTF-8 text", got)) from None
+
+
+# YAML's line breaks beyond LF and CR (U+0085, U+2028, U+2029) show in few editors: refused with the rest.
+_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
+
+
+def _refuse_control_characters(text: str, lines: Lines) -> None:
+    """Raise E107 for the first character that no editor shows."""
+    if (found := _CONTROL.search(text)) is None:
+        return
+    before = re.split(r"\r\n|\n|\r", text[: found.start()])
+    character = found.group()
+    name = unicodedata.name(character, "a control character")
+    got = f"U+{ord(character):04X} ({name})" + (": is this a binary file" if character == "\0" else "")
+    place = lines.place(len(before) - 1, len(before[-1]))
+    raise ApcError(Mistake("E107", place, "a YAML file", "visible text", got))

@@ -1,0 +1,1 @@
+"""What a person or an editor is shown of a scene: listing, diagram, picture, schema."""

@@ -1,0 +1,244 @@
+"""A scene as a graph: parts joined within a peer, peers joined over links.
+
+Takes: `Scene`. Gives: `Diagram`, `build_diagram`; `seconds`, `common_period`.
+Guarantees: every part of the topology is in it, a long array as one node; the same scene gives the same text.
+Does not: place anything on a page (see `picture`, `graphviz`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+
+from apc.compiler.components.component import Number, Reference
+from apc.compiler.components.parts import GROUND
+from apc.compiler.language.dimensions import SECOND, Dimension
+from apc.compiler.language.unit_text import format_si
+from apc.compiler.language.values import Value
+from apc.compiler.scene.instances import Part
+from apc.compiler.scene.links import SceneLink
+from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.sections import DEFAULT_TYPES
+
+ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
+STIFFNESS = Dimension((("kg", 1), ("s", -2)))
+DAMPING = Dimension((("kg", 1), ("s", -1)))
+LONGEST_ARRAY = 4  # with more elements an array is one node
+MOST_LINES = 7  # of numbers in one node
+LONGEST_EXPRESSION = 24  # characters shown beside its value
+
+
+@dataclass(frozen=True, slots=True)
+class Vertex:
+    """A part, or where parts meet.
+
+    `role` is mass, coupler, hand, ground or joint; `lines` are what to write below its name: its type, then
+    its numbers; `spring` and `damper` say what it is drawn with.
+    """
+
+    name: str
+    role: str
+    lines: tuple[str, ...]
+    clock: str
+    links: tuple[str, ...]
+    spring: bool = False
+    damper: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Net:
+    """A link: what to write below its name, and who hears whom, peers counted from 0.
+
+    `pairs` are (sender, receiver) of a graph given arc by arc, and empty for the other shapes.
+    """
+
+    name: str
+    lines: tuple[str, ...]
+    clock: str
+    shape: str
+    pairs: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Crowd:
+    """A group of peers: how many, and its own settings as texts."""
+
+    name: str
+    count: int
+    settings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """A clock, in seconds."""
+
+    name: str
+    period: Fraction
+    phase: Fraction
+
+
+@dataclass(frozen=True, slots=True)
+class Diagram:
+    """One peer's parts, and the peers. `joints` are pairs of nodes by name."""
+
+    title: str
+    about: str
+    nodes: tuple[Vertex, ...]
+    joints: tuple[tuple[str, str], ...]
+    nets: tuple[Net, ...]
+    crowds: tuple[Crowd, ...]
+    pulses: tuple[Pulse, ...]
+
+    @property
+    def peers(self) -> int:
+        """The number of peers."""
+        return sum(crowd.count for crowd in self.crowds)
+
+
+def build_diagram(scene: Scene) -> Diagram:
+    """Return the graph of a scene."""
+    parts = [part for part in scene.parts if "." not in part.name]
+    sizes: dict[str, int] = {}
+    for part in parts:
+        sizes[_array(part.name)] = sizes.get(_array(part.name), 0) + 1
+    nodes: dict[str, Vertex] = {}
+    joints: dict[tuple[str, str], None] = {}
+
+    def shown(name: str) -> str:
+        return _array(name) if sizes.get(_array(name), 0) > LONGEST_ARRAY else name
+
+    for part in parts:
+        name = shown(part.name)
+        if name not in nodes:
+            nodes[name] = _node(scene, part, name, sizes[_array(part.name)] if name != part.name else 1)
+    for part in parts:
+        for _, other, _ in part.connections:
+            one, two = shown(part.name), shown(other.partition(".")[0])
+            if other == GROUND:
+                two = f"{GROUND} of {one}"  # each has its own: the ground joins nothing
+                nodes.setdefault(two, Vertex(two, GROUND, (), "", ()))
+            elif (nodes[one].role == "mass") == (nodes[two].role == "mass"):
+                # Parts of one role are joined rigidly, at a point of its own: the graph has two sides.
+                middle = f"{one} and {two}"
+                nodes.setdefault(middle, Vertex(middle, "joint", (), "", ()))
+                joints[(middle, one)] = None
+                one = middle
+            joints[(two, one)] = None
+    return Diagram(
+        scene.name,
+        scene.about,
+        tuple(nodes.values()),
+        tuple(joints),
+        tuple(_net(link) for link in scene.links),
+        tuple(_crowds(scene)),
+        tuple(Pulse(c.name, c.period.number, c.phase.number) for c in scene.clocks),
+    )
+
+
+def _array(name: str) -> str:
+    return name.partition("[")[0]
+
+
+def _node(scene: Scene, part: Part, name: str, count: int) -> Vertex:
+    component = part.component
+    role = ROLES[part.section]
+    lines = [] if component.name == DEFAULT_TYPES.get(part.section) else [component.name]
+    if count > 1:
+        lines[:0] = [f"{count} of them"]
+    if part.groups != tuple(group.name for group in scene.groups):
+        lines.append(f"only at {', '.join(part.groups)}")
+    numbers = list(_numbers(scene, part))
+    if len(numbers) > MOST_LINES:
+        numbers = [*numbers[: MOST_LINES - 1], f"… and {len(numbers) - MOST_LINES + 1} more"]
+    by_role = {p.name: p.role for p in component.parameters if isinstance(p, Reference)}
+    named = [(by_role.get(own), word) for own, word in part.references]
+    dimensions = {p.unit.dimension for p in component.numbers}
+    return Vertex(
+        name,
+        role,
+        (*lines, *numbers),
+        next((word for its_role, word in named if its_role == "clock"), ""),
+        tuple(dict.fromkeys(word for its_role, word in named if its_role == "link")),
+        spring=STIFFNESS in dimensions and role != "mass",
+        damper=DAMPING in dimensions and role != "mass",
+    )
+
+
+def _numbers(scene: Scene, part: Part) -> Iterator[str]:
+    """Yield a part's numbers, those that are zero left out, and its words that are no default."""
+    for own, value in part.values:
+        if value.number:
+            yield f"{own} {_quantity(part, own, value)}{_expression(value)}"
+        parameter = part.component.parameter(own)
+        if part.shared and isinstance(parameter, Number) and parameter.divided:
+            each = Value(value.number / scene.peers, value.dimension, None, value.place)
+            yield f"shared: {_quantity(part, own, each)} a copy"
+    for own, value in part.starts:
+        yield f"{own} starts at {_quantity(part, own, value)}"
+    for own, word in part.options:
+        if word != getattr(part.component.parameter(own), "default", None):
+            yield f"{own} {word}"
+    for table in part.tables:
+        yield f"{table.name}: a table of {len(table.times)} rows"
+
+
+def _expression(value: Value) -> str:
+    text = value.expression
+    return f" = {text}" if text and len(text) <= LONGEST_EXPRESSION else ""
+
+
+def _quantity(part: Part, own: str, value: Value) -> str:
+    """Return a number in the unit that its component declares."""
+    declared = part.component.parameter(own) or part.component.variable(own)
+    for word, number in declared.words if isinstance(declared, Number) else ():
+        if number == value.number:
+            return word
+    unit = getattr(declared, "unit", None)
+    if value.dimension == SECOND:
+        return seconds(value.number)
+    if unit is None:
+        return format_si(float(value.number), value.dimension)
+    text = "" if unit.text == "1" else f" {unit.text.replace('*', '·')}"
+    return f"{float(value.number / unit.scale):.6g}{text}"
+
+
+def common_period(periods: Iterable[Fraction]) -> Fraction | None:
+    """Return the least common multiple of clocks' periods, None of no clocks."""
+    found = list(periods)
+    if not found:
+        return None
+    return Fraction(math.lcm(*(p.numerator for p in found)), math.gcd(*(p.denominator for p in found)))
+
+
+def seconds(number: Fraction) -> str:
+    """Return a time for a person: in ms below a second."""
+    return f"{float(number) * 1e3:.6g} ms" if abs(number) < 1 else f"{float(number):.6g} s"
+
+
+def _net(link: SceneLink) -> Net:
+    lines = [f"a packet each tick of {link.clock}", f"available {seconds(link.delay.number)} later"]
+    if not link.delay.number:
+        lines[-1] = "available at once"
+    lines += [f"{d.sender} to {d.receiver}: {seconds(d.delay.number)} later" for d in link.delays]
+    lines += [] if link.channel is None else link.channel.told
+    pairs = tuple((int(sender), int(receiver)) for sender, receiver in link.graph.arcs)
+    return Net(link.name, tuple(lines), link.clock, link.graph.shape, pairs)
+
+
+def _crowds(scene: Scene) -> Iterator[Crowd]:
+    by_name = {part.name: part for part in scene.parts}
+    for group in scene.groups:
+        settings = []
+        for name, value in group.values:
+            whole, _, own = name.rpartition(".")
+            settings.append(f"{name} {_quantity(by_name[whole], own, value)}{_expression(value)}")
+        settings += [f"{name} {word}" for name, word in group.words]
+        settings += [f"{name} of its own for each peer" for name, _ in group.columns]
+        yield Crowd(group.name, group.count, tuple(settings))
+
+
+def one_of(diagram: Diagram) -> str:
+    """Return what the peer drawn is, in words."""
+    return "the only peer" if diagram.peers == 1 else f"one of {diagram.peers} peers"
