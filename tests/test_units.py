@@ -207,7 +207,8 @@ def test_any_text_is_a_quantity_or_refused_and_nothing_else(text: str) -> None:
 def test_pint_is_imported_only_when_a_rare_unit_is_read() -> None:
     code = (
         "import sys; from apc.compiler.errors import Place;"
-        " from apc.compiler.language.units import parse_quantity; parse_quantity('500 N*s/m', Place('x', 1, 1)); assert 'pint' not in sys.modules;"
+        " from apc.compiler.language.units import parse_quantity;"
+        " parse_quantity('500 N*s/m', Place('x', 1, 1)); assert 'pint' not in sys.modules;"
         " parse_quantity('1 inch', Place('x', 1, 1)); assert 'pint' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
