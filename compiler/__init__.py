@@ -1,13 +1,15 @@
 """Text to CasADi, a folder a stage; a module imports only what stands before it.
 
 errors words                what all are written in
+multiples                   common multiples and divisors of exact times
 source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
 language                    expression, lexer, grammar: text to trees; evaluation: trees to values
                             dimensions, unit_grammar, unit_names, units, unit_text, unit_check
                             values, tables, recordings: numbers of a scene, and in CSV files
 components                  component, parts, declarations, component_check, definitions, library
 scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
-                            studies: a section each; scene: all of them
+                            studies: a section each; followers: what a group's settings change inside
+                            parts; scene: all of them
 equations                   connections: where connectors meet; flatten
                             reductions: what is heard of the others; clock_inference: what ticks together;
                             clocks

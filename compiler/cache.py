@@ -13,12 +13,14 @@ What a model was made from, by name:
     ./parts/        a folder of the user's own components: all definitions in it
     Mass            a definition of the built-in library
     apc             the compiler itself: all its modules
+    casadi, sympy   the libraries that write the functions, by their versions
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
 import json
 import lzma
 import struct
@@ -28,10 +30,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
-FORMAT = 4  # of NAME.apc
+FORMAT = 5  # of NAME.apc
 MEMBER = "model.json"  # of the archive: structure, numbers and the digests of the other members
 LARGEST = 256 * 2**20
 PROGRAM = "apc"
+LIBRARIES = ("casadi", "sympy")  # a newer one may write other functions
 # What zipfile, its decompressors, json and our own reading of the document raise at what isn't theirs.
 DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError),
@@ -76,11 +79,13 @@ def changed(record: Record, folder: Path) -> str:
     folder
         Where its topology is.
     """
-    if not {PROGRAM, record.topology} <= dict(record.texts).keys():
+    if not {PROGRAM, *LIBRARIES, record.topology} <= dict(record.texts).keys():
         return "apc itself"  # a model that doesn't say what it was made from wasn't made by this one
     for name, digest in record.texts:
         if name == PROGRAM:
             now, shown = program_digest(), "apc itself"
+        elif name in LIBRARIES:
+            now, shown = library_digest(name), name
         elif name == record.topology or _is_path(name):
             now, shown = _path_digest(folder / name), name.removeprefix("./")
         else:
@@ -119,7 +124,8 @@ def origin_texts(
         shown = _relative(name).rstrip("/") + "/"
         texts.append((shown, _path_digest(where / shown)))
     texts += [(name, digest) for name, digest in definitions if builtin_digest(name) == digest]
-    return (*dict.fromkeys(texts), (PROGRAM, program_digest()))
+    libraries = [(name, library_digest(name)) for name in LIBRARIES]
+    return (*dict.fromkeys(texts), *libraries, (PROGRAM, program_digest()))
 
 
 @functools.cache
@@ -149,6 +155,22 @@ def program_digest() -> str:
         whole.update(f"\0{path.relative_to(compiler)}\0".encode())
         whole.update(path.read_bytes())
     return whole.hexdigest()
+
+
+@functools.cache
+def library_digest(name: str) -> str:
+    """Return the SHA-256 of an installed library's version; empty if it is not installed.
+
+    The version is in the name of the folder beside it, such as `casadi-3.7.0.dist-info`: importing the
+    library, or `importlib.metadata`, takes longer than all else here. One that was built by hand may have no
+    such folder, and then has no version.
+    """
+    spec = importlib.util.find_spec(name)
+    if spec is None or spec.origin is None:
+        return ""
+    folder = Path(spec.origin).parent.parent
+    versions = sorted(path.name for path in folder.glob(f"{name}-*-info"))
+    return hashlib.sha256("/".join(versions).encode()).hexdigest()
 
 
 def _is_path(name: str) -> bool:

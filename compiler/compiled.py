@@ -123,6 +123,9 @@ class Parameter:
     """A number of the scene: SI value; `expression` is its text if it depends on other parameters.
 
     `minimum` is the least value allowed; `open_minimum` says that the least value itself is excluded.
+    `exact` is the rational that `value` is the nearest float to, as 5/3; None where `value` was given as a
+    float, in the shortest decimal that means it. Times that depend on a parameter are computed from `number`:
+    a tick decides by equality.
     """
 
     name: str
@@ -133,6 +136,12 @@ class Parameter:
     open_minimum: bool = False
     maximum: float | None = None
     about: str = ""
+    exact: Fraction | None = None
+
+    @property
+    def number(self) -> Fraction:
+        """The value, exact."""
+        return Fraction(repr(float(self.value))) if self.exact is None else self.exact
 
 
 @dataclass(frozen=True, slots=True)

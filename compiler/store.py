@@ -1,9 +1,10 @@
 """NAME.apc: the compiled model on disk.
 
 Takes: `CompiledSystem`. Gives: a file, and the same system back.
-Guarantees: written whole or not at all; a damaged file, one of another format version, or one that is older
-than its topology is refused by name; nothing is unpickled, and no library or topology is needed to load.
-Does not: compile.
+Guarantees: written whole or not at all; a damaged file, or one of another format version, is refused by name;
+every name, row and peer that one part of a model names is there in the other; nothing is unpickled, and no
+library or topology is needed to load.
+Does not: compile, or ask whether the topology has changed since (see `cache`).
 
 The file is a ZIP archive: `model.json` holds the structure, the numbers and the SHA-256 of every other
 member; each CasADi function is a member in CasADi's own serialization, each array one in NumPy's.
@@ -29,7 +30,7 @@ import casadi
 import numpy as np
 
 from apc.compiler.cache import DAMAGE, FORMAT, LARGEST, MEMBER
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import CompiledSystem, Graph, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 
 # CasADi's reader can crash on text that isn't its own, so every member is checked against its digest first.
@@ -122,6 +123,7 @@ def _is_consistent(system: CompiledSystem) -> bool:
     channels = [link.channel for link in system.links if link.channel is not None]
     named += [channel.jitter for channel in channels if channel.jitter is not None]
     losses = [dataclasses.astuple(channel.loss) for channel in channels if channel.loss is not None]
+    numbers = [*system.parameters, *(value for group in system.groups for value in group.values)]
     return (
         bool(system.groups)
         and timings.issuperset(named)
@@ -131,30 +133,76 @@ def _is_consistent(system: CompiledSystem) -> bool:
         and all({pair.sender, pair.receiver} <= groups for link in system.links for pair in link.delays)
         and all(0 <= group.kind < len(system.kinds) and group.count > 0 for group in system.groups)
         and all(len(column.values) == group.count for group in system.groups for column in group.columns)
-        and all(_is_kind_consistent(kind, timings, clocks, links, parameters) for kind in system.kinds)
+        and parameters.issuperset(column.name for group in system.groups for column in group.columns)
+        and parameters.issuperset(value.name for group in system.groups for value in group.values)
+        and all(one.exact is None or float(one.exact) == one.value for one in numbers)
+        and all(_is_graph_consistent(link.graph, system.peers) for link in system.links)
+        and all(_is_kind_consistent(kind, timings, clocks, parameters) for kind in system.kinds)
+        and links.issuperset(sending.link for kind in system.kinds for sending in kind.sends)
+        and all(_is_heard(kind, system) for kind in system.kinds)
     )
 
 
-def _is_kind_consistent(
-    kind: Kind, timings: set[str], clocks: set[str], links: set[str], parameters: set[str]
-) -> bool:
+def _is_graph_consistent(graph: Graph, peers: int) -> bool:
+    """Return whether the arcs of a graph, if it has any, are between peers that there are, each weighted."""
+    count = len(graph.weights)
+    pairs = graph.arcs.reshape(-1, 2) if graph.arcs.size else np.empty((0, 2))
+    return (
+        graph.shape in ("complete", "ring", "star", "arcs")
+        and (graph.shape == "arcs" or not count)
+        and len(pairs) == count
+        and bool(((pairs >= 0) & (pairs < peers)).all())
+    )
+
+
+def _is_heard(kind: Kind, system: CompiledSystem) -> bool:
+    """Return whether all that a kind hears is sent, row by row; an edge takes all of the sender's rows.
+
+    Of a complete graph those are heard that send over the link, one at least; of another graph all send.
+    """
+    rows = {
+        link.name: [
+            len(sending.channels)
+            for group in system.groups
+            for sending in system.kinds[group.kind].sends
+            if sending.link == link.name
+        ]
+        for link in system.links
+    }
+    n_x, n_u, n_p = len(kind.states), len(kind.holds), len(kind.parameters)
+    return all(
+        bool(rows.get(receive.link))
+        and 0 <= receive.channel < min(rows[receive.link])
+        and (
+            receive.edge is None
+            or _sizes(receive.edge)
+            == ([n_x, n_u, len(partition.memories), max(rows[receive.link]), n_p, 1], [1])
+        )
+        for partition in kind.clocks
+        for receive in partition.receives
+    )
+
+
+def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], parameters: set[str]) -> bool:
     """Return the same for one kind; its functions must have the sizes its names ask for."""
     partitions = {partition.clock: partition for partition in kind.clocks}
-    sends = {sending.link: sending for sending in kind.sends}
     n_x, n_u, n_p = len(kind.states), len(kind.holds), len(kind.parameters)
-    receives = [receive for partition in kind.clocks for receive in partition.receives]
+    parameters_of = set(kind.parameters)  # what starts is looked up among them
     return (
         parameters.issuperset(kind.parameters)
-        and parameters.issuperset(state.start for state in kind.states)
+        and parameters_of.issuperset(state.start for state in kind.states)
         and partitions.keys() <= clocks
-        and sends.keys() <= links
         and all(len(partition.units) == len(partition.outputs) for partition in kind.clocks)
+        and all(len(partition.starts) == len(partition.memories) for partition in kind.clocks)
+        and all(parameters_of.issuperset(partition.starts) for partition in kind.clocks)
+        and all(
+            0 <= memory < len(partition.outputs) for partition in kind.clocks for memory in partition.memories
+        )
         and (
             kind.ports is None or _sizes(kind.ports.port) == ([n_x, n_u, n_p, 1], [2 * len(kind.ports.parts)])
         )
         and all(hold.delay in timings and hold.clock in partitions for hold in kind.holds)
         and all(0 <= hold.output < len(partitions[hold.clock].outputs) for hold in kind.holds)
-        and all(receive.link in links for receive in receives)
         and _sizes(kind.derivative) == ([n_x, n_u, n_p, 1], [n_x])
         and all(
             _sizes(partition.tick)

@@ -32,7 +32,7 @@ def given(option: str, text: str, *, what: str, unit: str) -> Fraction:
     ApcError
         Those of `units.quantity`.
     """
-    # Imported here: reading a unit brings in pint, which most commands do not need.
+    # Imported here: the language of quantities, which most commands do not need.
     from apc.compiler.language.units import quantity
 
     try:

@@ -15,7 +15,7 @@ from tests.topologies import AVERAGE, ROOT
 
 # Folder by folder, and in each its modules, earliest first: each may import only those before it.
 HOUSE = (
-    ("apc.compiler", "errors words compiled cache"),
+    ("apc.compiler", "errors words multiples compiled cache"),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
         "apc.compiler.language",
@@ -27,7 +27,7 @@ HOUSE = (
     ("apc.compiler.components", "component parts declarations component_check definitions library"),
     (
         "apc.compiler.scene",
-        "named_numbers timebase instances sections channels graphs links groups studies scene",
+        "named_numbers timebase instances sections channels graphs links groups followers studies scene",
     ),
     (
         "apc.compiler.equations",
@@ -44,16 +44,17 @@ HOUSE = (
         "apc.runtime.frame",
         """
         exact names row_arithmetic rows bounds overrides parameters
-        discretize exchange jitter channel_law packets listener timetable
+        discretize exchange
         guards site jacobians start linearize
-        schedule liveness hearing hyperperiod scheduling gathering
+        schedule liveness hearing hyperperiod scheduling
         lift batch_lift residues
         """,
     ),
+    ("apc.runtime.network", "channel_law packets listener timetable weights gathering"),
     (
         "apc.runtime.eigen",
         """
-        runs peer_group listening peers loop closing coupling graph_loops twins modes
+        runs graph_modes peer_group listening peers loop closing coupling graph_loops twins modes
         rigid components pseudospectrum enclosure balls roots certify ratios duals spectrum
         """,
     ),
@@ -82,8 +83,8 @@ HOUSE = (
     (
         "apc.runtime.simulate",
         """
-        methods scales stepping integrate propagate flow instants quadrature forcing
-        local_signals pairs program writing native member ear population
+        methods settings scales stepping integrate propagate flow instants quadrature forcing
+        local_signals pairs program writing native member frame_packets population
         signals simulation length blocks accuracy summary trajectory formats recording figures still
         ensemble
         """,
@@ -96,7 +97,7 @@ HOUSE = (
         """,
     ),
     ("apc.runtime.answers", "answer report"),
-    ("apc.runtime.bench", "pushes events reference bench hard scale report figure"),
+    ("apc.runtime.bench", "timing pushes events reference bench hard scale report figure"),
     # what a person calls
     (
         "apc",

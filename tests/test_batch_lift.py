@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from typing import Any
 
+import mpmath
 import numpy as np
 import pytest
 
-from apc.runtime.frame.batch_lift import exponential_rows
+from apc.runtime.frame.batch_lift import compose_rows, exponential_rows
 from apc.runtime.frame.discretize import UNIT, discretize
 from apc.runtime.frame.lift import lift
 from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of_row
 from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.frame.schedule import Propagate
+from apc.runtime.frame.site import every_matrix
+from apc.runtime.large.crowds import Crowd
 from tests.populations import crowded, different
 from tests.sites import MS
 
@@ -49,6 +54,55 @@ def test_exponentials_are_within_their_bound_of_ball_arithmetic(decay: float) ->
     step, size, charge = exponential_rows(a[None], b[None], 0.01)
     assert np.all(np.abs(step[0] - truth.matrix) <= charge * UNIT * size[0] + UNIT * truth.size)
     assert np.all(charge * UNIT * size[0] < 1e-10)
+
+
+def _many_digits(matrix: Any) -> Any:
+    """Return a matrix of rationals as mpmath numbers, with a leading axis."""
+    plain = np.asarray(matrix, dtype=object)
+    found = [mpmath.mpf(one.numerator) / one.denominator for one in plain.reshape(-1)]
+    return np.array(found, dtype=object).reshape(1, *plain.shape)
+
+
+def _true_frame(crowd: Crowd, vector: Any) -> tuple[Any, Any]:
+    """Return z⁺ and s of one site over (z, r), its events followed in many digits."""
+    site = every_matrix(linearize_exact(crowd.jacobians, vector), _many_digits)
+    n_x, n_u = site.b.shape[-2:]
+    steps = {}
+    for duration in {one.duration for one in crowd.schedule.events if isinstance(one, Propagate)}:
+        seconds = duration * crowd.schedule.quantum
+        whole = mpmath.zeros(n_x + n_u)
+        for i, row in enumerate(np.concatenate([site.a[0], site.b[0]], axis=1)):
+            for j, entry in enumerate(row):
+                whole[i, j] = entry * seconds.numerator / seconds.denominator
+        moved = mpmath.expm(whole, method="taylor")[:n_x, :]
+        steps[duration] = np.array(moved.tolist(), dtype=object).reshape(1, n_x, n_x + n_u)
+    z, s = compose_rows(site, crowd.schedule, steps)
+    return z[0], s[0]
+
+
+@pytest.mark.parametrize(
+    ("grams", "seed", "values"),
+    [
+        # Of two frames moved at random, the changes in some entry of these were both too small by chance.
+        ("0.01", 0, {"comp": Fraction(0), "comm": Fraction(0)}),
+        ("0.01", 5, {"kt": 2000.0}),
+        ("0.01", 9, {"bc": 0.2}),
+        ("0.1", 4, {}),
+        ("1", 2, {"kc": 3000.0}),
+    ],
+)
+def test_the_estimate_covers_the_error_against_eighty_digits(grams: str, seed: int, values: Any) -> None:
+    system = apply(different(6, seed=seed, **values), [Override("cube.mass", None, Fraction(grams) / 1000)])
+    [crowd], _ = crowded(system)
+    lifted = crowd.lifted
+    assert lifted.estimated
+    with mpmath.workdps(80):
+        for row, vector in enumerate(crowd.parameters):
+            z, s = _true_frame(crowd, vector)
+            n_z = len(z)
+            for name, true in zip(NAMES, (z[:, :n_z], z[:, n_z:], s[:, :n_z], s[:, n_z:]), strict=True):
+                error = np.abs(getattr(lifted, name)[row] - true).astype(float)
+                assert np.all(error <= getattr(lifted, f"{name}_error")[row])
 
 
 def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:

@@ -14,11 +14,19 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.runtime.bench.bench import SAME, Bench, Measured, bench, bench_analysis, pareto_front
+from apc.runtime.bench.bench import (
+    SAME,
+    Bench,
+    Measured,
+    bench,
+    bench_analysis,
+    bench_simulation,
+    pareto_front,
+)
 from apc.runtime.bench.figure import draw_bench, save_bench
 from apc.runtime.bench.report import bench_report, scale_report
 from apc.runtime.bench.scale import scale, with_count
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +79,60 @@ def test_every_method_that_serves_the_scene_is_measured_beside_its_error(found: 
     # Of order four and one: a step of a quarter and of a tenth.
     assert errors["rk4:1 ms"] / errors["rk4:0.25 ms"] > 100  # type: ignore[operator] # no error is None here
     assert 5 < errors["semi-implicit:1 ms"] / errors["semi-implicit:0.1 ms"] < 20  # type: ignore[operator] # likewise
-    assert simulation.notes == ("the scene starts at rest: its first peer is moved by 10 mm",)
+    note = "nothing moves in this scene: device.x of its first peer starts 0.001 m elsewhere"
+    assert simulation.notes == (note,)
+
+
+PUSHED = """\
+topology: pushed
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.25 kg, damping: 2 N*s/m}}
+couplers:
+  idle: {type: SampledSpringDamper, a: device, b: ground, stiffness: 9 N/m, clock: haptic}
+"""
+BETWEEN = """\
+hands:
+  on: {type: StepForce, flange: device, force: 3 N, start: 10.25 ms}
+  off: {type: StepForce, flange: device, force: -3 N, start: 10.75 ms}
+"""
+ROTOR = """\
+component: Rotor
+about: A wheel that turns about its axis.
+connectors: {flange: Flange}
+parameters:
+  inertia: {unit: kg*m^2, above: 0}
+  drag: {unit: N*m*s, min: 0}
+  radius: {unit: m, above: 0}
+variables:
+  angle: {unit: rad, start: 0 rad}
+  rate: {unit: rad/s, start: 0 rad/s}
+equations:
+  - der(angle) = rate
+  - inertia*der(rate) = radius*flange.f - drag*rate
+  - flange.x = radius*angle
+"""
+
+
+def test_a_push_between_two_ticks_is_no_rest() -> None:
+    assert "nothing moves" in bench_simulation(compiled(PUSHED), Fraction(1, 50), rounds=1).notes[0]
+    pushed = bench_simulation(compiled(PUSHED + BETWEEN), Fraction(1, 50), rounds=1)
+    assert pushed.notes == ()
+    assert pushed.chosen is not None
+    assert pushed.chosen.error is not None
+    assert pushed.chosen.error < 1e-12
+
+
+def test_what_rests_is_moved_by_its_own_scale_in_its_own_unit(tmp_path: Path) -> None:
+    wheel = "{type: Rotor, inertia: 1 kg*m^2, drag: 1 N*m*s, radius: 5 mm}"
+    turning = replaced(PUSHED, ("{mass: 0.25 kg, damping: 2 N*s/m}", wheel))
+    found = bench_simulation(compiled(turning, library(tmp_path, ROTOR)), Fraction(1, 50), rounds=1)
+    assert found.notes == (
+        "nothing moves in this scene: device.angle of its first peer starts 0.001 elsewhere",
+    )
+    wide = replaced(PUSHED, ("{count: 1}", "{count: 2, set: {device.x: [20 mm, 30 mm]}}"))
+    still = compiled(replaced(wide, ("9 N/m", "0 N/m")))
+    assert "device.x of its first peer starts 0.03 m" in bench_simulation(still, Fraction(1, 50)).notes[0]
 
 
 def test_the_function_of_its_name_does_what_the_command_does() -> None:

@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import subprocess
 from pathlib import Path
 
-from tests.bench.__main__ import HERE, PAGE, PARTS, Part, run, sections
+import pytest
+
+from tests.bench.__main__ import HERE, PAGE, PARTS, Part, main, run, sections
 from tests.bench.readme import BLOCK, ERROR, README, pictures, printed
 
-HELPERS = {"__init__", "__main__", "naive_region", "drake", "pathsim"}  # not run by themselves
+HELPERS = {  # not run by themselves
+    "__init__",
+    "__main__",
+    "naive_region",
+    "drake",
+    "pathsim",
+    "judge",
+    "paper_scene",
+    "contact_reference",
+}
 
 
 def test_every_benchmark_is_part_of_the_page() -> None:
@@ -26,11 +38,43 @@ def test_a_quick_run_is_of_the_same_program() -> None:
 
 
 def test_a_section_shows_its_command_its_output_and_how_it_ended() -> None:
-    fine = run(Part("one", "Title", ("apc", "--version")), quick=False)
+    fine, code = run(Part("one", "Title", ("apc", "--version")), quick=False)
+    assert code == 0
     assert fine.startswith("## Title\n\n`apc --version` (20")
     assert "```text\napc" in fine
     assert "ended with" not in fine
-    assert "It ended with code 1." in run(Part("two", "T", ("apc", "check", "no.yaml")), quick=True)
+    wrong, code = run(Part("two", "T", ("apc", "check", "no.yaml")), quick=True)
+    assert code == 1
+    assert "It ended with code 1." in wrong
+
+
+def test_what_a_program_says_on_stderr_is_kept_beside_its_output(monkeypatch: pytest.MonkeyPatch) -> None:
+    both = subprocess.CompletedProcess([], 1, "a table\n", "E922 not every hard case came out right\n")
+    monkeypatch.setattr("tests.bench.__main__.subprocess.run", lambda *_, **__: both)
+    text, code = run(Part("one", "Title", ("apc", "--version")), quick=False)
+    assert "```text\na table\n\nE922 not every hard case came out right\n```" in text
+    assert code == 1
+
+
+def test_a_part_that_fails_fails_the_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def ran(part: Part, *_: object) -> tuple[str, int]:
+        return f"## {part.title}\n", int(part.name == "map")
+
+    monkeypatch.setattr("tests.bench.__main__.PAGE", tmp_path / "README.md")
+    monkeypatch.setattr("tests.bench.__main__.run", ran)
+    monkeypatch.setattr("sys.argv", ["bench", "--only", "hard"])
+    main()
+    monkeypatch.setattr("sys.argv", ["bench"])
+    with pytest.raises(SystemExit, match="failed: map"):
+        main()
+
+
+def test_every_part_with_targets_knows_strict() -> None:
+    for part in PARTS:
+        source = HERE / f"{part.words[0].rpartition('.')[2]}.py"
+        known = part.words[0] != "apc" and "parser_of(" in source.read_text(encoding="utf-8")
+        assert part.timed == known, part.name
+        assert ("--strict" in part.command(quick=False, strict=True)) == known
 
 
 def test_the_page_has_a_section_a_part_and_gives_them_back() -> None:

@@ -12,6 +12,7 @@ import pytest
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.runtime.simulate.ensemble import PART, Ensemble, Run, play_many, share_interval
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import prepare
 from apc.runtime.simulate.trajectory import play
 from tests.test_gathering import apart
@@ -30,9 +31,9 @@ def many(*settled: float | None) -> Ensemble:
 
 def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it() -> None:
     system = compiled(SHAKY)
-    few = play_many(system, Fraction(1, 2), runs=4, seed=3, jit=False)
-    assert play_many(system, Fraction(1, 2), runs=2, seed=3, jit=False).runs == few.runs[:2]
-    shared = play_many(system, Fraction(1, 2), runs=PART + 4, seed=3, jobs=2, jit=False)
+    few = play_many(system, Settings(Fraction(1, 2), seed=3, jit=False), runs=4)
+    assert play_many(system, Settings(Fraction(1, 2), seed=3, jit=False), runs=2).runs == few.runs[:2]
+    shared = play_many(system, Settings(Fraction(1, 2), seed=3, jit=False), runs=PART + 4, jobs=2)
     assert [one.number for one in shared.runs] == list(range(PART + 4))
     assert shared.runs[:4] == few.runs
     assert len({one.settled for one in shared.runs}) > 3, "they are different runs"
@@ -40,8 +41,8 @@ def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it() -> None:
 
 def test_run_0_is_the_run_that_is_played_alone() -> None:
     system = compiled(SHAKY)
-    [alone] = play_many(system, Fraction(1, 2), runs=1, seed=3, jit=False).runs
-    summary, _ = play(prepare(system, Fraction(1, 2), seed=3, jit=False), [])
+    [alone] = play_many(system, Settings(Fraction(1, 2), seed=3, jit=False), runs=1).runs
+    summary, _ = play(prepare(system, Settings(Fraction(1, 2), seed=3, jit=False)), [])
     assert summary.largest_force is not None
     assert (alone.verdict, alone.settled, alone.largest_force) == (
         summary.verdict,
@@ -52,7 +53,7 @@ def test_run_0_is_the_run_that_is_played_alone() -> None:
 
 def test_the_seed_is_the_experiments_if_none_is_given() -> None:
     system = compiled(SHAKY + "experiment: {seed: 5}\n")
-    assert play_many(system, Fraction(1, 10), runs=1, jit=False).seed == 5
+    assert play_many(system, Settings(Fraction(1, 10), jit=False), runs=1).seed == 5
 
 
 def test_statistics_are_those_of_the_runs_that_have_the_number() -> None:
@@ -76,7 +77,7 @@ def test_a_shares_interval_is_wilsons() -> None:
 
 def test_a_scene_without_chance_is_not_played_many_times() -> None:
     with pytest.raises(ApcError, match="E894 nothing in three-users-average is left to chance"):
-        play_many(compiled(AVERAGE), Fraction(1), runs=10)
+        play_many(compiled(AVERAGE), Settings(Fraction(1)), runs=10)
 
 
 def test_its_words_fit_a_terminal() -> None:

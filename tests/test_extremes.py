@@ -11,8 +11,8 @@ import pytest
 from apc.runtime.analysis.analysis import analyze, lifted_groups
 from apc.runtime.eigen.closing import close_loop
 from apc.runtime.eigen.graph_loops import graph_loop, graph_scale
+from apc.runtime.eigen.graph_modes import ring_mode, ring_values
 from apc.runtime.eigen.peer_group import used_ways
-from apc.runtime.frame.exchange import ring_mode, ring_values
 from apc.runtime.large.extremes import find_extremes
 from apc.runtime.large.graph import deciding_loops, is_large_ring
 from tests.sites import MS, grouped, linked, paper

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
@@ -144,4 +145,34 @@ def test_what_samples_or_sends_must_name_its_clock_or_link(tmp_path: Path) -> No
         "Write: parameters: {link: link}",
         "part0.yaml:5:40: E504 Pusher samples but has no parameter that names one clock. "
         "Write: parameters: {clock: clock}",
+    ]
+
+
+LATE = """\
+component: LateMean
+connectors: {object: Flange}
+sends: {x: "hold(w, lag)*1"}
+parameters: {stiffness: {unit: N/m}, lag: {unit: s, default: 1 ms}, clock: clock, link: link}
+equations:
+  - w = sample(object.x)
+  - f = stiffness*(sample(object.x) - mean(others.x))
+  - object.f = hold(f)
+"""
+
+
+@pytest.mark.parametrize("groups", ["one: {count: 1}", "one: {count: 1, set: {coordination.lag: 5 ms}}"])
+def test_a_delay_in_what_is_sent_is_the_groups_own(tmp_path: Path, groups: str) -> None:
+    text = f"""\
+topology: late
+clocks: {{haptic: 1 ms, network: 8 ms}}
+peers: {{{groups}, two: {{count: 2, set: {{coordination.lag: 5 ms}}}}}}
+masses: {{cube: {{mass: 0.6 kg, damping: 5 N*s/m, shared: true}}}}
+couplers:
+  coordination: {{type: LateMean, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}}
+links: {{lan: {{clock: network, delay: 8 ms}}}}
+"""
+    kinds = flat(text, library(tmp_path, LATE)).kinds
+    assert [kind.groups for kind in kinds] == [("one",), ("two",)], "each can be changed on its own"
+    assert [[(name, group, value.number) for name, group, value in kind.delays] for kind in kinds][1] == [
+        ("coordination.lag", "two", Fraction(5, 1000))
     ]

@@ -83,7 +83,7 @@ def test_a_parameter_keeps_its_bounds_its_unit_and_its_expression() -> None:
     found = {parameter.name: parameter for parameter in compiled(text).parameters}
     assert found["coordination.stiffness"] == Parameter(
         *("coordination.stiffness", "N/m", 500.0, "kt/(peers + 1)", 0.0, False, None),
-        "force per distance from the mean",
+        *("force per distance from the mean", Fraction(500)),
     )
     assert (found["device.mass"].minimum, found["device.mass"].open_minimum) == (0.0, True)
     assert (found["kt"].value, found["kt"].unit) == (2000.0, "N/m")
@@ -229,3 +229,20 @@ def test_groups_of_one_kind_share_its_functions() -> None:
     assert [(parameter.name, parameter.value) for parameter in one.values] == [("device.mass", 2.0)]
     assert two.values == ()
     assert system.peers == 10
+
+
+def test_a_link_over_which_only_some_send_a_value_is_refused() -> None:
+    text = replaced(
+        AVERAGE,
+        ("user: {count: 3}", "a: {count: 2}\n  b: {count: 2}"),
+        (
+            "  coordination:",
+            "  grip: {type: AveragePosition, object: device, stiffness: 5 N/m, clock: haptic, link: lan,"
+            " at: [a]}\n  coordination:",
+        ),
+    )
+    (line,) = told(compiled, text)
+    assert line.partition(": ")[2] == (
+        "E215 grip.x travels over lan, and those of b send other values over it. "
+        "Write: a link of its own for what only some groups send"
+    )

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.gathering`: what unreliable links do to a scene that is played."""
+"""Claims about `apc.runtime.network.gathering`: what unreliable links do to a scene that is played."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.frame.channel_law import channel_law
-from apc.runtime.frame.packets import PacketSource
+from apc.runtime.network.channel_law import channel_law
+from apc.runtime.network.packets import PacketSource
 from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import Simulation, prepare
 from tests.eventwise import MS, Play, User, coast, contact, pull
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
@@ -34,7 +35,7 @@ def apart(text: str, more: str = "") -> str:
 
 
 def played(system: CompiledSystem, *, duration: Fraction = Fraction(1), seed: int = 0) -> NDArray[np.float64]:
-    return rows_of(prepare(system, duration, jit=False, seed=seed))
+    return rows_of(prepare(system, Settings(duration, jit=False, seed=seed)))
 
 
 def rows_of(simulation: Simulation, run: int = 0) -> NDArray[np.float64]:
@@ -110,7 +111,7 @@ def test_a_played_scene_is_what_looking_at_every_packet_gives(operator: str, mor
         newest="all" not in more,
         zero="zero" in more,
     )
-    simulation = prepare(system, duration, jit=False, seed=3)
+    simulation = prepare(system, Settings(duration, jit=False, seed=3))
     names = [signal.name for signal in simulation.signals]
     wanted = [f"user[{i}].{name}" for i in (1, 2, 3) for name in ("device.x", "device.v", "cube.x", "cube.v")]
     found = rows_of(simulation)[:, [names.index(name) for name in wanted]]
@@ -161,7 +162,7 @@ def test_a_link_that_loses_everything_leaves_every_copy_where_it_is_or_holds_the
     zero = played(compiled(apart(AVERAGE, "loss: 100 %, on_loss: zero")), duration=Fraction(4))
     names = [f"user[{i}].cube.x" for i in (1, 2, 3)]
     system = compiled(apart(AVERAGE, "loss: 100 %"))
-    simulation = prepare(system, Fraction(4), jit=False)
+    simulation = prepare(system, Settings(Fraction(4), jit=False))
     columns = [[signal.name for signal in simulation.signals].index(name) for name in names]
     # Until the first packet is due nobody knows of a loss: the start values pull for 8 ms, nothing after.
     assert np.abs(np.diff(zero[-200:, columns], axis=0)).max() < 1e-12
@@ -175,20 +176,20 @@ def test_a_link_that_loses_everything_leaves_every_copy_where_it_is_or_holds_the
 
 def test_the_same_seed_gives_the_same_rows_however_long_the_chunks_are() -> None:
     system = compiled(apart(AVERAGE, "loss: 20 %, jitter: 9 ms, distribution: pareto, reorder: all"))
-    long = prepare(system, Fraction(3), jit=False, seed=1)
-    short = prepare(system, Fraction(1, 10), jit=False, seed=1)
+    long = prepare(system, Settings(Fraction(3), jit=False, seed=1))
+    short = prepare(system, Settings(Fraction(1, 10), jit=False, seed=1))
     assert short.length != long.length
     one, other = rows_of(long), rows_of(short)
     assert one[: len(other)].tolist() == other.tolist()
     assert rows_of(long).tolist() == one.tolist()
-    assert np.abs(rows_of(prepare(system, Fraction(3), jit=False, seed=2)) - one).max() > 1e-3
+    assert np.abs(rows_of(prepare(system, Settings(Fraction(3), jit=False, seed=2))) - one).max() > 1e-3
     assert np.abs(rows_of(long, run=1) - one).max() > 1e-3
 
 
 def test_the_seed_is_the_experiments_if_none_is_given() -> None:
     text = apart(AVERAGE, "loss: 20 %") + "experiment: {seed: 9}\n"
-    assert prepare(compiled(text), Fraction(1), jit=False).seed == 9
-    assert prepare(compiled(text), Fraction(1), jit=False, seed=4).seed == 4
+    assert prepare(compiled(text), Settings(Fraction(1), jit=False)).seed == 9
+    assert prepare(compiled(text), Settings(Fraction(1), jit=False, seed=4)).seed == 4
 
 
 def test_average_and_mesh_of_two_users_meet_the_same_luck() -> None:
@@ -213,4 +214,7 @@ def test_one_who_sends_nothing_has_nothing_to_stand_in_for_what_it_misses() -> N
     silent = replace(kind, name="silent", sends=())
     group = replace(system.groups[0], name="listener", kind=1)
     with pytest.raises(ApcError, match=r"E893 .* hears lan, over which its peer sends nothing"):
-        prepare(replace(system, kinds=(kind, silent), groups=(*system.groups, group)), Fraction(1), jit=False)
+        prepare(
+            replace(system, kinds=(kind, silent), groups=(*system.groups, group)),
+            Settings(Fraction(1), jit=False),
+        )

@@ -13,9 +13,9 @@ from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import lifted_groups
 from apc.runtime.eigen.closing import close_loop
 from apc.runtime.eigen.graph_loops import common_graph, graph_loop, graph_scale
+from apc.runtime.eigen.graph_modes import graph_modes
 from apc.runtime.eigen.modes import complete_loops
 from apc.runtime.eigen.peer_group import used_ways
-from apc.runtime.frame.exchange import graph_modes
 from tests.sites import linked, paper
 
 

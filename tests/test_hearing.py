@@ -8,7 +8,7 @@ import pytest
 
 from apc.compiler.errors import ApcError
 from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.hearing import ears_of
+from apc.runtime.frame.hearing import hearing_of
 from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.liveness import live_outputs, live_receives
 from apc.runtime.frame.parameters import resolve
@@ -36,7 +36,7 @@ def test_a_receive_over_an_edge_function_hears_each_channel_on_a_way_of_its_own(
     pattern = jacobians(system.kinds[0]).pattern
     read = [live_receives(pattern, live_outputs(pattern))]
     exchange = build_exchange(system, resolve(system).timings)
-    [[heard]] = ears_of(system, [pattern], exchange, 0, read)
+    [[heard]] = hearing_of(system, [pattern], exchange, 0, read)
     assert heard == tuple(
         (Way("sum", "lan", "lan.delay", "haptic: pull", channel), channel)
         for channel in ("coordination.x", "coordination.v")

@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.hyperperiod import ClockGrid, common_divisor
+from apc.runtime.frame.hyperperiod import ClockGrid
 from apc.runtime.frame.schedule import Schedule
 from tests.scheduled import schedules
 from tests.sites import MS, paper
@@ -24,10 +24,6 @@ def test_the_frame_is_the_least_common_multiple_of_the_periods() -> None:
 
 
 def test_every_time_is_a_whole_number_of_the_largest_quantum() -> None:
-    times = [Fraction(1, 90), Fraction(1, 60), Fraction(0), Fraction(7, 1000)]
-    quantum = common_divisor(times)
-    assert quantum == Fraction(1, 9000)
-    assert all((time / quantum).denominator == 1 for time in times)
     schedule = _schedule(haptic_phase=MS * 3 / 10, network_phase=MS * 5 / 2, comp=MS * 2 / 5)
     assert schedule.quantum == MS / 10
 

@@ -19,6 +19,7 @@ from apc.runtime.simulate.blocks import blocks
 from apc.runtime.simulate.integrate import integrated
 from apc.runtime.simulate.methods import Method, parse_method
 from apc.runtime.simulate.propagate import nonlinear_rows
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import prepare
 from apc.runtime.simulate.trajectory import Trajectory, simulate
 from tests.sites import alone
@@ -223,7 +224,7 @@ def test_what_jumps_without_a_slope_is_not_linear() -> None:
     system = alone(lambda x, u: 1 - 2 * (x > 5e-3), None)
     assert nonlinear_rows(system.kinds[0]) == (0,)
     with pytest.raises(ApcError, match="E870 the motion of x is not linear between the ticks: only"):
-        prepare(system, Fraction(1, 10), method=Method("exact"))
+        prepare(system, Settings(Fraction(1, 10), method=Method("exact")))
 
 
 @pytest.mark.parametrize(
@@ -237,7 +238,7 @@ def test_what_jumps_without_a_slope_is_not_linear() -> None:
 def test_what_cant_be_integrated_on_is_kept_until_there(
     law: Callable[[Any], Any], rows: int, last: float | None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    played = blocks(prepare(alone(lambda x, u: law(x)), Fraction(1, 10)))
+    played = blocks(prepare(alone(lambda x, u: law(x)), Settings(Fraction(1, 10))))
     block = next(played)
     assert len(block.time) == rows
     if last is not None:

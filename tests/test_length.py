@@ -8,6 +8,7 @@ import pytest
 
 from apc.compiler.errors import ApcError
 from apc.runtime.simulate.length import MOST_ROWS, check_length, size_note
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import prepare
 from tests.topologies import AVERAGE, compiled
 
@@ -26,8 +27,8 @@ def test_what_no_one_will_wait_for_is_refused_with_the_line_to_write() -> None:
 
 
 def test_a_large_file_is_told_of_by_its_rows_and_columns() -> None:
-    short = prepare(SCENE, Fraction(1), jit=False)
+    short = prepare(SCENE, Settings(Fraction(1), jit=False))
     assert size_note(short, decimal=True) == ""
-    long = prepare(SCENE, Fraction(10_000), jit=False)
+    long = prepare(SCENE, Settings(Fraction(10_000), jit=False))
     assert size_note(long, decimal=False) == "will hold 10,000,000 rows of 25 columns, about 2 GB"
     assert size_note(long, decimal=True) == "will hold 10,000,000 rows of 25 columns, about 5 GB"

@@ -207,6 +207,26 @@ def test_an_option_test_names_its_option_and_word(tmp_path: Path) -> None:
             "parameters: {how: {options: [one, two], default: three}, ",
             "part0.yaml:3:50: E206 how has no option three",
         ),
+        (
+            "{unit: kg, above: 0}",
+            "{unit: g, min: 3, above: 1}",
+            "part0.yaml:3:45: E203 mass wants either min or above, got both.",
+        ),
+        (
+            "{unit: kg, above: 0}",
+            "{unit: g, above: 1, default: 1}",
+            "part0.yaml:3:49: E207 the default of mass wants more than 1 g, got 1 g.",
+        ),
+        (
+            "{unit: kg, above: 0}",
+            "{unit: g, min: 1, max: 0.5}",
+            "part0.yaml:3:43: E207 the max of mass wants 1 g or more, got 0.5 g.",
+        ),
+        (
+            "{unit: kg, above: 0}",
+            "{unit: g, max: 2, options: {one: 1, three: 3}}",
+            "part0.yaml:3:63: E207 three of mass wants 2 g or less, got 3 g.",
+        ),
         ("equations:\n", "equations: 3\nabout:\n", "part0.yaml:5:12: E203 equations wants a list, got 3."),
     ],
 )

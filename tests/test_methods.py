@@ -81,6 +81,6 @@ def test_the_closer_run_has_half_the_step_or_a_hundredth_of_the_tolerance() -> N
     assert finer(Method("semi-implicit", step=MS), all_linear=False)[1] == 2
     closer, factor = finer(Method("cvodes", tolerance=1e-6), all_linear=True)
     assert (closer.tolerance, factor) == (pytest.approx(1e-8), 1)
-    assert finer(DEFAULT, all_linear=True)[0].shaken
-    assert finer(Method("exact"), all_linear=True)[0].shaken
-    assert not finer(DEFAULT, all_linear=False)[0].shaken
+    assert finer(DEFAULT, all_linear=True)[0].perturbed
+    assert finer(Method("exact"), all_linear=True)[0].perturbed
+    assert not finer(DEFAULT, all_linear=False)[0].perturbed

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import PEERS, CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.compiler.pipeline import compile_topology
 from apc.runtime.frame.overrides import Override, apply, parse_override
 from apc.runtime.frame.parameters import resolve
 from tests.sites import NAMES, columned, derived, grouped, paper
+from tests.topologies import SCENES, compiled, library
 
 
 def _value(system: CompiledSystem, name: str, group: int = 0) -> float:
@@ -123,3 +127,102 @@ def test_an_override_replaces_a_column(name: str) -> None:
     assert _column(changed, "device.mass") == [0.5, 0.5, 0.5]
     kept = apply(system, [parse_override(system, "contact.stiffness=5 N/m")])
     assert _column(kept, "device.mass") == [0.1, 0.2, 0.1]
+
+
+THIRDS = """\
+topology: thirds
+clocks: {haptic: 1 ms, network: 8 ms}
+parameters: {ratio: 5/3, base: 4.8 ms}
+peers: {user: {count: 3}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic, delay: 1 ms}
+  coordination: {type: AveragePosition, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}
+links: {lan: {clock: network, delay: base*ratio}}
+"""
+
+
+@pytest.mark.parametrize("setting", ["base=4.8 ms", "ratio=5/3"])
+def test_a_time_that_depends_on_a_third_stays_the_very_tick(setting: str) -> None:
+    """4.8 ms · 5/3 is 8 ms: a packet that came 2e-19 s later would miss its tick."""
+    system = compiled(THIRDS)
+    changed = apply(system, [parse_override(system, setting)])
+    assert resolve(changed).timings["lan.delay"] == Fraction(8, 1000)
+
+
+def _own_values(system: CompiledSystem) -> list[Override]:
+    """Return every number and time of a scene as an override that sets it to what it is."""
+    own = {value.name for group in system.groups for value in group.values}
+    own |= {column.name for group in system.groups for column in group.columns}
+    found = [Override(one.name, None, one.number) for one in system.parameters if one.name not in own]
+    found += [Override(one.name, None, one.value) for one in system.timings]
+    found += [
+        Override(one.name, group.name, one.number)
+        for group in system.groups
+        for one in group.values
+        if one.expression is None
+    ]
+    return [one for one in found if one.name != PEERS]
+
+
+@pytest.mark.parametrize("scene", sorted(path.name for path in SCENES.glob("*.yaml")))
+def test_setting_a_number_to_what_it_is_changes_nothing(scene: str) -> None:
+    system = compile_topology(SCENES / scene)
+    before = resolve(system)
+    for override in _own_values(system):
+        after = resolve(apply(system, [override]))
+        assert after.timings == before.timings, override
+        for one, other in zip(after.parameters, before.parameters, strict=True):
+            assert np.array_equal(one, other), override
+
+
+OUTER = """\
+component: Outer
+connectors: {a: Flange, b: Flange}
+parameters: {k: {unit: N/m}, lag: {unit: s, default: 1 ms}, slack: {unit: s, default: 0 s}, clock: clock}
+parts:
+  inner: {type: SampledSpringDamper, a: a, b: b, stiffness: 2*k, clock: clock, delay: lag + slack}
+"""
+NESTED = """\
+topology: nested
+clocks: {haptic: 1 ms, slow: 2 ms}
+peers: {one: {count: 1}, two: {count: 2, set: {o.k: 7 N/m, o.lag: 2 ms, o.clock: slow}}}
+masses: {device: {mass: 0.1 kg}, cube: {mass: 0.1 kg}}
+couplers: {o: {type: Outer, a: device, b: cube, k: 1 N/m, clock: haptic}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("settings", "stiffness", "delays"),
+    [
+        ([], (2, 14), (1, 2)),
+        (["o.k=3 N/m"], (6, 6), (1, 2)),
+        (["two.o.k=3 N/m"], (2, 6), (1, 2)),
+        (["o.lag=5 ms"], (2, 14), (5, 2)),
+        (["two.o.lag=5 ms"], (2, 14), (1, 5)),
+        (["o.lag=5 ms", "two.o.lag=3 ms"], (2, 14), (5, 3)),
+        (["o.slack=1 ms"], (2, 14), (2, 3)),
+    ],
+)
+def test_what_a_group_sets_of_a_part_reaches_the_parts_inside(
+    tmp_path: Path, settings: list[str], stiffness: tuple[int, int], delays: tuple[int, int]
+) -> None:
+    system = compiled(NESTED, library(tmp_path, OUTER))
+    changed = apply(system, [parse_override(system, text) for text in settings])
+    numbers = resolve(changed)
+    kinds = [changed.kinds[group.kind] for group in changed.groups]
+    rows = zip(kinds, numbers.parameters, strict=True)
+    assert [row[0, kind.parameters.index("o.inner.stiffness")] for kind, row in rows] == list(stiffness)
+    assert [numbers.timings[kind.holds[0].delay] * 1000 for kind in kinds] == list(delays)
+    assert [kind.holds[0].clock for kind in kinds] == ["haptic", "slow"]
+
+
+def test_a_group_can_not_set_what_a_time_of_all_groups_depends_on(tmp_path: Path) -> None:
+    text = NESTED.replace("o.k: 7 N/m, o.lag: 2 ms, o.clock: slow", "o.k: 7 N/m")
+    system = compiled(text, library(tmp_path, OUTER))
+    assert _message(system, "two.o.lag=2 ms") == (
+        "E622 o.inner.delay is one time for all groups, and depends on what is set for two. "
+        "Write: the same without the group, or a group with a set of its own"
+    )

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.frame.channel_law import channel_law
-from apc.runtime.frame.packets import PacketSource
+from apc.runtime.network.channel_law import channel_law
+from apc.runtime.network.packets import PacketSource
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import prepare
 from apc.runtime.simulate.trajectory import simulate
 from tests.eventwise import MS, coast
@@ -248,9 +249,9 @@ def test_machine_code_gives_the_same(tmp_path: Path) -> None:
 def test_nobody_has_no_maximum(tmp_path: Path) -> None:
     system = scene(tmp_path, FORCES["max"][0], "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
     with pytest.raises(ApcError, match=r"E801 far\[2\] hears nobody over lan: there is no max over nobody"):
-        prepare(system, DURATION)
+        prepare(system, Settings(DURATION))
 
 
 def test_so_many_pairs_that_the_memory_would_not_hold_them_are_refused() -> None:
     with pytest.raises(ApcError, match="E874 10000 peers"):
-        prepare(edged(paper(peers=10_000)), DURATION)
+        prepare(edged(paper(peers=10_000)), Settings(DURATION))

@@ -11,6 +11,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import lifted_groups
 from apc.runtime.eigen.modes import dense
 from apc.runtime.simulate.population import exchanges_within
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import Simulation, prepare
 from tests.scheduled import schedules
 from tests.sites import MS, columned, grouped, linked, paper
@@ -24,7 +25,7 @@ def test_peers_meet_within_a_frame_only_where_something_is_heard_in_the_frame_it
 
 def _frames(system: CompiledSystem, count: int) -> np.ndarray:
     """Return the continuous states of all peers after each frame, peer by peer."""
-    simulation = prepare(system, Fraction(1), jit=False)
+    simulation = prepare(system, Settings(Fraction(1), jit=False))
     population, states = simulation.population, list(simulation.population.start)
     rows = []
     for number in range(count):

@@ -11,7 +11,7 @@ import pytest
 
 from apc.compiler.compiled import Kind
 from apc.runtime.frame.parameters import resolve
-from apc.runtime.simulate.propagate import nonlinear_rows, rates, shaken, transitions
+from apc.runtime.simulate.propagate import nonlinear_rows, perturbed, rates, transitions
 from tests.sites import NAMES, alone, paper
 
 mpmath = pytest.importorskip("mpmath")
@@ -55,10 +55,10 @@ def test_what_a_nonlinear_equation_is_tied_to_is_not_linear_either() -> None:
     assert nonlinear_rows(replace(kind, derivative=casadi.Function("f", [x, u, p, t], [bent]))) == (0, 1)
 
 
-def test_shaken_transitions_are_off_by_one_rounding_and_zeros_stay() -> None:
+def test_perturbed_transitions_are_off_by_one_rounding_and_zeros_stay() -> None:
     system = alone(lambda x, u: -3 * x)
     exact = transitions(rates(system.kinds[0]), resolve(system).parameters[0][0], [Fraction(1, 10)])
-    [one], [other] = exact.matrices, shaken(exact, 1).matrices
+    [one], [other] = exact.matrices, perturbed(exact, 1).matrices
     assert abs(other[0, 0] - one[0, 0]) == np.spacing(one[0, 0])
     assert other[0, 1] == one[0, 1] == 0.0
-    assert shaken(exact, 1).matrices[0].tolist() == other.tolist()
+    assert perturbed(exact, 1).matrices[0].tolist() == other.tolist()

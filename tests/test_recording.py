@@ -19,6 +19,7 @@ from apc.compiler.errors import ApcError
 from apc.runtime.simulate import formats
 from apc.runtime.simulate.blocks import Block, blocks
 from apc.runtime.simulate.recording import SUFFIXES, open_recording
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import Simulation, prepare
 from apc.runtime.simulate.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
@@ -30,7 +31,7 @@ WHOLE = simulate(SYSTEM, duration=DURATION)
 
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
-    return prepare(SYSTEM, DURATION)
+    return prepare(SYSTEM, Settings(DURATION))
 
 
 def written(simulation: Simulation, path: Path) -> Path:

@@ -15,6 +15,7 @@ from apc.runtime.analysis.analysis import analyze, lifted_groups
 from apc.runtime.eigen.modes import dense
 from apc.runtime.simulate.blocks import blocks
 from apc.runtime.simulate.methods import Method
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import prepare
 from apc.runtime.simulate.trajectory import Trajectory, simulate
 from tests.eventwise import MS, Play, User, experiment, play
@@ -195,7 +196,7 @@ def test_recording_some_peers_changes_nothing_for_them() -> None:
 
 def test_a_long_run_comes_in_blocks_of_bounded_size() -> None:
     system = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 100}")))
-    sizes = [block.values.nbytes for block in blocks(prepare(system, Fraction(2)))]
+    sizes = [block.values.nbytes for block in blocks(prepare(system, Settings(Fraction(2))))]
     assert len(sizes) > 3
     assert max(sizes) < 2**22
 

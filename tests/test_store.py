@@ -7,6 +7,7 @@ import json
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -91,7 +92,16 @@ def test_another_format_version_is_refused_by_number(model: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["", "[]", "{}", "null", '{"format": 4}', "{", '{"format": 4, "functions": 3}']
+    "content",
+    [
+        "",
+        "[]",
+        "{}",
+        "null",
+        f'{{"format": {store.FORMAT}}}',
+        "{",
+        f'{{"format": {store.FORMAT}, "functions": 3}}',
+    ],
 )
 def test_a_document_of_another_shape_is_refused(model: Path, content: str) -> None:
     rewritten(model, "model.json", content)
@@ -171,3 +181,50 @@ def test_a_byte_changed_or_an_end_cut_off_is_refused_or_harmless(
         assert error.mistakes[0].code in ("E602", "E603", "E604")
     else:
         assert dataclasses.replace(found).name == "three-users-average"
+
+
+EDGES = replaced(
+    AVERAGE,
+    ("type: AveragePosition", "type: SaturatedMesh, limit: 1 N"),
+    ("lan: {", "lan: {graph: {edges: [[1, 2], [2, 3]]}, "),
+)
+WRONG = {
+    "a row nobody sends": ("kinds.0.clocks.0.receives.0.channel", 99),
+    "a row before the first": ("kinds.0.clocks.0.receives.0.channel", -1),
+    "a link nobody sends over": ("kinds.0.sends.0.link", "haptic"),
+    "a memory that is no output": ("kinds.0.clocks.0.memories", [99]),
+    "a start without a memory": ("kinds.0.clocks.0.starts", ["device.x"]),
+    "a start that is no parameter": ("kinds.0.states.0.start", "lan"),
+    "a peer that is not there": ("groups.0.count", 2),
+    "a graph of another shape": ("links.0.graph.shape", "tree"),
+    "a value that its exact one is not": ("parameters.0.exact", "7/3"),
+    "a group's value of nothing": ("groups.0.values", [{"name": "no", "unit": "1", "value": 1.0}]),
+    "an edge of other sizes": ("kinds.0.clocks.0.receives.0.edge", "kinds.0.derivative"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_model_that_names_what_is_not_there_is_refused(tmp_path: Path, wrong: str) -> None:
+    model = tmp_path / "scene.apc"
+    store.save(compiled(EDGES), model)
+    with zipfile.ZipFile(model) as archive:
+        document = json.loads(archive.read("model.json"))
+
+    def holder(path: str) -> tuple[Any, Any]:
+        *steps, last = [int(step) if step.isdecimal() else step for step in path.split(".")]
+        found: Any = document["system"]
+        for step in steps:
+            found = found[step]
+        return found, last
+
+    path, value = WRONG[wrong]
+    whole, last = holder(path)
+    if isinstance(value, str) and value.startswith("kinds."):
+        there, name = holder(value)
+        value = there[name]
+    if path == "groups.0.values":
+        value = [{**document["system"]["parameters"][0], **value[0], "exact": None}]
+    whole[last] = value
+    rewritten(model, "model.json", json.dumps(document))
+    (line,) = told(store.load, model)
+    assert "E604 is damaged: it is not what apc compile writes" in line

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.timetable`."""
+"""Claims about `apc.runtime.network.timetable`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.channel_law import channel_law
 from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.listener import Listener
-from apc.runtime.frame.packets import PacketSource
 from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.timetable import Timetable
+from apc.runtime.network.channel_law import channel_law
+from apc.runtime.network.listener import Listener
+from apc.runtime.network.packets import PacketSource
+from apc.runtime.network.timetable import Timetable
 from tests.sites import MS
 from tests.topologies import AVERAGE, compiled, replaced
 

@@ -89,7 +89,7 @@ def test_columns_are_found_by_name_and_have_units() -> None:
 def test_pandas_and_xarray_hold_the_same_numbers() -> None:
     pytest.importorskip("pandas")
     pytest.importorskip("xarray")
-    frame = AVERAGE_RUN.to_pandas()
+    frame = AVERAGE_RUN.to_dataframe()
     assert frame.index.name == "time [s]"
     assert (frame["left[2].cube.x [m]"].to_numpy() == AVERAGE_RUN["left[2].cube.x"]).all()
     data = AVERAGE_RUN.to_xarray()

@@ -14,6 +14,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.analysis.needs import needs
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import prepare
 from tests.bench.needs import Account, accounts
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
@@ -212,7 +213,7 @@ def _same(plain: CompiledSystem, more: CompiledSystem) -> None:
     counted = [[one.n_instructions() for one in functions(system)] for system in (plain, more)]
     assert counted[0] == counted[1]
     assert needs(more) == needs(plain)
-    played, alike = (prepare(system, Fraction(1, 20), jit=False).chunk for system in (plain, more))
+    played, alike = (prepare(system, Settings(Fraction(1, 20), jit=False)).chunk for system in (plain, more))
     assert alike.serialize() == played.serialize()
     assert sum(_instructions(alike)) == sum(_instructions(played)) > 0
     assert [kind.states for kind in more.kinds] == [kind.states for kind in plain.kinds]

@@ -16,7 +16,7 @@ from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.expression import Equation, Expr
 from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.units import Unit, parse_quantity, parse_unit, quantity
-from apc.compiler.language.values import text_place
+from apc.compiler.language.values import Value, text_place
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
 from apc.compiler.source.reading import (
     add_unknown,
@@ -181,7 +181,7 @@ def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
     about = read_text(body.get("about"), "about", mistakes) or ""
     if unit is None:
         return None
-    return Number(
+    declared = Number(
         name,
         unit,
         default,
@@ -193,6 +193,24 @@ def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
         about,
         body.place,
     )
+    _check_bounds(declared, body, mistakes)
+    return declared
+
+
+def _check_bounds(number: Number, body: Mapping, mistakes: Mistakes) -> None:
+    """Record two lower bounds, and a maximum, a default or a named value that is out of bounds."""
+    above, maximum, default = body.get("above"), body.get("max"), body.get("default")
+    if above is not None and body.get("min") is not None:
+        mistakes.add("E203", above.place, number.name, expected="either min or above", got="both")
+    options, named = body.get("options"), dict(number.words)
+    words = entries(options if isinstance(options, Mapping) else None)
+    given: list[tuple[str, Fraction | None, Node | None]]
+    given = [(key.text, named.get(key.text), value) for key, value in words]
+    given += [("the max", number.maximum, maximum), ("the default", number.default, default)]
+    for what, value, node in given:
+        if value is not None and node is not None:
+            found = Value(value, number.unit.dimension, None, node.place)
+            number.bounds.check(found, f"{what} of {number.name}", mistakes)
 
 
 def _unit(body: Mapping, name: str, mistakes: Mistakes) -> Unit | None:

@@ -25,9 +25,11 @@ from apc.compiler.language.expression import (
     Name,
     Number,
     format_expression,
+    names,
     transform,
     walk,
 )
+from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.values import Value
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.scene import Scene, SceneGroup
@@ -108,23 +110,32 @@ def flatten(scene: Scene) -> FlatSystem:
 
 
 def _structure(scene: Scene, group: SceneGroup, delays: set[str]) -> object:
-    """Return what must be equal for two groups to share their equations: parts, words and delays."""
+    """Return what must be equal for two groups to share their equations: parts and words.
+
+    A group with a delay of its own shares with nobody: the schedule is a kind's, and each such delay can be
+    changed without the other groups'.
+    """
     present = tuple(part.name for part in scene.parts if group.name in part.groups)
-    own = tuple((name, value.number) for name, value in group.values if name in delays)
-    return present, tuple(sorted(group.words)), tuple(sorted(own))
+    own = any(name in delays for name, _ in group.values)
+    return present, tuple(sorted(group.words)), group.name if own else None
 
 
 def _delay_names(scene: Scene) -> set[str]:
-    """Return the parameters that are the delay of a hold: part of the schedule, not of the equations."""
-    found = set()
+    """Return the numbers of parts that a hold's delay is or depends on: of the schedule, not of equations."""
+    found: set[str] = set()
     for part in scene.parts:
-        for equation in part.component.equations:
-            for side in (equation.left, equation.right):
-                for node in walk(side):
-                    if isinstance(node, Call) and node.function == "hold":
-                        for delay in node.arguments[1:]:
-                            names = (one for one in walk(delay) if isinstance(one, Name))
-                            found |= {f"{part.name}.{name.parts[0]}" for name in names}
+        component = part.component
+        sides = [side for equation in component.equations for side in (equation.left, equation.right)]
+        for expression in (*sides, *(send.expression for send in component.sends)):
+            for node in walk(expression):
+                if isinstance(node, Call) and node.function == "hold":
+                    for delay in node.arguments[1:]:
+                        found |= {f"{part.name}.{name.parts[0]}" for name in names(delay)}
+    for part in reversed(scene.parts):  # what an inner part's number depends on is a number of an outer part
+        for name, value in part.values:
+            if f"{part.name}.{name}" in found and value.expression is not None:
+                tree = parse_expression(value.expression, Place(name, 1, 1, value.expression))
+                found |= {".".join(node.parts) for node in names(tree)}
     return found
 
 

@@ -34,9 +34,10 @@ from apc.compiler.equations.jets import Jets
 from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
 from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, symbol, to_sympy
-from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing
+from apc.compiler.equations.zero_test import NOTHING_VANISHES, Given, Vanishing
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import Expr, Name
+from apc.compiler.language.expression import Expr, Name, names
+from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.scene.scene import Scene
 
@@ -116,16 +117,23 @@ def _positive_parameters(scene: Scene) -> list[str]:
     ]
 
 
-def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[sympy.Symbol, Fraction]]:
-    """Return the numbers of each group of a kind; of those that differ by peer, the first peer's."""
-    common = {f"{part.name}.{name}": value.number for part in scene.parts for name, value in part.values}
-    common["peers"] = Fraction(scene.peers)
+def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[sympy.Symbol, Given]]:
+    """Return the numbers of each group of a kind, those that differ from peer to peer as they do."""
+    common = {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
     found = []
     for group in scene.groups:
-        if group.name in kind.flat.groups:
-            own = {name: value.number for name, value in group.values}
-            own |= {name: Fraction(float(numbers[0])) for name, numbers in group.columns}
-            found.append({symbol(name): number for name, number in (common | own).items()})
+        if group.name not in kind.flat.groups:
+            continue
+        columns: dict[str, Given] = dict(group.columns)
+        numbers: dict[str, Given] = {"peers": Fraction(scene.peers)}
+        for name, value in (common | dict(group.values)).items():
+            numbers[name] = value.number
+            if columns and value.expression is not None and name not in columns:
+                tree = parse_expression(value.expression, Place(name, 1, 1, value.expression))
+                # Inside a part, what depends on a number that differs from peer to peer does so too.
+                if any(".".join(node.parts) in columns for node in names(tree)):
+                    columns[name] = to_sympy(tree, no_derivative)
+        found.append({symbol(name): number for name, number in (numbers | columns).items()})
     return found
 
 

@@ -8,6 +8,7 @@ Does not: write functions.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -30,11 +31,12 @@ from apc.compiler.components.component import Number as NumberParameter
 from apc.compiler.equations.clocks import HoldCrossing
 from apc.compiler.equations.flatten import FlatKind
 from apc.compiler.equations.reductions import count_of
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import Expr, Name, Number, format_expression, transform
+from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.language.values import Value
+from apc.compiler.language.values import Value, renamed
 from apc.compiler.scene.channels import SceneChannel
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene, SceneGroup
@@ -93,11 +95,20 @@ class Timings:
 
     def _parameter(self, name: str, own: dict[str, tuple[str, Value]]) -> str:
         """Register a delay parameter, under the group's name if it sets its own."""
-        if name in own:
-            group, value = own[name]
+        if name not in own:
+            part, _, parameter = name.rpartition(".")
+            return self.use(name, self._parts[part][parameter])
+        group, value = own[name]
+        if value.expression is None:
             return self.use(f"{group}.{name}", value)
-        part, _, parameter = name.rpartition(".")
-        return self.use(name, self._parts[part][parameter])
+
+        def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
+            """Return what a group's own number depends on: its own as well, if it has one of that name."""
+            other = ".".join(parts)
+            return tuple(self._parameter(other, own).split(".")) if other in own else parts
+
+        tree = renamed(parse_expression(value.expression, Place(name, 1, 1, value.expression)), whole)
+        return self.use(f"{group}.{name}", replace(value, expression=format_expression(tree)))
 
     def _number(self, parts: tuple[str, ...]) -> Fraction:
         return Fraction(self.scene.peers) if parts == (PEERS,) else self._found[".".join(parts)].value
@@ -123,6 +134,27 @@ def used_links(
         else:
             dropped.append((link.name, "nobody hears what it would carry"))
     return links, dropped
+
+
+def check_channels(scene: Scene, kinds: Sequence[Kind]) -> None:
+    """Refuse a link over which some peers send what others don't: who hears it would hear them send nothing.
+
+    Raises
+    ------
+    ApcError
+        E215 for each such link.
+    """
+    mistakes = Mistakes()
+    for link in scene.links:
+        sent = {kind.name: one.channels for kind in kinds for one in kind.sends if one.link == link.name}
+        every = dict.fromkeys(channel for channels in sent.values() for channel in channels)
+        missing = [(name, one) for one in every for name, channels in sent.items() if one not in channels]
+        if missing:
+            name, channel = missing[0]
+            what = f"{channel} travels over {link.name}, and those of {name} send other values over it"
+            hint = "a link of its own for what only some groups send"
+            mistakes.add("E215", link.place, what, hint=hint)
+    mistakes.raise_if_any()
 
 
 def _link(link: SceneLink, timings: Timings) -> Link:
@@ -178,7 +210,7 @@ def used_clocks(
 def compiled_groups(
     scene: Scene, kinds: Sequence[Kind], kind_of: Mapping[str, int], links: Sequence[Link], timings: Timings
 ) -> tuple[Group, ...]:
-    """Return the groups: a setting that is a timing is in the schedule and no parameter.
+    """Return the groups: a setting that is a timing follows that timing.
 
     How many peers each peer hears over a link, `count(LINK)`, is a parameter of its group, or a column where
     it differs from peer to peer.
@@ -204,9 +236,9 @@ def compiled_groups(
     start = 0
     for group in scene.groups:
         values = [
-            compiled_parameter(scene, name, value)
+            compiled_parameter(scene, name, replace(value, expression=timing) if timing in exact else value)
             for name, value in group.values
-            if f"{group.name}.{name}" not in exact
+            for timing in (f"{group.name}.{name}",)
         ]
         columns = [Column(name, numbers) for name, numbers in group.columns]
         kind = kinds[kind_of[group.name]]
@@ -273,7 +305,7 @@ def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
     number = float(value.number)
     part, _, own = name.rpartition(".")
     if not part:
-        return Parameter(name, unit, number, value.expression)
+        return Parameter(name, unit, number, value.expression, exact=value.number)
     component = scene.part(part).component
     declared = component.parameter(own)
     if isinstance(declared, NumberParameter):
@@ -286,10 +318,12 @@ def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
             declared.open_minimum,
             None if declared.maximum is None else float(declared.maximum),
             declared.about,
+            value.number,
         )
     variable = component.variable(own)
     assert variable is not None
-    return Parameter(name, unit, number, value.expression, about=f"start value: {variable.about}")
+    about = f"start value: {variable.about}"
+    return Parameter(name, unit, number, value.expression, about=about, exact=value.number)
 
 
 def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
@@ -320,7 +354,9 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
             found[name] = Parameter(name, "1", float(scene.peers - 1), about=COUNT_ABOUT)
         if link.channel is not None and any(used.name == link.name for used in links):
             found |= {
-                name: Parameter(name, "1", float(value.number), value.expression, 0.0, False, 1.0, about)
+                name: Parameter(
+                    *(name, "1", float(value.number), value.expression, 0.0, False, 1.0, about, value.number)
+                )
                 for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
             }
     found[PEERS] = Parameter(PEERS, "1", float(scene.peers), about="number of peers")

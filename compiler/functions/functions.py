@@ -31,7 +31,14 @@ from apc.compiler.equations.clocks import HoldCrossing, ReceiveCrossing
 from apc.compiler.equations.structure import SortedKind, SortedSystem
 from apc.compiler.equations.symbolic import derivative_symbol, symbol
 from apc.compiler.functions.casadi_writer import Writer
-from apc.compiler.functions.exchange import Timings, all_parameters, compiled_groups, used_clocks, used_links
+from apc.compiler.functions.exchange import (
+    Timings,
+    all_parameters,
+    check_channels,
+    compiled_groups,
+    used_clocks,
+    used_links,
+)
 from apc.compiler.functions.ports import held_ports
 from apc.compiler.functions.reached import Reached
 from apc.compiler.language.recordings import TimeTable
@@ -46,6 +53,7 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     builders = [_KindBuilder(scene, kind, timings) for kind in system.kinds]
     rows = _shared_rows([builder.reached for builder in builders])
     kinds = [builder.build(rows) for builder in builders]
+    check_channels(scene, kinds)
     dropped = [item for builder in builders for item in builder.dropped]
     links, unheard = used_links(scene, kinds, timings)
     clocks, silent = used_clocks(scene, kinds, links, timings)

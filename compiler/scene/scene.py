@@ -5,7 +5,7 @@ Guarantees: parts, clocks, links, parameters and connections that are named exis
 their parameter wants and lie within its bounds; parts inside parts and arrays are written out; all mistakes
 of the file are reported together.
 Does not: look into a component's equations, or read a section itself: each has a module of its own
-(`groups`, `named_numbers`, `timebase`, `sections`, `instances`, `links`, `studies`).
+(`groups`, `followers`, `named_numbers`, `timebase`, `sections`, `instances`, `links`, `studies`).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from apc.compiler.errors import Mistakes, Place
 from apc.compiler.language.values import (
     Value,
 )
+from apc.compiler.scene.followers import with_followers
 from apc.compiler.scene.groups import Columns, GroupBody, read_counts, read_settings
 from apc.compiler.scene.instances import Part, PartReader, settable_names
 from apc.compiler.scene.links import SceneLink, read_link
@@ -55,8 +56,8 @@ KEYS = (
 class SceneGroup:
     """`count` peers.
 
-    `values` are the group's own settings by whole name (`contact.stiffness`), `words` its own options and
-    clocks, `columns` settings that differ from peer to peer.
+    `values` are the group's own settings by whole name (`contact.stiffness`) and what follows from them
+    inside parts, `words` its own options and clocks, `columns` settings that differ from peer to peer.
     """
 
     name: str
@@ -164,7 +165,7 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
         about,
         tuple(clocks.values()),
         tuple(numbers.values.items()),
-        _read_groups(bodies, settable, clocks, sections, numbers),
+        _read_groups(bodies, settable, parts, clocks, sections, numbers),
         tuple(part for part in parts if part.section != "links"),
         tuple(link for link in links if link is not None),
         read_experiment(root.get("experiment"), numbers.read_time, mistakes),
@@ -186,6 +187,7 @@ def _required(root: Mapping, key: str, example: str, mistakes: Mistakes) -> Node
 def _read_groups(
     bodies: MappingType[str, GroupBody],
     settable: MappingType[str, list[tuple[str, Settable]]],
+    parts: list[Part],
     clocks: Collection[str],
     sections: PartSections,
     numbers: NamedNumbers,
@@ -206,10 +208,10 @@ def _read_groups(
 
     found = []
     for group in bodies.values():
+        place = group.body.place
         settings = read_settings(group, own, clocks, numbers.read_for, explained, numbers.mistakes)
+        settings = with_followers(settings, parts, numbers.values, numbers.peers, place, numbers.mistakes)
         found.append(
-            SceneGroup(
-                group.name, group.count, settings.values, settings.words, settings.columns, group.body.place
-            )
+            SceneGroup(group.name, group.count, settings.values, settings.words, settings.columns, place)
         )
     return tuple(found)

@@ -1,14 +1,13 @@
 """A scene as a graph: parts joined within a peer, peers joined over links.
 
-Takes: `Scene`. Gives: `Diagram`, `build_diagram`; `seconds`, `common_period`.
+Takes: `Scene`. Gives: `Diagram`, `build_diagram`; `seconds`.
 Guarantees: every part of the topology is in it, a long array as one node; the same scene gives the same text.
 Does not: place anything on a page (see `picture`, `graphviz`).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -202,14 +201,6 @@ def _quantity(part: Part, own: str, value: Value) -> str:
         return format_si(float(value.number), value.dimension)
     text = "" if unit.text == "1" else f" {unit.text.replace('*', '·')}"
     return f"{float(value.number / unit.scale):.6g}{text}"
-
-
-def common_period(periods: Iterable[Fraction]) -> Fraction | None:
-    """Return the least common multiple of clocks' periods, None of no clocks."""
-    found = list(periods)
-    if not found:
-        return None
-    return Fraction(math.lcm(*(p.numerator for p in found)), math.gcd(*(p.denominator for p in found)))
 
 
 def seconds(number: Fraction) -> str:

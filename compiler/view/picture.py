@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from apc.compiler.view.diagram import Crowd, Diagram, Net, Pulse, Vertex, common_period, one_of, seconds
+from apc.compiler.multiples import common_multiple
+from apc.compiler.view.diagram import Crowd, Diagram, Net, Pulse, Vertex, one_of, seconds
 from apc.compiler.view.layers import (
     BETWEEN,
     LINE,
@@ -254,9 +255,9 @@ def _legend(
                 y += LINE
             y += LINE * (0 if crowd.settings else 1) + 2
         y += 10
-    frame = common_period(pulse.period for pulse in diagram.pulses)
-    if frame is None:
+    if not diagram.pulses:
         return marks, right, y
+    frame = common_multiple(pulse.period for pulse in diagram.pulses)
     names = [_pulse_text(pulse) for pulse in diagram.pulses]
     start = left + 18 + max(text_width(name, SMALL) for name in names) + 20
     end = max(right, start + 260)

@@ -1,6 +1,6 @@
 """A picture written as SVG.
 
-Takes: `Picture`, or a diagram to place first. Gives: `draw_svg`.
+Takes: a `Diagram`, which is placed first. Gives: `draw_svg`.
 Guarantees: the same picture gives the same bytes, on every machine: coordinates are in tenths.
 Does not: place anything.
 """

@@ -24,13 +24,13 @@ from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.peer_group import PeerGroup, states_of
 from apc.runtime.eigen.peers import peer_groups
 from apc.runtime.eigen.spectrum import Mode, Spectrum, solve_spectrum
-from apc.runtime.frame.channel_law import nominal_notes
 from apc.runtime.frame.discretize import TOO_LARGE
 from apc.runtime.frame.exchange import Exchange, build_exchange
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.parameters import Numbers, resolve
 from apc.runtime.frame.schedule import ORDER, Schedule
 from apc.runtime.frame.scheduling import build_schedules
+from apc.runtime.network.channel_law import nominal_notes
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 

@@ -74,7 +74,7 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
         E830 not of that form, E831 a parameter that a box can't leave open, E833 limits that can't be; those
         of `names.find` and `units.quantity`.
     """
-    # Imported here: reading a unit brings in pint, which an analysis without a box never needs.
+    # Imported here: the language of quantities, which an analysis without a box never needs.
     from apc.compiler.language.units import quantity
 
     name, equals, value = (part.strip() for part in text.partition("="))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +21,7 @@ from apc.progress import progress_bar
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
-    from apc.runtime.simulate.methods import Method
+    from apc.runtime.simulate.settings import Settings
     from apc.runtime.simulate.simulation import Simulation
     from apc.runtime.simulate.summary import Summary
     from apc.runtime.simulate.trajectory import Sink
@@ -122,6 +121,7 @@ def simulate_command(
     from apc.inputs import open_scene
     from apc.runtime.simulate.length import check_length
     from apc.runtime.simulate.methods import DEFAULT, parse_method
+    from apc.runtime.simulate.settings import Settings
     from apc.runtime.simulate.trajectory import duration_of, parse_duration
 
     if runs is not None and (signals or out or plot or error):
@@ -136,21 +136,11 @@ def simulate_command(
         from apc.runtime.simulate.still import save_still
 
         save_still(system, still)
-    how = _How(seconds, chosen, seed, jit=not no_jit)
+    how = Settings(seconds, chosen, seed, jit=not no_jit)
     if runs is not None:
         _play_many(system, how, runs, jobs, as_json=as_json)
     else:
         _play_one(system, how, _Kept(signals, out, plot, still, error), as_json=as_json)
-
-
-@dataclass(frozen=True, slots=True)
-class _How:
-    """How long a scene is played, in seconds, by which method, and with what luck."""
-
-    seconds: Fraction
-    method: Method
-    seed: int | None
-    jit: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,19 +163,16 @@ def _check_pictures(plot: Path | None, still: Path | None) -> None:
             check_format(path, option)
 
 
-def _play_many(system: CompiledSystem, how: _How, runs: int, jobs: int, *, as_json: bool) -> None:
+def _play_many(system: CompiledSystem, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
     """Play a scene many times and print what that amounts to."""
     from apc.runtime.simulate.ensemble import play_many
 
     with progress_bar("simulate", "runs") as show:
         many = play_many(
             system,
-            how.seconds,
+            how,
             runs=runs,
-            seed=how.seed,
             jobs=jobs,
-            jit=how.jit,
-            method=how.method,
             progress=lambda done: show(done, runs),
         )
     print_result(many, as_json=as_json)
@@ -193,7 +180,7 @@ def _play_many(system: CompiledSystem, how: _How, runs: int, jobs: int, *, as_js
         raise click.Abort
 
 
-def _play_one(system: CompiledSystem, how: _How, kept: _Kept, *, as_json: bool) -> None:
+def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bool) -> None:
     """Play a scene once, keep what is wanted of it, and print what it amounts to."""
     from apc.runtime.simulate.accuracy import compare_with
     from apc.runtime.simulate.simulation import prepare
@@ -205,11 +192,9 @@ def _play_one(system: CompiledSystem, how: _How, kept: _Kept, *, as_json: bool) 
         trajectory_of,
     )
 
-    simulation = prepare(
-        system, how.seconds, signals=kept.signals, jit=how.jit, seed=how.seed, method=how.method
-    )
+    simulation = prepare(system, how, signals=kept.signals)
     keeper = Keeper(simulation) if kept.plot is not None else None
-    comparison = compare_with(simulation, signals=kept.signals, jit=how.jit) if kept.error else None
+    comparison = compare_with(simulation, signals=kept.signals) if kept.error else None
     sinks = [sink for sink in (keeper, comparison) if sink is not None]
     summary, interrupted = _play_into(simulation, kept.out, sinks)
     estimate = comparison.estimate() if comparison is not None else None
@@ -226,7 +211,7 @@ def _play_one(system: CompiledSystem, how: _How, kept: _Kept, *, as_json: bool) 
             if written is not None:
                 click.echo(f"  {written} is written")
     if interrupted:
-        until = f"{summary.end:g} s of {float(how.seconds):g} s"
+        until = f"{summary.end:g} s of {float(how.duration):g} s"
         click.echo(f"stopped at {until}; what was done is kept", err=True)
         raise click.Abort
 
@@ -240,7 +225,7 @@ def _play_into(simulation: Simulation, out: Path | None, sinks: Sequence[Sink]) 
     recording = open_recording(out, simulation) if out is not None else None
     if out is not None and (note := size_note(simulation, decimal=out.suffix.lower() == ".csv")):
         click.echo(f"{out} {note}", err=True)
-    total = float(simulation.duration)
+    total = float(simulation.settings.duration)
     try:
         with progress_bar("simulate", "s") as show:
             every = sinks if recording is None else [recording, *sinks]

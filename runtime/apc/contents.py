@@ -19,9 +19,10 @@ from apc.compiler.equations.flatten import FlatKind, FlatSystem
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
 from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
 from apc.compiler.scene.scene import Scene
-from apc.compiler.view.diagram import Diagram, build_diagram, common_period, one_of, seconds
+from apc.compiler.view.diagram import Diagram, build_diagram, one_of, seconds
 from apc.compiler.view.graphviz import draw_dot
 from apc.compiler.view.listing import plain, step_lines
 from apc.compiler.view.svg import draw_svg
@@ -221,7 +222,7 @@ def schedule(system: CompiledSystem) -> dict[str, Any]:
     """
     timings = {timing.name: timing.value for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
-    frame = common_period(periods.values())
+    frame = common_multiple(periods.values()) if periods else None
     return {
         "frame_s": None if frame is None else float(frame),
         "clocks": [

@@ -73,17 +73,13 @@ def load_fresh(path: Path) -> CompiledSystem:
     from apc.compiler.store import load
 
     system = load(path)
-    now = _changed(Record(system.origin.topology, system.origin.texts), path)
+    record = Record(system.origin.topology, system.origin.texts)
+    now = changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
     if now:
         what = f"is stale: {now} has changed since it was compiled"
         hint = f"apc compile {path.with_name(system.origin.topology)}"
         raise ApcError(Mistake("E605", Place(str(path)), what, hint=hint))
     return system
-
-
-def is_fresh(system: CompiledSystem, path: Path) -> bool:
-    """Return whether the texts a compiled model was made from, if its topology is there, are the same now."""
-    return not _changed(Record(system.origin.topology, system.origin.texts), path)
 
 
 def load_or_compile(path: Path) -> CompiledSystem:
@@ -141,8 +137,3 @@ def compiled_already(topology: Path) -> bool:
     """Return whether the compiled model beside a topology is what compiling it now would give."""
     record = read_record(topology.with_suffix(".apc"))
     return record is not None and record.topology == topology.name and not changed(record, topology.parent)
-
-
-def _changed(record: Record, path: Path) -> str:
-    there = path.with_name(record.topology).is_file()
-    return changed(record, path.parent) if there else ""

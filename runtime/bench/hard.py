@@ -2,8 +2,8 @@
 
 Takes: a folder of topologies and its `truths.json`.
 Gives: `HardCase`, `HardReport`, `run_hard_cases`.
-Guarantees: an error is computed exactly from the stored digits; a bound that does not hold, a wrong verdict
-and a wrong number of rigid modes fail.
+Guarantees: an error is computed exactly from the stored digits; a bound that does not hold or says nothing, a
+verdict that is wrong or left open and a wrong number of rigid modes fail.
 Does not: compute any truth (see the script beside the scenes).
 """
 
@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import json
 import math
-import statistics
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.pipeline import compile_topology
 from apc.runtime.analysis.analysis import Analysis, analyze
+from apc.runtime.bench.timing import median_time
+from apc.runtime.threads import single_threaded
 
 TRUTHS = "truths.json"
 REPEATS = 3  # of each analysis; its time is the median
@@ -34,7 +35,9 @@ class HardCase:
     """One scene: the answer beside the truth.
 
     `error` is |ρ − truth|, `bound` what the analysis says it is at most, both divided by max(ρ, 1) where ρ
-    is the truth. `seconds` is the median time of the analysis. `failed` says what is wrong, "" if nothing is.
+    is the truth. `seconds` is the median time of the analysis. `undecided` says that it left the verdict
+    open. `failed` says what is wrong, "" if nothing is: no bound and no verdict are failures too, since the
+    truth is known.
     """
 
     name: str
@@ -46,12 +49,18 @@ class HardCase:
     error: float
     bound: float
     seconds: float
+    undecided: bool
     failed: str
 
     @property
     def looseness(self) -> float:
         """Bound ÷ error; infinite where there is no error."""
         return self.bound / self.error if self.error else math.inf
+
+    @property
+    def unbounded(self) -> bool:
+        """Whether the bound says nothing."""
+        return not math.isfinite(self.bound)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +86,8 @@ class HardReport:
             ],
             "without_truth": list(self.without),
             "failed": [case.name for case in self.failures],
+            "undecided": [case.name for case in self.cases if case.undecided],
+            "unbounded": [case.name for case in self.cases if case.unbounded],
         }
 
 
@@ -111,12 +122,9 @@ def run_hard_cases(
             without.append(path.name)
             continue
         system = compile_topology(path)
-        times: list[float] = []
-        while len(times) < repeats and sum(times) < ENOUGH:
-            began = time.perf_counter()
-            found = solve(system)
-            times.append(time.perf_counter() - began)
-        cases.append(compare(system, found, truths[path.stem], statistics.median(times), path.stem))
+        with single_threaded():
+            seconds, found = median_time(partial(solve, system), repeats, enough=ENOUGH)
+        cases.append(compare(system, found, truths[path.stem], seconds, path.stem))
     if not cases:
         what = "holds no topology whose truth is known"
         raise ApcError(Mistake("E920", Place(str(folder)), what, hint="--hard tests/hard"))
@@ -140,14 +148,21 @@ def compare(
         The name of the case.
     """
     radius = Fraction(truth["spectral_radius"])
-    finite = math.isfinite(found.spectral_radius)
-    apart = abs(Fraction(found.spectral_radius) - radius) if finite else None
-    size = float(max(radius, Fraction(1)))
     bound = found.spectral_radius_error
+    apart = None
+    if math.isfinite(found.spectral_radius):
+        apart = abs(Fraction(found.spectral_radius) - radius)
+    size = float(max(radius, Fraction(1)))
     wrong = []
-    if apart is None or (math.isfinite(bound) and apart > Fraction(bound)):
+    if apart is None:
+        wrong.append("there is no spectral radius")
+    elif not math.isfinite(bound):
+        wrong.append("the bound says nothing")
+    elif apart > Fraction(bound):
         wrong.append("the bound does not hold")
-    if found.stable is not None and found.verdict != truth["verdict"]:
+    if found.stable is None:
+        wrong.append(f"the verdict is left open: {truth['verdict']}")
+    elif found.verdict != truth["verdict"]:
         wrong.append(f"the verdict is wrong: {truth['verdict']}")
     if found.rigid_modes != truth["rigid_modes"]:
         wrong.append(f"{truth['rigid_modes']} rigid modes, not {found.rigid_modes}")
@@ -161,6 +176,7 @@ def compare(
         error=math.inf if apart is None else float(apart) / size,
         bound=bound / size,
         seconds=seconds,
+        undecided=found.stable is None,
         failed="; ".join(wrong),
     )
 

@@ -80,10 +80,13 @@ def hard_report(found: HardReport) -> str:
     lines += ["", _filled("error and bound are of the spectral radius ρ, divided by ρ where it is above 1")]
     lines += [_filled(f"{name} has no truth beside it: left out") for name in found.without]
     lines += [_filled(f"FAILED {case.name}: {case.failed}") for case in found.failures]
-    undecided = sum(case.verdict.startswith("undecided") for case in found.cases)
-    if not found.failures:
-        said = f"{undecided} left undecided" if undecided else "every verdict is right"
-        lines.append(f"  every bound holds; {said}")
+    if found.failures:
+        undecided = sum(case.undecided for case in found.cases)
+        unbounded = sum(case.unbounded for case in found.cases)
+        scenes = f"{len(found.failures)} of {counted(len(found.cases), 'scene')} failed"
+        lines.append(f"  {scenes}; {undecided} left open, {unbounded} without a bound")
+    else:
+        lines.append("  every bound holds; every verdict is right")
     return "\n".join(lines)
 
 

@@ -9,13 +9,12 @@ Does not: change the file; the group with the most peers of a written `count` gr
 from __future__ import annotations
 
 import resource
-import statistics
 import sys
-import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from fractions import Fraction
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import parse_source, read_source
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.bench.reference import Truth, spectral_truth
+from apc.runtime.bench.timing import median_time, timed
 from apc.runtime.threads import single_threaded
 
 REPEATS = 3  # of each analysis; its time is the median
@@ -134,14 +134,8 @@ def _measure(path: Path, count: int) -> ScaleRow | str:
     """Compile and analyse, in this process."""
     try:
         with single_threaded():
-            began = time.perf_counter()
-            system = with_count(path, count)
-            compiled = time.perf_counter() - began
-            times = []
-            for _ in range(REPEATS):
-                began = time.perf_counter()
-                found = analyze(system)
-                times.append(time.perf_counter() - began)
+            compiled, system = timed(partial(with_count, path, count))
+            analyzed, found = median_time(partial(analyze, system), REPEATS)
             memory = _memory()
             truth = spectral_truth(system)
     except ApcError as error:
@@ -152,7 +146,7 @@ def _measure(path: Path, count: int) -> ScaleRow | str:
     return ScaleRow(
         peers=system.peers,
         compile_s=compiled,
-        analyze_s=statistics.median(times),
+        analyze_s=analyzed,
         memory=memory,
         error=off,
         bound=found.spectral_radius_error,

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.graph_modes import Surd
 from apc.runtime.eigen.loop import Packet, packet_places
 from apc.runtime.frame.discretize import step_balls
 from apc.runtime.frame.exact import is_rational
-from apc.runtime.frame.exchange import Surd
 from apc.runtime.frame.lift import follow
 from apc.runtime.frame.schedule import Propagate, Schedule, Way
 from apc.runtime.frame.site import LinearSite, entrywise

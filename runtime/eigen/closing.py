@@ -17,10 +17,10 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.runtime.eigen.graph_modes import Surd
 from apc.runtime.eigen.loop import Coupling, Loop, Packet, StateLayout, lay_out
 from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.exchange import Surd
 from apc.runtime.frame.schedule import Way
 
 Floats = NDArray[np.float64]

@@ -3,7 +3,7 @@
 Takes: a group of equal peers, the graph that all their ways share, an eigenvalue of its W.
 Gives: `common_graph`, `GraphScale`, `graph_scale`, `graph_loop`.
 Guarantees: exact weights where the eigenvalue is rational; else how far off they may be, and the closed form.
-Does not: find the eigenvalues of W (see `exchange.graph_modes`).
+Does not: find the eigenvalues of W (see `graph_modes`).
 
 An eigenvalue λ makes a system of one site, r = λ s, as often as W holds it. A complex pair λ = α ± iβ is one
 real system of two sites, r = [α −β; β α] s.
@@ -17,9 +17,10 @@ from fractions import Fraction
 
 import numpy as np
 
+from apc.runtime.eigen.graph_modes import GraphMode, Surd
 from apc.runtime.eigen.loop import Coupling, Loop
 from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.frame.exchange import Exchange, GraphMode, Surd, check_mean
+from apc.runtime.frame.exchange import Exchange, check_mean
 from apc.runtime.frame.schedule import Way
 
 

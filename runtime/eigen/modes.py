@@ -28,10 +28,11 @@ import numpy as np
 from apc.runtime.eigen.closing import ClosedSystem, close_loop
 from apc.runtime.eigen.coupling import complete_degrees, couple
 from apc.runtime.eigen.graph_loops import common_graph, graph_loop, graph_scale
+from apc.runtime.eigen.graph_modes import graph_modes
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
 from apc.runtime.eigen.twins import split_twins
-from apc.runtime.frame.exchange import Exchange, graph_modes
+from apc.runtime.frame.exchange import Exchange
 
 
 @dataclass(frozen=True, slots=True)

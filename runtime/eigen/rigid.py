@@ -29,9 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.graph_modes import QUICK_PRIME
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.frame.exchange import QUICK_PRIME
 from apc.runtime.frame.schedule import Act, Propagate, Send, Tick, Value
 from apc.runtime.frame.site import LinearSite
 

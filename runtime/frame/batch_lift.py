@@ -29,9 +29,14 @@ Matrix = NDArray[Any]  # float64 or complex128
 # Sites composed together: their matrices then stay in the cache of a processor.
 CHUNK = 2048
 
-# A bound on a frame's rounding errors above this decides nothing: they are estimated then, from so many
-# frames of numbers moved at random by all roundings of a frame at once, and so many times what that changes.
-HOPELESS, SHAKES, SAFE = 1e-6, 2, 8.0
+# A bound on a frame's rounding errors above this decides nothing: they are estimated then.
+HOPELESS = 1e-6
+
+# From so many frames of numbers moved at random by all roundings of a frame at once: SAFE times the largest
+# change. A change is nearly a normal number, below 1/SAFE of its standard deviation in one frame of 10, so in
+# all of 8 once in 10⁸. Of 46,656 entries (1,080 sites with copies of 10 mg to 1 g, against 80 digits) the
+# error was at most a third of this estimate; of two frames, it was beyond it in 49, up to three times.
+PERTURBED_FRAMES, SAFE = 8, 8.0
 
 # With ‖X‖ ≤ 1/2 the Taylor series of φ₁ is right to 2^−60 after so many terms: (1/2)^16/17! < 2^−64.
 TERMS = 16
@@ -70,7 +75,7 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
     -----
     As in `lift`, errors multiply along the composition of magnitudes; a step of `exponential_rows` counts
     with the roundings it reports. Where stiffness and damping nearly cancel over many ticks that grows
-    without measure, whatever the errors are: beyond `HOPELESS` they are estimated, see `_shaken`.
+    without measure, whatever the errors are: beyond `HOPELESS` they are estimated, see `_perturbed`.
     """
     n_z = len(site.kind.states) + len(schedule.carried)
     durations = sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
@@ -89,7 +94,7 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
         gamma = roundings * UNIT / (1 - roundings * UNIT)
         errors = gamma * z_large, gamma * s_large
         if not all(float(one.max(initial=0.0)) <= HOPELESS for one in errors):
-            errors, estimated = _shaken(many, schedule, steps, (z, s), roundings), True
+            errors, estimated = _perturbed(many, schedule, steps, (z, s), roundings), True
         parts.append((z, s, *errors))
     z, s, z_error, s_error = (np.concatenate(part) for part in zip(*parts, strict=True))
     return LiftedRows(
@@ -107,7 +112,7 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
     )
 
 
-def _shaken(
+def _perturbed(
     site: LinearSite,
     schedule: Schedule,
     steps: Mapping[int, Matrix],
@@ -131,7 +136,7 @@ def _shaken(
         return np.asarray(matrix * (1 + size * UNIT * random.uniform(-1, 1, matrix.shape)))
 
     errors = [size * UNIT * np.abs(one) for one in frame]
-    for _ in range(SHAKES):
+    for _ in range(PERTURBED_FRAMES):
         other = compose_rows(
             every_matrix(site, moved), schedule, {duration: moved(step) for duration, step in steps.items()}
         )

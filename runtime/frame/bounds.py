@@ -76,4 +76,4 @@ def _check_columns(system: CompiledSystem, group: Group, mistakes: Mistakes) -> 
         wrong = np.flatnonzero(below | (values > high))
         if len(wrong):
             peer, value = f"{group.name}[{int(wrong[0]) + 1}]", float(values[wrong[0]])
-            _check_parameter(replace(parameter, value=value), f"{peer}.{name}", mistakes)
+            _check_parameter(replace(parameter, value=value, exact=None), f"{peer}.{name}", mistakes)

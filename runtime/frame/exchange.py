@@ -1,45 +1,25 @@
 """Who hears whom, with what weight and how late: the links of a scene between its peers.
 
 Takes: a `CompiledSystem` and its timings.
-Gives: `Exchange`, `build_exchange`, `arcs`, `check_mean`; `GraphMode`, `Surd`, `graph_modes`,
-`ring_mode`, `ring_values`.
-Guarantees: a complete graph, a ring and a star cost no more than their arcs; an eigenvalue that equal row
-sums make exact is exact, any other comes with a bound on its error.
-Does not: know what is sent, or when (see `scheduling`).
+Gives: `Exchange`, `build_exchange`, `arcs`, `check_mean`.
+Guarantees: a complete graph, a ring and a star cost no more than their arcs.
+Does not: know what is sent, or when (see `scheduling`), or a graph's eigenvalues (see `graph_modes`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-import flint
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Graph, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-
-
-# Backward error of LAPACK's eigenvalue solvers in units of n·UNIT·‖W‖_F: 'a modest constant' (LAPACK Users'
-# Guide, 3rd ed., section 4.7).
-EIGEN_ROUNDINGS = 10
-
-# Eigenvectors worse conditioned than this: the matrix can't be told from one that has no full set of them.
-WORST_CONDITION = 1e6
-
-# Beyond so many peers, a repeated row sum is not proven an eigenvalue of that multiplicity in exact
-# rationals.
-MOST_EXACT = 300
-
-# A prime for the quick look: the null space modulo a prime is at least as large as the true one.
-QUICK_PRIME = 2**61 - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,187 +145,3 @@ def check_mean(exchange: Exchange, peer: int, link: str, operator: str, hears: b
     if not total:
         what = f"the weights of what {name} hears over {link} add up to 0: there is no mean"
         raise ApcError(Mistake("E802", Place(exchange.scene), what))
-
-
-@dataclass(frozen=True, slots=True)
-class Surd:
-    """A real number known in closed form: `scale` · cos(2π · `turn`) · √`square`."""
-
-    scale: Fraction
-    turn: Fraction = Fraction(0)
-    square: int = 1
-
-
-@dataclass(frozen=True, slots=True)
-class GraphMode:
-    """An eigenvalue of W, held `multiplicity` times; with a positive imaginary part it stands for a pair.
-
-    `doubt` bounds its error; `common` says that all peers move alike in it. `surd` is what it is exactly,
-    where `doubt` is not zero and there is a closed form.
-    """
-
-    real: Fraction
-    imaginary: Fraction
-    multiplicity: int
-    doubt: float
-    common: bool
-    surd: Surd | None = None
-
-    @property
-    def value(self) -> complex:
-        """The eigenvalue."""
-        return complex(self.real, self.imaginary)
-
-
-def graph_modes(graph: Graph, peers: int, *, mean: bool) -> tuple[GraphMode, ...] | None:
-    """Return the eigenvalues of a graph's W, or None when it may lack a full set of eigenvectors.
-
-    Parameters
-    ----------
-    graph
-        The graph.
-    peers
-        The number N of peers.
-    mean
-        Whether W's rows are divided by their sums.
-    """
-    n = peers
-    if graph.shape == "ring" and n > 2:
-        return tuple(ring_mode(k, n, mean=mean) for k in range(n // 2 + 1))
-    if graph.shape == "star" and n > 2:
-        # The centre against the others, alike or opposite: ±1 of the mean, ±√(n−1) of the sum; the others
-        # apart.
-        root = math.isqrt(n - 1)
-        exact = mean or root**2 == n - 1
-        largest = Fraction(1) if mean else Fraction(root) if exact else Fraction(math.sqrt(n - 1))
-        doubt = 0.0 if exact else float(largest) * UNIT
-        return (
-            GraphMode(largest, Fraction(0), 1, doubt, mean, Surd(Fraction(1), square=n - 1)),
-            GraphMode(-largest, Fraction(0), 1, doubt, False, Surd(Fraction(-1), square=n - 1)),
-            GraphMode(Fraction(0), Fraction(0), n - 2, 0.0, False),
-        )
-    return _numeric_modes(graph, n, mean=mean)
-
-
-def ring_mode(k: int, n: int, *, mean: bool) -> GraphMode:
-    """Return an eigenvalue of a ring of n peers, a circulant: 2 cos(2πk/n) of the sum, k up to n/2."""
-    scale = Fraction(1, 2) if mean else Fraction(1)
-    times = 1 if 2 * k in (0, n) else 2
-    value = 2 * scale * _cosine(k, n)
-    return GraphMode(value, Fraction(0), times, _cosine_doubt(k, n), k == 0, Surd(2 * scale, Fraction(k, n)))
-
-
-def ring_values(n: int, *, mean: bool) -> Floats:
-    """Return the values of all `ring_mode`s (n // 2 + 1,), to rounding."""
-    return np.cos(2 * np.pi * np.arange(n // 2 + 1) / n) * (1.0 if mean else 2.0)
-
-
-def _cosine(k: int, n: int) -> Fraction:
-    """Return cos(2πk/n), exactly where it is rational (Niven: 0, ±1/2 and ±1 only)."""
-    turn = Fraction(k, n)
-    known = {
-        Fraction(0): Fraction(1),
-        Fraction(1, 6): Fraction(1, 2),
-        Fraction(1, 4): Fraction(0),
-        Fraction(1, 3): Fraction(-1, 2),
-        Fraction(1, 2): Fraction(-1),
-    }
-    return known[turn] if turn in known else Fraction(math.cos(2 * math.pi * k / n))
-
-
-def _cosine_doubt(k: int, n: int) -> float:
-    """Return a bound on the error of twice the cosine: of its argument, up to π, and of its own."""
-    return 0.0 if Fraction(k, n).denominator in (1, 2, 3, 4, 6) else 2 * (4 * math.pi + 2) * UNIT
-
-
-def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...] | None:
-    """Compute the eigenvalues of W, those that are one within their errors as one."""
-    pairs, weights = arcs(graph, n)
-    plain = np.zeros((n, n))
-    np.add.at(plain, (pairs[:, 1], pairs[:, 0]), weights)
-    sums = plain.sum(axis=1)
-    matrix = plain / sums[:, None] if mean else plain
-    size = EIGEN_ROUNDINGS * n * UNIT
-    if np.array_equal(plain, plain.T) and (not mean or np.all(sums > 0)):
-        # D⁻¹S is similar to D^(−1/2) S D^(−1/2): real, with a full set of eigenvectors.
-        root = np.sqrt(sums) if mean else np.ones(n)
-        symmetric = plain / root[:, None] / root
-        values = np.linalg.eigvalsh((symmetric + symmetric.T) / 2).astype(np.complex128)
-        doubt = size * float(np.linalg.norm(symmetric))
-    else:
-        values, vectors = np.linalg.eig(matrix)
-        condition = float(np.linalg.cond(vectors))
-        if not condition <= WORST_CONDITION:
-            return None
-        # Bauer and Fike: an eigenvalue moves no further than the condition times the matrix.
-        doubt = size * condition * float(np.linalg.norm(matrix))
-    exact_sum = _row_sum(plain, mean=mean)
-    modes = []
-    for cluster in _clusters(values, doubt):
-        centre = complex(np.mean(values[cluster]))
-        spread = doubt + float(np.abs(values[cluster] - centre).max())
-        if exact_sum is not None and abs(centre - float(exact_sum)) <= spread:
-            found = _is_exact(graph, n, exact_sum, len(cluster), mean=mean)
-            modes.append(
-                GraphMode(exact_sum, Fraction(0), len(cluster), 0.0 if found else spread, common=True)
-            )
-        elif abs(centre.imag) <= spread:
-            modes.append(
-                GraphMode(Fraction(centre.real), Fraction(0), len(cluster), spread + abs(centre.imag), False)
-            )
-        elif centre.imag > 0:  # its conjugate has a cluster of its own
-            modes.append(GraphMode(Fraction(centre.real), Fraction(centre.imag), len(cluster), spread, False))
-    return tuple(sorted(modes, key=lambda mode: (not mode.common, -mode.real, mode.imaginary)))
-
-
-def _clusters(values: NDArray[np.complex128], doubt: float) -> list[Integers]:
-    """Group the eigenvalues that can't be told apart, by their places."""
-    cluster = np.arange(len(values))
-    for i in range(len(values)):
-        near = np.unique(cluster[np.abs(values - values[i]) <= 2 * doubt])
-        cluster[np.isin(cluster, near)] = near[0]
-    return [np.flatnonzero(cluster == one) for one in np.unique(cluster)]
-
-
-def _row_sum(plain: Floats, *, mean: bool) -> Fraction | None:
-    """Return what all rows of W add up to exactly, or None when they differ."""
-    if mean:
-        return Fraction(1)
-    sums = {sum(map(Fraction, row[row != 0].tolist()), Fraction(0)) for row in plain}
-    return sums.pop() if len(sums) == 1 else None
-
-
-def _is_exact(graph: Graph, n: int, value: Fraction, multiplicity: int, *, mean: bool) -> bool:
-    """Say whether W − value is proven to have a null space of exactly this dimension.
-
-    Equal row sums make it one at least; modulo a prime it is never smaller than over the rationals.
-    """
-    pairs, weights = arcs(graph, n)
-    rows: dict[tuple[int, int], Fraction] = {}
-    for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
-        rows[receiver, sender] = rows.get((receiver, sender), Fraction(0)) + Fraction(weight)
-    for peer in range(n):
-        rows.setdefault((peer, peer), Fraction(0))
-    if mean:  # D (D⁻¹S − value) has the same null space
-        degree = [Fraction(0)] * n
-        for (receiver, _), weight in rows.items():
-            degree[receiver] += weight
-        for peer in range(n):
-            rows[peer, peer] -= value * degree[peer]
-    else:
-        for peer in range(n):
-            rows[peer, peer] -= value
-    quick = flint.nmod_mat(n, n, QUICK_PRIME)
-    for place, entry in rows.items():
-        if entry.denominator % QUICK_PRIME == 0:
-            return False
-        quick[place] = entry.numerator * pow(entry.denominator, -1, QUICK_PRIME) % QUICK_PRIME
-    nullity = n - quick.rank()
-    if nullity == multiplicity == 1:
-        return True
-    if n > MOST_EXACT or nullity < multiplicity:
-        return False
-    matrix = flint.fmpq_mat(n, n)
-    for place, entry in rows.items():
-        matrix[place] = flint.fmpq(entry.numerator, entry.denominator)
-    return bool(n - matrix.rref()[1] == multiplicity)

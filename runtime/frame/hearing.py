@@ -1,7 +1,7 @@
 """Whom the receives of a group hear: over which ways, and which channel on each.
 
 Takes: a `CompiledSystem`, the patterns of its kinds, the exchange, the receives that matter.
-Gives: `Ears`, `ears_of`.
+Gives: `Hearing`, `hearing_of`.
 Guarantees: a way for each delay among the senders; nobody who doesn't send is on one.
 Does not: know when anything is sent or heard.
 """
@@ -18,16 +18,16 @@ from apc.runtime.frame.schedule import Way
 from apc.runtime.frame.site import LinearSite
 
 # For each clock partition and receive: the ways it hears, and the channel of the link on each.
-Ears = tuple[tuple[tuple[tuple[Way, str], ...], ...], ...]
+Hearing = tuple[tuple[tuple[tuple[Way, str], ...], ...], ...]
 
 
-def ears_of(
+def hearing_of(
     system: CompiledSystem,
     patterns: Sequence[LinearSite],
     exchange: Exchange,
     group: int,
     read: Sequence[frozenset[tuple[int, int]]],
-) -> Ears:
+) -> Hearing:
     """Return what the receives of a group hear.
 
     Parameters

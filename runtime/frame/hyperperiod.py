@@ -1,21 +1,21 @@
 """Exact time: the quantum that all times are multiples of, and the hyperperiod of the clocks, the frame.
 
 Takes: a `CompiledSystem`, its timings as exact rationals, what matters of its kinds.
-Gives: `Times`, `ClockGrid`, `times_in_use`; `common_divisor`.
+Gives: `Times`, `ClockGrid`, `times_in_use`.
 Guarantees: every period, phase and delay in use is a whole number of quanta; what nobody uses takes no part.
 Does not: say what happens at an instant (see `scheduling`).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.compiled import Clock, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.hearing import Ears
+from apc.compiler.multiples import common_divisor, common_multiple
+from apc.runtime.frame.hearing import Hearing
 from apc.runtime.frame.liveness import live_holds
 from apc.runtime.frame.site import LinearSite
 
@@ -54,7 +54,7 @@ def times_in_use(
     timings: Mapping[str, Fraction],
     patterns: Sequence[LinearSite],
     live: Sequence[frozenset[tuple[int, int]]],
-    ears: Sequence[Ears],
+    hearing: Sequence[Hearing],
 ) -> Times:
     """Find the quantum of which every period, phase and delay in use is a multiple, and the frame.
 
@@ -64,7 +64,7 @@ def times_in_use(
         The compiled scene, and seconds by the name of the timing.
     patterns, live
         The structural pattern of each kind, and its outputs that matter (see `liveness`).
-    ears
+    hearing
         What the receives of each group hear.
 
     Raises
@@ -83,7 +83,7 @@ def times_in_use(
         for hold, used in zip(pattern.kind.holds, live_holds(pattern, outputs), strict=True):
             if used:
                 delays[hold.delay] = timings[hold.delay]
-    for way, _ in (pair for own in ears for partition in own for receive in partition for pair in receive):
+    for way, _ in (pair for own in hearing for partition in own for receive in partition for pair in receive):
         clock = link_of[way.link].clock
         clocks[clock] = clock_of[clock]
         delays[way.delay] = timings[way.delay]
@@ -95,7 +95,7 @@ def times_in_use(
     }
     quantum = common_divisor([*period.values(), *phase.values(), *delays.values()])
     count = {name: int(value / quantum) for name, value in period.items()}
-    frame = math.lcm(*count.values())
+    frame = int(common_multiple(period.values()) / quantum)
     _check_frame_length(system, period, count, frame, quantum)
     return Times(
         quantum=quantum,
@@ -122,10 +122,3 @@ def _check_frame_length(
         )
         hint = "periods that are simple multiples of one another"
         raise ApcError(Mistake("E805", Place(system.name), what, hint=hint))
-
-
-def common_divisor(times: Iterable[Fraction]) -> Fraction:
-    """Return the largest rational of which every time is a whole multiple."""
-    listed = list(times)
-    denominator = math.lcm(*(time.denominator for time in listed))
-    return Fraction(math.gcd(*(int(time * denominator) for time in listed)), denominator)

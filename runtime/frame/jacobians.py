@@ -1,7 +1,8 @@
 """The Jacobians of a kind, as one CasADi function of everything they may depend on.
 
 Takes: a kind of a `CompiledSystem`.
-Gives: `SiteJacobians` (built once a kind), `jacobians`; `Edge`, `edge_name`.
+Gives: `SiteJacobians` (built once a kind), `jacobians`; `Edge`, `edge_name`;
+`structural_pattern`.
 Guarantees: structural patterns come from CasADi, whatever the numbers; a kind that is called affine has the
 same Jacobians everywhere.
 Does not: evaluate them (see `linearize`).
@@ -19,6 +20,7 @@ from typing import Any
 
 import casadi
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.compiled import ClockPartition, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -114,7 +116,9 @@ def jacobians(kind: Kind) -> SiteJacobians:
         and all(edge.affine for edge in edges.values())
     )
     listening = [_listening(kind, p, edges) for p in range(len(kind.clocks))]
-    pattern = assemble(kind, affine, [_pattern(block) for block in blocks], [heard for _, heard in listening])
+    pattern = assemble(
+        kind, affine, [structural_pattern(block) for block in blocks], [heard for _, heard in listening]
+    )
     own = [parts for parts, _ in listening]
     return SiteJacobians(
         kind=kind,
@@ -130,6 +134,15 @@ def edge_name(partition: ClockPartition, receive: Receive) -> str:
     """Return the name of a receive that looks at every sender by itself, "" for a plain sum or mean."""
     plain = receive.edge is None and receive.operator in ("sum", "mean")
     return "" if plain else f"{partition.clock}: {receive.name}"
+
+
+def structural_pattern(block: Any) -> NDArray[np.bool_]:
+    """Return the structural nonzeros of a CasADi matrix, or of a sparsity, as truth values."""
+    sparsity = block if isinstance(block, casadi.Sparsity) else block.sparsity()
+    pattern = np.zeros(sparsity.shape, dtype=np.bool_)
+    rows, columns = sparsity.get_triplet()
+    pattern[rows, columns] = True
+    return pattern
 
 
 def _refuse_loop_with_edges(kind: Kind) -> None:
@@ -182,15 +195,7 @@ def _listening(
         function = edges[p, place].function
         symbols = function.sx_in()
         moving = casadi.vertcat(*symbols[:4])
-        depends = _pattern(casadi.jacobian(function(*symbols)[0], moving))[0]
+        depends = structural_pattern(casadi.jacobian(function(*symbols)[0], moving))[0]
         own.append(depends[:inside])
         channels.append(tuple(np.flatnonzero(depends[inside:]).tolist()))
     return own, tuple(channels)
-
-
-def _pattern(block: Any) -> Matrix:
-    """Return the structural nonzeros of a CasADi matrix as truth values."""
-    pattern = np.zeros((block.size1(), block.size2()), dtype=bool)
-    rows, columns = block.sparsity().get_triplet()
-    pattern[rows, columns] = True
-    return pattern

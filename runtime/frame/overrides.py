@@ -37,7 +37,7 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
         E621 not of that form, E622 no such parameter, E623 the number of peers is not a parameter to set;
         and those of `units.quantity`: the unit has to fit.
     """
-    # Imported here: reading a unit brings in pint, which an analysis without overrides never needs.
+    # Imported here: the language of quantities, which an analysis without overrides never needs.
     from apc.compiler.language.units import quantity
 
     name, equals, value = text.partition("=")
@@ -59,7 +59,8 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     Raises
     ------
     ApcError
-        E624 a value beyond the parameter's bounds, E625 a time that can't be.
+        E622 a group's own value for what a time of all groups depends on, E624 a value beyond the
+        parameter's bounds, E625 a time that can't be.
     """
     if not overrides:
         return system
@@ -70,10 +71,13 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     groups = []
     for group in system.groups:
         own = {one.name: one.value for one in overrides if one.group == group.name}
-        # Set for everybody means for this group as well: its own old value goes.
-        values = {value.name: value for value in group.values if value.name not in everywhere}
+        # Set for everybody means for this group as well: its own old value goes. A time of its own stays.
+        shared = {name: value for name, value in everywhere.items() if f"{group.name}.{name}" not in timings}
+        values = {value.name: value for value in group.values if value.name not in shared}
         values |= {name: parameters[name] for name in own if name not in values}
-        scope = _Scope({**parameters, **values}, timings, {**everywhere, **own})
+        if own:
+            _check_times(group.name, _Scope({**parameters, **values}, timings, own), system.timings)
+        scope = _Scope({**parameters, **values}, timings, {**shared, **own})
         # What a group leaves to everybody is its own as soon as it depends on a value of its own.
         values |= {
             name: parameter
@@ -100,6 +104,23 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     return changed
 
 
+def _check_times(group: str, scope: _Scope, timings: Sequence[Timing]) -> None:
+    """Refuse what a group sets for itself where a time for all groups depends on it.
+
+    Parameters
+    ----------
+    group, scope
+        The group, and a scope that only its own overrides reach.
+    timings
+        The times before any override.
+    """
+    for timing in timings:
+        if scope.timing(timing.name) is not timing:
+            what = f"{timing.name} is one time for all groups, and depends on what is set for {group}"
+            hint = "the same without the group, or a group with a set of its own"
+            raise ApcError(Mistake("E622", OVERRIDE, what, hint=hint))
+
+
 class _Scope:
     """Parameters and timings as one group sees them, with the overrides that reach it."""
 
@@ -122,7 +143,7 @@ class _Scope:
         if value is None:
             return parameter
         kept = None if name in self._overridden else parameter.expression
-        return replace(parameter, value=float(value), expression=kept)
+        return replace(parameter, value=float(value), exact=value, expression=kept)
 
     def timing(self, name: str) -> Timing:
         """Return a timing with its value in this scope."""
@@ -170,5 +191,4 @@ class _Scope:
             return changed
         if name in self._timings:
             return self._timings[name].value
-        # The shortest decimal of the float is what stood in the text, mostly: 0.008 is 1/125 again.
-        return Fraction(repr(float(self._parameters[name].value)))
+        return self._parameters[name].number

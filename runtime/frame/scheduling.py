@@ -18,7 +18,7 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import Exchange, build_exchange
-from apc.runtime.frame.hearing import Ears, ears_of
+from apc.runtime.frame.hearing import Hearing, hearing_of
 from apc.runtime.frame.hyperperiod import ClockGrid, Times, times_in_use
 from apc.runtime.frame.liveness import live_holds, live_outputs, live_receives
 from apc.runtime.frame.schedule import (
@@ -81,12 +81,12 @@ def build_schedules(
     exchange = build_exchange(system, timings)
     live = [live_outputs(pattern) for pattern in patterns]
     read = [live_receives(pattern, outputs) for pattern, outputs in zip(patterns, live, strict=True)]
-    ears = [ears_of(system, patterns, exchange, group, read) for group in range(len(system.groups))]
-    times = times_in_use(system, timings, patterns, live, ears)
+    hearing = [hearing_of(system, patterns, exchange, group, read) for group in range(len(system.groups))]
+    times = times_in_use(system, timings, patterns, live, hearing)
 
-    known: dict[tuple[int, Ears], dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]] = {}
+    known: dict[tuple[int, Hearing], dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]] = {}
     depth: dict[Sent, int] = {}
-    for group, own in zip(system.groups, ears, strict=True):
+    for group, own in zip(system.groups, hearing, strict=True):
         if (group.kind, own) not in known:
             heard = _heard_at_ticks(patterns[group.kind], exchange, live[group.kind], own, times, rank, kept)
             known[group.kind, own] = heard
@@ -102,7 +102,7 @@ def build_schedules(
         (kind, own): _build(patterns[kind], system, live[kind], heard, depth, times, rank)
         for (kind, own), heard in known.items()
     }
-    return tuple(built[group.kind, own] for group, own in zip(system.groups, ears, strict=True))
+    return tuple(built[group.kind, own] for group, own in zip(system.groups, hearing, strict=True))
 
 
 def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
@@ -123,7 +123,7 @@ def _heard_at_ticks(
     pattern: LinearSite,
     exchange: Exchange,
     live: frozenset[tuple[int, int]],
-    ears: Ears,
+    hearing: Hearing,
     times: Times,
     rank: Mapping[str, int],
     kept: Mapping[str, Kept],
@@ -143,7 +143,7 @@ def _heard_at_ticks(
         for index in range(times.frame // times.clocks[clock].period):
             heard[p, index] = tuple(
                 tuple(row for way, channel in receive for row in rows(way, channel, clock, index))
-                for receive in ears[p]
+                for receive in hearing[p]
             )
     return heard
 

@@ -4,7 +4,8 @@ Takes: one group of equal peers, what it weighs its neighbours by, and the eigen
 Gives: `Extremes`, `find_extremes`.
 Guarantees: every system that is left out has all its eigenvalues within `below`: whole intervals of graph
 eigenvalues are shown to be so from their middles, rounding included.
-Does not: compute the graph's eigenvalues (see `exchange`), or solve the systems that decide (see `spectrum`).
+Does not: compute the graph's eigenvalues (see `graph_modes`), or solve the systems that decide (see
+`spectrum`).
 
 A site that hears μ times what it sent moves by a matrix M(μ) = M₀ + μ M₁. At the middle c of an interval,
 X⁻¹ M(c) X is diagonal but for a block of what dies out at once, and X⁻¹ M(μ) X differs from it by (μ − c) G,

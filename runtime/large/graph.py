@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from apc.runtime.eigen.graph_loops import common_graph, graph_loop, graph_scale
+from apc.runtime.eigen.graph_modes import ring_mode, ring_values
 from apc.runtime.eigen.modes import Arrangement
 from apc.runtime.eigen.peer_group import PeerGroup, used_ways
 from apc.runtime.eigen.rigid import find_rigid_modes
 from apc.runtime.eigen.spectrum import Spectrum, judge
-from apc.runtime.frame.exchange import Exchange, ring_mode, ring_values
+from apc.runtime.frame.exchange import Exchange
 
 # From so many eigenvalues on.
 MANY = 128

@@ -15,7 +15,7 @@ difference is what roundings of this size amount to.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -103,7 +103,7 @@ class Comparison:
         return ErrorEstimate(self.kind, self.compared, tuple(found))
 
 
-def compare_with(simulation: Simulation, *, signals: Sequence[str] = (), jit: bool = True) -> Comparison:
+def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> Comparison:
     """Prepare the closer run of a simulation.
 
     Parameters
@@ -112,19 +112,10 @@ def compare_with(simulation: Simulation, *, signals: Sequence[str] = (), jit: bo
         What is to be judged.
     signals
         The patterns that it was prepared with.
-    jit
-        Whether to compile to machine code where there is a C compiler.
     """
-    method, factor = finer(simulation.method, all_linear=not simulation.tolerances)
-    closer = prepare(
-        simulation.system,
-        simulation.duration,
-        signals=signals,
-        jit=jit,
-        seed=simulation.seed,
-        method=method,
-    )
-    if method.shaken:
+    method, factor = finer(simulation.settings.method, all_linear=not simulation.tolerances)
+    closer = prepare(simulation.system, replace(simulation.settings, method=method), signals=signals)
+    if method.perturbed:
         return Comparison(closer, "rounding", "coefficients off by one rounding", factor)
     if method.step is not None:
         return Comparison(closer, "method", f"half the step, {method}", factor)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.gathering import Arrivals
 from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.timetable import Timetable
+from apc.runtime.network.gathering import Arrivals
+from apc.runtime.network.timetable import Timetable
 from apc.runtime.simulate.forcing import impulses
 from apc.runtime.simulate.simulation import Simulation
 
@@ -64,7 +64,7 @@ def blocks(simulation: Simulation, *, run: int = 0) -> Iterator[Block]:
         E872 an equation has no solution at some instant, E915 a motion can't be integrated any further; what
         was before is yielded first.
     """
-    last = int(simulation.duration / simulation.quantum)  # rounds down
+    last = int(simulation.settings.duration / simulation.quantum)  # rounds down
     runner = _Runner(simulation, run)
     for first in range(0, last // simulation.frame + 1, simulation.length):
         block = runner.run(first, last)

@@ -1,6 +1,6 @@
 """Many runs of one scene, each with packets of its own, and what they have in common.
 
-Takes: a `CompiledSystem`, a duration, how many runs, a seed.
+Takes: a `CompiledSystem`, its `Settings`, how many runs.
 Gives: `Run`, `Ensemble`, `play_many`; `ensemble_text`.
 Guarantees: run k is the same whoever plays it, in whatever order, however many there are; a share and a mean
 stand with how far chance may have moved them; on Ctrl-C the runs that are done are kept.
@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
@@ -30,7 +30,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted
 from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.methods import DEFAULT, Method
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import Simulation, prepare
 from apc.runtime.simulate.summary import Watch
 from apc.runtime.threads import single_threaded
@@ -141,13 +141,10 @@ def share_interval(count: int, total: int) -> tuple[float, float]:
 
 def play_many(
     system: CompiledSystem,
-    duration: Fraction,
+    settings: Settings,
     *,
     runs: int,
-    seed: int | None = None,
     jobs: int = 1,
-    jit: bool = True,
-    method: Method = DEFAULT,
     progress: Callable[[int], None] | None = None,
 ) -> Ensemble:
     """Play a scene many times, each time with other packets.
@@ -156,18 +153,12 @@ def play_many(
     ----------
     system
         The compiled scene.
-    duration
-        Of each run, in seconds.
+    settings
+        How each run is played; run k of a seed is always the same.
     runs
         How many, 1 or more.
-    seed
-        The experiment's if not given; run k of a seed is always the same.
     jobs
         How many processes share the work; 1: this one alone.
-    jit
-        Whether to compile to machine code where there is a C compiler.
-    method
-        How the continuous states move between events.
     progress
         Is told how many runs are done.
 
@@ -180,14 +171,12 @@ def play_many(
     if not any(link.channel is not None for link in system.links):
         what = f"nothing in {system.name} is left to chance: every run would be the same"
         raise ApcError(Mistake("E894", Place(system.name), what, hint="links: {lan: {…, loss: 2 %}}"))
-    seed = system.experiment.seed if seed is None else seed
+    seed = system.experiment.seed if settings.seed is None else settings.seed
+    settings = replace(settings, seed=seed)
     parts = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
     done: list[Run] = []
     interrupted = False
-    if jobs == 1:
-        work = _here(system, duration, seed, jit, method, parts)
-    else:
-        work = _shared(system, duration, seed, jit, method, parts, jobs)
+    work = _here(system, settings, parts) if jobs == 1 else _shared(system, settings, parts, jobs)
     try:
         for found in work:
             done += found
@@ -198,25 +187,17 @@ def play_many(
             raise
         interrupted = True
     done.sort(key=lambda run: run.number)
-    return Ensemble(system.name, duration, seed, tuple(done), interrupted)
+    return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted)
 
 
-def _here(
-    system: CompiledSystem, duration: Fraction, seed: int, jit: bool, method: Method, parts: Sequence[range]
-) -> Iterator[list[Run]]:
-    simulation = prepare(system, duration, jit=jit, seed=seed, method=method)
+def _here(system: CompiledSystem, settings: Settings, parts: Sequence[range]) -> Iterator[list[Run]]:
+    simulation = prepare(system, settings)
     for part in parts:
         yield [_played(simulation, number) for number in part]
 
 
 def _shared(
-    system: CompiledSystem,
-    duration: Fraction,
-    seed: int,
-    jit: bool,
-    method: Method,
-    parts: Sequence[range],
-    jobs: int,
+    system: CompiledSystem, settings: Settings, parts: Sequence[range], jobs: int
 ) -> Iterator[list[Run]]:
     """Yield the runs as processes, each started afresh, get them done."""
     with tempfile.TemporaryDirectory() as folder:
@@ -225,9 +206,7 @@ def _shared(
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(min(jobs, len(parts)), context, _ignore_interrupts)
         try:
-            waiting = [
-                pool.submit(_part, str(path), str(duration), seed, jit, method, part) for part in parts
-            ]
+            waiting = [pool.submit(_part, str(path), settings, part) for part in parts]
             for future in as_completed(waiting):
                 yield future.result()
         except BrokenProcessPool:
@@ -242,15 +221,15 @@ def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _part(path: str, duration: str, seed: int, jit: bool, method: Method, part: range) -> list[Run]:
+def _part(path: str, settings: Settings, part: range) -> list[Run]:
     with single_threaded():
-        simulation = _opened(path, duration, seed, jit, method)
+        simulation = _opened(path, settings)
         return [_played(simulation, number) for number in part]
 
 
 @lru_cache(maxsize=1)
-def _opened(path: str, duration: str, seed: int, jit: bool, method: Method) -> Simulation:
-    return prepare(store.load(Path(path)), Fraction(duration), jit=jit, seed=seed, method=method)
+def _opened(path: str, settings: Settings) -> Simulation:
+    return prepare(store.load(Path(path)), settings)
 
 
 def _played(simulation: Simulation, number: int) -> Run:

@@ -149,7 +149,7 @@ def _integrated(
     size = np.maximum(magnitude(found, g), size)
     off = ~(apart <= AGREE * size).all(axis=1)
     if off.any():  # it may be that of rounding the instants, which no halving mends
-        some = found if len(found.after) == 1 else Panels(found.after[off], found.weights[off])
+        some = found if len(found.after) == 1 else found.chosen(off)
         drift = at_instants(site.forcing.drift, site.parameters, instants[off])
         moved = magnitude(some, np.where(np.isfinite(drift), drift, 0.0))
         off[off] = ~(apart[off] <= AGREE * (size[off] + moved)).all(axis=1)

@@ -62,7 +62,7 @@ def size_note(simulation: Simulation, *, decimal: bool) -> str:
     decimal
         Whether the file is a text.
     """
-    frames = int(simulation.duration / (simulation.frame * simulation.quantum))
+    frames = int(simulation.settings.duration / (simulation.frame * simulation.quantum))
     rows, columns = frames * len(simulation.marks), len(simulation.signals) + 1
     size = rows * columns * (DECIMAL if decimal else BINARY)
     if size < LARGE:

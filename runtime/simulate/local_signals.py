@@ -1,7 +1,7 @@
 """What can be recorded of one site: its states, what its clocks compute, what its holds put out.
 
 Takes: a `Kind` and its `Schedule`.
-Gives: `LocalSignal`, `local_signals`; `ticking_partitions`.
+Gives: `LocalSignal`, `local_signals`; `sent_states`, `ticking_partitions`.
 Guarantees: a value that acts later than it is computed is two signals, any other is one.
 Does not: know other peers (see `signals`).
 """
@@ -9,6 +9,8 @@ Does not: know other peers (see `signals`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+import casadi
 
 from apc.compiler.compiled import Kind
 from apc.runtime.frame.schedule import Act, Propagate, Schedule, Tick
@@ -51,6 +53,22 @@ def local_signals(kind: Kind, schedule: Schedule) -> tuple[LocalSignal, ...]:
             unit = kind.clocks[p].units[hold.output]
             found.append(LocalSignal(f"{hold.name} acting", unit, "hold", (h,)))
     return tuple(found)
+
+
+def sent_states(kind: Kind) -> tuple[int, ...]:
+    """Return the states, by their places, that a site sends to others as they are."""
+    found = []
+    for sending in kind.sends:
+        if sending.send.is_a("SXFunction"):
+            inputs = sending.send.sx_in()
+            channels = sending.send(*inputs)
+            found += [
+                place
+                for row in range(channels.numel())
+                for place in range(len(kind.states))
+                if casadi.is_equal(channels[row], inputs[0][place])
+            ]
+    return tuple(dict.fromkeys(found))
 
 
 def ticking_partitions(schedule: Schedule) -> list[int]:

@@ -3,7 +3,7 @@
 Takes: a group's program, its different sites, which of them each peer is.
 Gives: `Member`, `build_member`.
 Guarantees: what many peers have in common is kept once.
-Does not: know the other members (see `ear`, `population`).
+Does not: know the other members (see `frame_packets`, `population`).
 """
 
 from __future__ import annotations

@@ -39,13 +39,13 @@ MOST_STEPS = 10**6  # between two events
 class Method:
     """`step` in seconds is of the methods with a fixed step, `tolerance` (relative) of CVODES.
 
-    `shaken` marks a run that shows what roundings do: every coefficient of its transitions is off by one.
+    `perturbed` marks a run that shows what roundings do: every coefficient of its transitions is off by one.
     """
 
     name: str
     step: Fraction | None = None
     tolerance: float | None = None
-    shaken: bool = False
+    perturbed: bool = False
 
     def __str__(self) -> str:
         """Return it as it is written on a command line."""
@@ -86,7 +86,7 @@ def parse_method(text: str) -> Method:
         return Method(EXACT)
     if name == CVODES:
         return Method(CVODES, tolerance=_tolerance(size, place))
-    # Imported here: reading a unit brings in pint, which most runs do not need.
+    # Imported here: the language of quantities, which most runs do not need.
     from apc.compiler.language.units import quantity
 
     if not size:
@@ -165,6 +165,6 @@ def finer(method: Method, *, all_linear: bool) -> tuple[Method, float]:
     if method.step is not None:
         return replace(method, step=method.step / 2), 1 / (1 - 0.5 ** ORDERS[method.name])
     if method.name == EXACT or (method.name == WHERE_NEEDED and all_linear):
-        return replace(method, shaken=True), 1.0
+        return replace(method, perturbed=True), 1.0
     assert method.tolerance is not None
     return replace(method, tolerance=method.tolerance / TIGHTER), 1.0

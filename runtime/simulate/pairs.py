@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.gathering import Gathering, Listeners
 from apc.runtime.frame.jacobians import edge_name
 from apc.runtime.frame.schedule import Heard
+from apc.runtime.network.gathering import Gathering, GroupPeers
+from apc.runtime.network.weights import weight_matrix
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -127,7 +128,7 @@ class Pairs:
     def __init__(
         self,
         exchange: Exchange,
-        members: Sequence[Listeners],
+        members: Sequence[GroupPeers],
         sending: Mapping[str, Sequence[bool]],
         gathering: Gathering,
         packet: Packet,
@@ -267,19 +268,9 @@ def _reduction(pair: Any, operator: str, listing: _Listing, count: int) -> Any:
         else:
             if operator == "mean":
                 weights = weights / np.bincount(receivers, weights, minlength=count)[receivers]
-            result = casadi.densify(values @ _sparse(weights, receivers, count))
+            places, shape = np.arange(len(receivers)), (len(receivers), count)
+            result = casadi.densify(values @ weight_matrix(weights, places, receivers, shape))
     return casadi.Function("look", [own, sent, missing, t], [result])
-
-
-def _sparse(weights: Floats, receivers: Integers, count: int) -> Any:
-    """Return the matrix (M, count) that adds up what each receiver hears, each with its weight."""
-    import scipy.sparse
-
-    places = np.arange(len(receivers))
-    shape = (len(receivers), count)
-    whole = scipy.sparse.coo_array((weights, (places, receivers)), shape=shape).tocsc()
-    whole.sort_indices()  # CasADi wants the rows of a column in order
-    return casadi.DM(whole)
 
 
 def _joined(values: Any, receivers: Integers, join: Callable[[Any, Any], Any]) -> Any:

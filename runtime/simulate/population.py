@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.gathering import Gate
 from apc.runtime.frame.schedule import Propagate, Schedule, Tick
-from apc.runtime.simulate.ear import Ear
+from apc.runtime.network.gathering import Gate
+from apc.runtime.simulate.frame_packets import FramePackets
 from apc.runtime.simulate.member import Member
 
 Floats = NDArray[np.float64]
@@ -121,7 +121,7 @@ def build_population(
     looked = [pairwise.pair.function for segment in segments for pairwise in segment.pairs]
     found = _distinct([*(segment.kernel for segment in segments), *looked])
     ready = dict(zip(found, kernels(list(found.values())), strict=True))
-    ear = Ear(system, exchange, members, gates)
+    packets = FramePackets(system, exchange, members, gates)
     carries = [casadi.MX.sym(f"carry{g}", len(one.carry[0]), one.count) for g, one in enumerate(members)]
     histories = [
         casadi.MX.sym(f"history{g}", sum(one.program.schedule.depths), one.count)
@@ -133,15 +133,15 @@ def build_population(
     ]
     number = casadi.MX.sym("frame")
     constants = [casadi.DM(one.each(_constants(one)).T) for one in members]
-    ear.remember(histories)
+    packets.remember(histories)
     now, taken = list(carries), [0] * len(members)
     rows: list[list[Any]] = [[] for _ in members]
     for index in range(len(members[0].program.segments)):
         # All that is heard in a segment was sent before it began.
         heard = [
             casadi.vertcat(
-                ear.hear(g, member.program.segments[index]),
-                *ear.look(g, member.program.segments[index], now[g], constants[g], number, ready),
+                packets.hear(g, member.program.segments[index]),
+                *packets.look(g, member.program.segments[index], now[g], constants[g], number, ready),
             )
             for g, member in enumerate(members)
         ]
@@ -154,11 +154,11 @@ def build_population(
             every = pushed[:, member.rows.tolist()] if size else casadi.MX(0, member.count)
             now[g], sent, recorded = many(now[g], heard[g], constants[g], every, number)
             rows[g].append(recorded)
-            ear.send(g, segment, sent)
+            packets.send(g, segment, sent)
     frame = casadi.Function(
         "frame",
-        [*carries, *histories, *ear.gathering.held, *impulses, *ear.gathering.inputs, number],
-        [*now, *ear.histories(), *ear.gathering.finish(), *(casadi.vertcat(*one) for one in rows)],
+        [*carries, *histories, *packets.gathering.held, *impulses, *packets.gathering.inputs, number],
+        [*now, *packets.histories(), *packets.gathering.finish(), *(casadi.vertcat(*one) for one in rows)],
     )
     start = [one.each(one.carry) for one in members] + [_first_history(one) for one in members]
     start += [_first_held(gate, members) for gate in gates]

@@ -1,7 +1,7 @@
 """What a site's continuous states do from event to event: the exact transition of a linear partition.
 
 Takes: a `Kind` and parameter vectors.
-Gives: `Rates`, `rates`, `Transitions`, `transitions`, `shaken`; `nonlinear_rows`.
+Gives: `Rates`, `rates`, `Transitions`, `transitions`, `perturbed`; `nonlinear_rows`.
 Guarantees: no step size; every entry of a transition is right to the last digit but one.
 Does not: integrate what is not linear (see `flow`), or know what changes with time alone (see `forcing`).
 
@@ -24,6 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.discretize import discretize
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.guards import guards_of
+from apc.runtime.frame.jacobians import structural_pattern
 
 Floats = NDArray[np.float64]
 Pattern = NDArray[np.bool_]
@@ -62,7 +63,7 @@ def nonlinear_rows(kind: Kind) -> tuple[int, ...]:
     curved = _curved(speed, moving, t)
     if not curved:
         return ()
-    tied = _structure(kind.derivative.jac_sparsity(0, 0))
+    tied = structural_pattern(kind.derivative.jac_sparsity(0, 0))
     together = _closure(tied | tied.T)
     return tuple(np.flatnonzero(together[:, curved].any(axis=1)).tolist())
 
@@ -97,9 +98,11 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
     slopes = casadi.sparsify(kept) @ slopes
     timed = bool(still.numel() and casadi.depends_on(still, t))
     constant = type_.zeros(*still.shape) if timed else still
-    structure = _structure(slopes)
+    structure = structural_pattern(slopes)
     reach = _closure(structure[:, :n_x])
-    pushed = np.ones(n_x, dtype=bool) if type_ is casadi.MX else _structure(casadi.sparsify(still))[:, 0]
+    pushed = (
+        np.ones(n_x, dtype=bool) if type_ is casadi.MX else structural_pattern(casadi.sparsify(still))[:, 0]
+    )
     flat = casadi.vec(casadi.horzcat(casadi.densify(slopes), constant))
     own: Pattern = np.isin(np.arange(n_x), rest)
     return Rates(
@@ -113,7 +116,7 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
     )
 
 
-def shaken(exact: Transitions, seed: int) -> Transitions:
+def perturbed(exact: Transitions, seed: int) -> Transitions:
     """Return the same transitions with every number off by one rounding, up or down by chance.
 
     Parameters
@@ -184,15 +187,6 @@ def _curved(speed: Any, moving: Any, t: Any) -> list[int]:
         if (slopes[row, :].nnz() and casadi.depends_on(slopes[row, :], varies))
         or (isinstance(speed, casadi.SX) and guards_of(speed[row], moving))
     ]
-
-
-def _structure(block: Any) -> Pattern:
-    """Return the structural nonzeros of a CasADi matrix or sparsity as truth values."""
-    pattern = np.zeros((block.size1(), block.size2()), dtype=bool)
-    sparsity = block if isinstance(block, casadi.Sparsity) else block.sparsity()
-    rows, columns = sparsity.get_triplet()
-    pattern[rows, columns] = True
-    return pattern
 
 
 def _closure(a: Pattern) -> Pattern:

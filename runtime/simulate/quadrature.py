@@ -57,10 +57,18 @@ class Kernel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panels:
-    """Parts of an interval: `after` (k, 26) seconds from its start, `weights` (k or 1, 26, n_x, pushed)."""
+    """Parts of an interval: `after` (k, 26) seconds from its start, `weights` (k or 1, 26, n_x, pushed).
+
+    `sizes`, of the same shape, are what each weight is right to some roundings of.
+    """
 
     after: Floats
     weights: Floats
+    sizes: Floats
+
+    def chosen(self, which: NDArray[np.bool_]) -> Panels:
+        """Return some of the parts."""
+        return Panels(self.after[which], self.weights[which], self.sizes[which])
 
 
 def kernel_of(a: NDArray[Any], pushed: Sequence[int], duration: Fraction) -> Kernel:
@@ -87,7 +95,7 @@ def whole(kernel: Kernel) -> Panels:
     """Return the whole interval as one panel."""
     high = float(kernel.duration)
     weights = kernel.steps * (WEIGHTS * high / 2)[:, None, None]
-    return Panels(_nodes(np.zeros(1), np.array([high])), weights[None])
+    return Panels(_nodes(np.zeros(1), np.array([high])), weights[None], np.abs(weights)[None])
 
 
 def panels(kernel: Kernel, low: Floats, high: Floats) -> Panels:
@@ -96,10 +104,15 @@ def panels(kernel: Kernel, low: Floats, high: Floats) -> Panels:
     if kernel.smooth:
         through = _through_fine(2 * after.reshape(-1) / float(kernel.duration) - 1)
         steps = np.tensordot(through, kernel.steps[FIRST_FINE:], 1)
+        sizes = np.broadcast_to(np.abs(kernel.steps).max(axis=0), steps.shape)
     else:
-        steps = _exact(kernel.a, kernel.pushed, kernel.duration, after.reshape(-1))
-    own = (high - low)[:, None] * WEIGHTS / 2
-    return Panels(after, steps.reshape(*after.shape, *kernel.steps.shape[1:]) * own[:, :, None, None])
+        # Halved alike, many intervals have the same parts.
+        each, place = np.unique(after.reshape(-1), return_inverse=True)
+        steps = _exact(kernel.a, kernel.pushed, kernel.duration, each)[place]
+        sizes = np.abs(steps)
+    shape = (*after.shape, *kernel.steps.shape[1:])
+    own = ((high - low)[:, None] * WEIGHTS / 2)[:, :, None, None]
+    return Panels(after, steps.reshape(shape) * own, sizes.reshape(shape) * own)
 
 
 def integrate(found: Panels, g: Floats) -> tuple[Floats, Floats]:
@@ -112,24 +125,24 @@ def integrate(found: Panels, g: Floats) -> tuple[Floats, Floats]:
     g
         The forces (pushed, k, 26).
     """
-    terms, weights = _flat(found, g)
+    terms, weights = _flat(found.weights, g)
     first = FIRST_FINE * len(g)
     fine = _summed(terms[:, first:], weights[:, first:])
     return fine, np.abs(fine - _summed(terms[:, :first], weights[:, :first]))
 
 
 def magnitude(found: Panels, g: Floats) -> Floats:
-    """Return what the terms of the fine rule add up to, each without its sign (k, n_x); g as for `integrate`."""
-    terms, weights = _flat(found, g)
+    """Return what the terms of the fine rule are right to some roundings of (k, n_x); g as for `integrate`."""
+    terms, sizes = _flat(found.sizes, g)
     first = FIRST_FINE * len(g)
-    return _summed(np.abs(terms[:, first:]), np.abs(weights[:, first:]))
+    return _summed(np.abs(terms[:, first:]), sizes[:, first:])
 
 
-def _flat(found: Panels, g: Floats) -> tuple[Floats, Floats]:
+def _flat(weights: Floats, g: Floats) -> tuple[Floats, Floats]:
     """Return the forces (k, nodes and pushed) and the weights (k or 1, nodes and pushed, n_x)."""
-    k, _, states, pushed = found.weights.shape
-    weights = found.weights.transpose(0, 1, 3, 2).reshape(k, len(NODES) * pushed, states)
-    return g.transpose(1, 2, 0).reshape(g.shape[1], len(NODES) * pushed), weights
+    k, _, states, pushed = weights.shape
+    flat = weights.transpose(0, 1, 3, 2).reshape(k, len(NODES) * pushed, states)
+    return g.transpose(1, 2, 0).reshape(g.shape[1], len(NODES) * pushed), flat
 
 
 def _summed(terms: Floats, weights: Floats) -> Floats:

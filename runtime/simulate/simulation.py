@@ -1,13 +1,13 @@
 """A scene made ready to be played in time: one function for a stretch of frames of all peers.
 
-Takes: a `CompiledSystem`, the duration, the signals wanted, the method. Gives: `Simulation`, `prepare`.
+Takes: a `CompiledSystem`, its `Settings`, the signals wanted. Gives: `Simulation`, `prepare`.
 Guarantees: time is counted in whole quanta; what would not fit the memory is refused before it is built.
 Does not: play it (see `blocks`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -18,25 +18,26 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exchange import Exchange, build_exchange
-from apc.runtime.frame.gathering import Gate, build_gates, kept_links
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.parameters import Numbers, resolve
 from apc.runtime.frame.schedule import Kept, Propagate, Schedule
 from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.frame.site import LinearSite
-from apc.runtime.frame.timetable import Route, routes_of
+from apc.runtime.network.gathering import Gate, build_gates, kept_links
+from apc.runtime.network.timetable import Route, routes_of
 from apc.runtime.simulate.flow import Flow, Tolerance, flow_of, rows_to_move
 from apc.runtime.simulate.forcing import SiteForcing, forcing_of
 from apc.runtime.simulate.local_signals import LocalSignal, local_signals
 from apc.runtime.simulate.member import Member, build_member
-from apc.runtime.simulate.methods import CVODES, DEFAULT, EXACT, WHERE_NEEDED, Method, check_step
+from apc.runtime.simulate.methods import CVODES, EXACT, WHERE_NEEDED, Method, check_step
 from apc.runtime.simulate.native import native
 from apc.runtime.simulate.pairs import count_pairs
 from apc.runtime.simulate.population import Population, build_population, exchanges_within, refuse_unheard_of
 from apc.runtime.simulate.program import Program
-from apc.runtime.simulate.propagate import Transitions, rates, shaken, transitions
+from apc.runtime.simulate.propagate import Transitions, perturbed, rates, transitions
 from apc.runtime.simulate.quadrature import Kernel, kernel_of
 from apc.runtime.simulate.scales import state_scales
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.signals import Choice, Signal, choose, signals_of
 from apc.runtime.simulate.writing import build_program
 from apc.runtime.trouble import finite_equations
@@ -65,19 +66,18 @@ class Simulation:
     those not in `ticks` make a row at time 0 only; `forces` are those that change with time, of each group's
     different sites. `chunk` is the frame of all peers, `length` times in a row;
     `compiled` says that it runs in machine code. `gates` are the unreliable links, `seed` is what their luck
-    begins from. `tolerances` are of the states that CVODES moves.
+    begins from: that of the settings, or of the experiment. `tolerances` are of the states that CVODES moves.
     """
 
     system: CompiledSystem
+    settings: Settings
     population: Population
     choices: tuple[Choice, ...]
     signals: tuple[Signal, ...]
     forces: tuple[tuple[SiteForcing, ...], ...]
     gates: tuple[Gate, ...]
     seed: int
-    method: Method
     tolerances: tuple[Tolerance, ...]
-    duration: Fraction
     quantum: Fraction
     frame: int
     marks: tuple[int, ...]
@@ -89,9 +89,10 @@ class Simulation:
     @property
     def how(self) -> str:
         """The method in words of a command line; what is exact throughout is called so."""
-        if self.method.name != WHERE_NEEDED:
-            return str(self.method)
-        return f"{self.method}, {CVODES}:{self.method.tolerance:g} elsewhere" if self.tolerances else EXACT
+        method = self.settings.method
+        if method.name != WHERE_NEEDED:
+            return str(method)
+        return f"{method}, {CVODES}:{method.tolerance:g} elsewhere" if self.tolerances else EXACT
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -100,31 +101,17 @@ class Simulation:
         return tuple(dict.fromkeys(listed))
 
 
-def prepare(
-    system: CompiledSystem,
-    duration: Fraction,
-    *,
-    signals: Sequence[str] = (),
-    jit: bool = True,
-    seed: int | None = None,
-    method: Method = DEFAULT,
-) -> Simulation:
+def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str] = ()) -> Simulation:
     """Do what comes before the first instant.
 
     Parameters
     ----------
     system
         The compiled scene.
-    duration
-        In seconds; the last row is that of the last tick until then.
+    settings
+        How it is played.
     signals
         Patterns of the signals to record, all if there is none; see `signals.choose`.
-    jit
-        Whether to compile to machine code where there is a C compiler.
-    seed
-        Of what is random; the experiment's if not given.
-    method
-        How the continuous states move between events.
 
     Raises
     ------
@@ -134,52 +121,83 @@ def prepare(
         step that does not fit; and those of `build_schedules`, `build_population` and `routes_of`.
     """
     refuse_unheard_of(system)
-    numbers = resolve(system)
     with finite_equations(system.name):
-        sites = [jacobians(kind) for kind in system.kinds]
-        flows = [_flow(system, numbers, place, site, method) for place, site in enumerate(sites)]
-        patterns = [site.pattern for site in sites]
-        exchange = build_exchange(system, numbers.timings)
-        routes = routes_of(system, numbers.timings, exchange)
-        schedules, kept = _schedules(system, numbers, patterns, routes)
-        _check_size(system, exchange, schedules)
-        _check_step(system, numbers, schedules, method)
-        available = [
-            local_signals(system.kinds[one.kind], s) for one, s in zip(system.groups, schedules, strict=True)
-        ]
-        choices = choose(system, available, signals)
-        _check_size(system, exchange, schedules, choices)
-        members = _members(system, numbers, exchange, schedules, choices, sites, flows, method)
+        plan = _plan(system, settings.method)
+        choices = _choices(plan, signals)
+        members = _members(plan, choices, settings.method)
+        gates = build_gates(plan.routes, plan.kept, plan.exchange, plan.schedules, members)
         compiled: list[bool] = []
 
         def kernels(functions: Sequence[Any]) -> Sequence[Any]:
-            ready = native(functions) if jit else functions
+            ready = native(functions) if settings.jit else functions
             compiled.append(any(new is not old for new, old in zip(ready, functions, strict=True)))
             return ready
 
-        gates = build_gates(routes, kept, exchange, schedules, members)
-        population = build_population(system, exchange, members, kernels, gates)
-    marks = schedules[0].marks[:-1]
-    length = _chunk_length(population.frame, duration, schedules[0].frame_s)
+        population = build_population(system, plan.exchange, members, kernels, gates)
+    schedule = plan.schedules[0]
+    marks = schedule.marks[:-1]
+    length = _chunk_length(population.frame, settings.duration, schedule.frame_s)
     return Simulation(
         system=system,
+        settings=settings,
         population=population,
         choices=choices,
         signals=signals_of(system, choices),
         forces=tuple(_forces(member) for member in members),
         gates=gates,
-        seed=system.experiment.seed if seed is None else seed,
-        method=method,
-        tolerances=_tolerances(system, flows),
-        duration=duration,
-        quantum=schedules[0].quantum,
-        frame=schedules[0].frame,
+        seed=system.experiment.seed if settings.seed is None else settings.seed,
+        tolerances=_tolerances(system, plan.flows),
+        quantum=schedule.quantum,
+        frame=schedule.frame,
         marks=marks,
-        ticks=frozenset(marks if _ticks_at_zero(system, numbers) else marks[1:]),
+        ticks=frozenset(marks if _ticks_at_zero(system, plan.numbers) else marks[1:]),
         compiled=compiled[0],
         length=length,
         chunk=population.frame.mapaccum("chunk", length, len(population.start)),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Plan:
+    """What the peers of a scene do in a frame, before a function of it is built.
+
+    `sites` are the Jacobians of each kind, `flows` what the method moves of it, `schedules` what happens in a
+    frame of each group; `routes` are what is heard over unreliable links, `kept` what is kept of each.
+    """
+
+    system: CompiledSystem
+    numbers: Numbers
+    exchange: Exchange
+    sites: tuple[SiteJacobians, ...]
+    flows: tuple[Flow | None, ...]
+    routes: tuple[Route, ...]
+    schedules: tuple[Schedule, ...]
+    kept: Mapping[str, Kept]
+
+
+def _plan(system: CompiledSystem, method: Method) -> _Plan:
+    """Find out what happens in a frame, and refuse what can't be played."""
+    numbers = resolve(system)
+    sites = tuple(jacobians(kind) for kind in system.kinds)
+    flows = tuple(_flow(system, numbers, place, site, method) for place, site in enumerate(sites))
+    exchange = build_exchange(system, numbers.timings)
+    routes = routes_of(system, numbers.timings, exchange)
+    schedules, kept = _schedules(system, numbers, [site.pattern for site in sites], routes)
+    _check_size(system, exchange, schedules)
+    _check_step(system, numbers, schedules, method)
+    return _Plan(system, numbers, exchange, sites, flows, routes, schedules, kept)
+
+
+def _choices(plan: _Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
+    """Return what is recorded of each group; refuse more than fits the memory."""
+    system = plan.system
+    available = [
+        local_signals(system.kinds[group.kind], schedule)
+        for group, schedule in zip(system.groups, plan.schedules, strict=True)
+    ]
+    choices = choose(system, available, signals)
+    _check_size(system, plan.exchange, plan.schedules, choices)
+    return choices
 
 
 def _schedules(
@@ -195,29 +213,22 @@ def _schedules(
     return schedules, kept
 
 
-def _members(
-    system: CompiledSystem,
-    numbers: Numbers,
-    exchange: Exchange,
-    schedules: Sequence[Schedule],
-    choices: Sequence[Choice],
-    sites: Sequence[SiteJacobians],
-    flows: Sequence[Flow | None],
-    method: Method,
-) -> list[Member]:
+def _members(plan: _Plan, choices: Sequence[Choice], method: Method) -> list[Member]:
     """Return the groups as members of a population, those peers that are recorded apart from the others."""
+    system, numbers, flows = plan.system, plan.numbers, plan.flows
     linear = [rates(kind, flow.rows if flow else ()) for kind, flow in zip(system.kinds, flows, strict=True)]
-    cuts = exchanges_within(schedules)
+    cuts = exchanges_within(plan.schedules)
     programs: dict[Any, Program] = {}
     members = []
-    for group, (one, schedule, choice) in enumerate(zip(system.groups, schedules, choices, strict=True)):
+    groups = zip(system.groups, plan.schedules, choices, strict=True)
+    for group, (one, schedule, choice) in enumerate(groups):
         rows, vectors = numbers.rows[group], numbers.parameters[group]
         for peers, recorded in _recorded_and_not(choice):
             key = (one.kind, id(schedule), recorded)
             if key not in programs:
                 programs[key] = build_program(linear[one.kind], schedule, recorded, cuts, flows[one.kind])
             moves = _transitions(programs[key], vectors, method)
-            numbered, site = exchange.starts[group] + peers, sites[one.kind]
+            numbered, site = plan.exchange.starts[group] + peers, plan.sites[one.kind]
             members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
     return members
 
@@ -317,8 +328,8 @@ def _transitions(program: Program, vectors: Floats, method: Method) -> list[Tran
         key = np.asarray(program.rates.matrices(vector)).tobytes()
         if key not in known:
             known[key] = transitions(program.rates, vector, seconds)
-            if method.shaken:
-                known[key] = shaken(known[key], len(known))
+            if method.perturbed:
+                known[key] = perturbed(known[key], len(known))
         found.append(known[key])
     return found
 

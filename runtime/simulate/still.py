@@ -27,6 +27,7 @@ from apc.runtime.frame.parameters import resolve
 from apc.runtime.frame.start import start_values
 from apc.runtime.optional import need
 from apc.runtime.simulate.figures import check_format, write_figure
+from apc.runtime.simulate.local_signals import sent_states
 
 Floats = NDArray[np.float64]
 
@@ -66,7 +67,7 @@ def bodies_of(kind: Kind, vector: Sequence[float], start: Sequence[float]) -> tu
     """
     places = [i for i, state in enumerate(kind.states) if state.unit == "m"]
     widths = dict.fromkeys(places, 0.0)
-    sent = _sent(kind)
+    sent = sent_states(kind)
     walls: dict[float, None] = {}
     for slopes, offset in _distances(kind, vector):
         moving = np.flatnonzero(slopes).tolist()
@@ -100,19 +101,6 @@ def _distances(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, float]
             alone = not casadi.depends_on(column[row], others)
             if alone and not casadi.depends_on(slopes[row, :], x):
                 found.append((numbers[0][row], float(numbers[1][row, 0])))
-    return found
-
-
-def _sent(kind: Kind) -> set[int]:
-    """Return the states that are sent to others as they are."""
-    found = set()
-    for sending in kind.sends:
-        if sending.send.is_a("SXFunction"):
-            inputs = sending.send.sx_in()
-            column = sending.send(*inputs)
-            for i in range(len(kind.states)):
-                if any(casadi.is_equal(column[row], inputs[0][i]) for row in range(column.numel())):
-                    found.add(i)
     return found
 
 

@@ -18,15 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import casadi
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import wrapped
 from apc.runtime.simulate.blocks import Block
+from apc.runtime.simulate.local_signals import sent_states
 from apc.runtime.simulate.signals import Signal
 from apc.runtime.simulate.simulation import Simulation
 
@@ -85,7 +84,7 @@ class Watch:
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
         n = len(simulation.signals)
-        rows = int(simulation.duration / (simulation.frame * simulation.quantum)) + 1
+        rows = int(simulation.settings.duration / (simulation.frame * simulation.quantum)) + 1
         rows *= len(simulation.marks)
         most = max(16, min(BUCKETS, MOST_EXTREMES // max(n, 1)))
         self.width = -(-rows // most)
@@ -239,29 +238,13 @@ def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
 
 def _copies(system: CompiledSystem, signals: Sequence[Signal], last: Floats) -> tuple[tuple[str, float], ...]:
     """Return how far apart the peers' copies of each state that is sent as it is are at the end."""
-    names = dict.fromkeys(name for kind in system.kinds for name in _sent_states(kind))
+    names = dict.fromkeys(kind.states[i].name for kind in system.kinds for i in sent_states(kind))
     found = []
     for name in names:
         values = [last[i] for i, one in enumerate(signals) if one.local == name and one.unit in ("m", "rad")]
         if len(values) > 1:
             found.append((name, float(np.max(values) - np.min(values))))
     return tuple(found)
-
-
-def _sent_states(kind: Any) -> list[str]:
-    """Return the states that a kind sends as they are."""
-    found = []
-    for sending in kind.sends:
-        if sending.send.is_a("SXFunction"):
-            arguments = sending.send.sx_in()
-            sent = sending.send(*arguments)
-            found += [
-                state.name
-                for row in range(sent.numel())
-                for place, state in enumerate(kind.states)
-                if casadi.is_equal(sent[row], arguments[0][place])
-            ]
-    return found
 
 
 _WORDS = {

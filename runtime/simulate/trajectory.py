@@ -26,6 +26,7 @@ from apc.runtime.simulate.accuracy import ErrorEstimate, compare_with, error_tex
 from apc.runtime.simulate.blocks import Block, blocks
 from apc.runtime.simulate.flow import Tolerance
 from apc.runtime.simulate.methods import DEFAULT, EXACT, Method
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.signals import Signal
 from apc.runtime.simulate.simulation import Simulation, prepare
 from apc.runtime.simulate.summary import Summary, Watch, summary_text
@@ -104,7 +105,7 @@ class Trajectory:
         """Return the summary as plain data, ready for JSON; the rows are not in it."""
         return result_document(self.topology, self.summary, self.provenance, self.interrupted, self.error)
 
-    def to_pandas(self) -> Any:
+    def to_dataframe(self) -> Any:
         """Return a pandas DataFrame: index `time [s]`, a column a signal, headings with units."""
         pandas = need("pandas", "data")
         columns = [signal.heading for signal in self.signals]
@@ -228,7 +229,7 @@ def provenance_of(simulation: Simulation) -> Provenance:
     return Provenance(
         topology=system.name,
         texts=hashlib.sha256(texts.encode()).hexdigest(),
-        duration_s=str(simulation.duration),
+        duration_s=str(simulation.settings.duration),
         method=simulation.how,
         tolerances=simulation.tolerances,
         seed=simulation.seed,
@@ -249,10 +250,11 @@ class Keeper:
     """Keeps the rows in memory."""
 
     def __init__(self, simulation: Simulation) -> None:
-        rows = int(simulation.duration / simulation.quantum) // simulation.frame + 1
+        rows = int(simulation.settings.duration / simulation.quantum) // simulation.frame + 1
         if rows * len(simulation.marks) * len(simulation.signals) > MOST_KEPT:
+            seconds = float(simulation.settings.duration)
             what = (
-                f"{len(simulation.signals)} signals over {float(simulation.duration):g} s are more than "
+                f"{len(simulation.signals)} signals over {seconds:g} s are more than "
                 f"{MOST_KEPT} numbers, too many to keep in memory"
             )
             hint = "fewer --signals, a shorter --duration, or --out FILE.parquet alone"
@@ -330,11 +332,10 @@ def simulate(
     ApcError
         E877 no duration is known, E876 too many numbers to keep; and those of `simulation.prepare`.
     """
-    simulation = prepare(
-        system, duration_of(system, duration), signals=signals, jit=jit, seed=seed, method=method
-    )
+    settings = Settings(duration_of(system, duration), method, seed, jit)
+    simulation = prepare(system, settings, signals=signals)
     keeper = Keeper(simulation)
-    comparison = compare_with(simulation, signals=signals, jit=jit) if error else None
+    comparison = compare_with(simulation, signals=signals) if error else None
     summary, interrupted = play(simulation, [keeper, *([comparison] if comparison else [])])
     estimate = comparison.estimate() if comparison else None
     return trajectory_of(simulation, keeper, summary, interrupted, estimate)

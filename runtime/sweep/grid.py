@@ -194,7 +194,7 @@ def _count(what: str, text: str) -> int:
 
 def _quantities(label: str, unit: str, texts: Sequence[str]) -> tuple[Fraction, ...]:
     """Read quantities; one without a unit takes that of the last."""
-    from apc.compiler.language.units import quantity  # it brings in pint
+    from apc.compiler.language.units import quantity
 
     last = _NUMBER.sub("", texts[-1], count=1).strip()
     complete = [f"{text.strip()} {last}" if last and _NUMBER.fullmatch(text) else text for text in texts]

@@ -1,13 +1,15 @@
 """Where the largest eigenvalue magnitude of a family of matrices crosses 1 as one number varies.
 
-Takes: a function that gives the matrices and their derivatives at many points of an interval.
-Gives: `Course`, `Root`, `Scan`, `scan`, `eigenvalues`.
+Takes: a function that gives the matrices and their derivatives at many points of an interval, or of many.
+Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`, `eigenvalues`.
 Guarantees: every cell between samples is either shown clear by the eigenvalues and their derivatives at both
 ends, or divided down to the cell size; every change found is bracketed.
 Does not: prove anything (see `critical`), or choose the interval.
 
 Between two samples an eigenvalue follows the cubic through its values and slopes at both; how far the
 tangents of the two ends miss each other half-way, e, stands for what the cubic doesn't know.
+
+Several lines are scanned in step: a call for many small matrices takes hardly longer than one for few.
 """
 
 from __future__ import annotations
@@ -21,9 +23,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Truths = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
 # Each system's matrices (k, n, n) and their derivatives at points (k,); NaN where there is no matrix.
 Course = Callable[[Floats], Sequence[tuple[Floats, Floats]]]
+
+# The same of several lines: at points (k,), each of the line whose number stands in the first argument (k,).
+Courses = Callable[[Integers, Floats], Sequence[tuple[Floats, Floats]]]
 
 # A sample with an eigenvalue nearer to the circle than this tells no side: far above the rounding of a few
 # dozen states.
@@ -45,7 +51,10 @@ SPOILT = 1e-8
 # A derivative of an eigenvalue of worse condition than this is mostly rounding.
 WORST = 1e10
 
-# Cells divided at a time, and levels: an eigenvalue that follows the circle would be sampled for ever.
+# So few cells are divided into so many parts at once: a few matrices more take no longer, another call does.
+FEW, PARTS = 8, 8
+
+# Cells of a line divided at a time, and levels: what follows the circle would be sampled for ever.
 MOST_OPEN, MOST_LEVELS = 64, 40
 
 # What is smaller decides nothing; its derivative, one of a defective cluster at zero often, means nothing.
@@ -123,19 +132,33 @@ def _left_vectors(matrix: Floats, values: Complexes) -> Complexes:
 
 @dataclass(frozen=True, slots=True)
 class _Samples:
-    """Points in order with each system's eigenvalues (k, n) and slopes (k, n)."""
+    """Points of lines, both in order, with each system's eigenvalues (k, n) and slopes (k, n)."""
 
+    lines: Integers
     points: Floats
     values: tuple[Complexes, ...]
     slopes: tuple[Complexes, ...]
 
-    def merged(self, other: _Samples) -> _Samples:
+    def merged(self, other: _Samples) -> tuple[_Samples, Truths]:
+        """Return both together, and which are the other's."""
+        lines = np.concatenate([self.lines, other.lines])
         points = np.concatenate([self.points, other.points])
-        order = np.argsort(points, kind="stable")
-        return _Samples(
+        order = np.lexsort((points, lines))
+        together = _Samples(
+            lines[order],
             points[order],
             tuple(_stacked(*pair)[order] for pair in zip(self.values, other.values, strict=True)),
             tuple(_stacked(*pair)[order] for pair in zip(self.slopes, other.slopes, strict=True)),
+        )
+        return together, order >= len(self.points)
+
+    def chosen(self, which: Truths | NDArray[np.intp]) -> _Samples:
+        """Return some of the samples."""
+        return _Samples(
+            self.lines[which],
+            self.points[which],
+            tuple(one[which] for one in self.values),
+            tuple(one[which] for one in self.slopes),
         )
 
     def radius(self) -> Floats:
@@ -164,75 +187,123 @@ def scan(course: Course, points: Floats, *, least: float) -> Scan:
     least
         Cells are measured against the value, or against this where the value is smaller.
     """
-    samples = _sample(course, points)
-    whole = True
+    return scan_lines(lambda _, some: course(some), [points], [least])[0]
+
+
+def scan_lines(
+    courses: Courses, points: Sequence[Floats], least: Sequence[float], *, first: bool = False
+) -> tuple[Scan, ...]:
+    """Scan several lines, each as `scan` does.
+
+    Parameters
+    ----------
+    courses
+        The matrices and their derivatives.
+    points
+        Where to begin on each line (k,), in order.
+    least
+        For each line, what its cells are measured against at least.
+    first
+        Whether what lies beyond the first crossing at which the magnitude rises is left alone.
+    """
+    count = len(points)
+    if not count:
+        return ()
+    smallest = np.array(least, dtype=np.float64)
+    lines = np.repeat(np.arange(count), [len(one) for one in points])
+    samples = _sample(courses, lines, np.concatenate(points))
+    new = np.ones(len(samples.points), dtype=bool)
+    whole, going = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
     for _ in range(MOST_LEVELS):
-        if len(samples.points) < 2:
+        # A cell that was there before was found clear, or can't be divided.
+        cells = np.flatnonzero((samples.lines[1:] == samples.lines[:-1]) & (new[1:] | new[:-1]))
+        cells = cells[cells <= _last_cells(samples, count)[samples.lines[cells]]] if first else cells
+        cells = cells[_widths(samples, cells, smallest) > CELL]
+        cells = cells[_open(samples, cells)]
+        going &= np.bincount(samples.lines[cells], minlength=count) <= MOST_OPEN
+        whole &= going
+        cells = cells[going[samples.lines[cells]]]
+        if not len(cells):
             break
-        open_ = np.flatnonzero(_open(samples) & (_widths(samples.points, least) > CELL))
-        if not len(open_):
-            break
-        if len(open_) > MOST_OPEN:
-            whole = False
-            break
-        more = _sample(course, _middles(samples.points)[open_])
-        if not len(more.points):
-            whole = False
-            break
-        samples = samples.merged(more)
+        lines, between = _between(samples, cells, PARTS if len(cells) <= FEW else 2)
+        more = _sample(courses, lines, between)
+        whole &= np.bincount(more.lines, minlength=count) == np.bincount(lines, minlength=count)
+        samples, new = samples.merged(more)
     else:
-        whole = False
+        whole[lines] = False
     radius = samples.radius()
     stable = radius < 1
-    changes = np.flatnonzero(stable[1:] != stable[:-1])
-    return Scan(samples.points, radius, _roots(course, samples, changes), whole)
+    changes = np.flatnonzero((stable[1:] != stable[:-1]) & (samples.lines[1:] == samples.lines[:-1]))
+    changes = changes[changes <= _last_cells(samples, count)[samples.lines[changes]]] if first else changes
+    roots, of_line = _roots(courses, samples, changes), samples.lines[changes]
+    return tuple(
+        Scan(
+            samples.points[samples.lines == line],
+            radius[samples.lines == line],
+            tuple(root for root, one in zip(roots, of_line, strict=True) if one == line),
+            bool(whole[line]),
+        )
+        for line in range(count)
+    )
 
 
-def _sample(course: Course, points: Floats) -> _Samples:
+def _last_cells(samples: _Samples, count: int) -> Integers:
+    """Return the first cell of each line in which the magnitude rises across 1, past all if none does."""
+    stable = samples.radius() < 1
+    rising = stable[:-1] & ~stable[1:] & (samples.lines[1:] == samples.lines[:-1])
+    found = np.full(count, len(stable), dtype=np.int64)
+    np.minimum.at(found, samples.lines[:-1][rising], np.flatnonzero(rising))
+    return found
+
+
+def _sample(courses: Courses, lines: Integers, points: Floats) -> _Samples:
     """Return the samples at points that have matrices and a side."""
-    pairs = course(points)
+    pairs = courses(lines, points)
     sound = np.ones(len(points), dtype=bool)
     for matrix, slope in pairs:
         sound &= np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(slope).all(axis=(1, 2))
     found = [eigenvalues(matrix[sound], slope[sound]) for matrix, slope in pairs]
-    samples = _Samples(points[sound], tuple(v for v, _ in found), tuple(d for _, d in found))
+    values, slopes = tuple(v for v, _ in found), tuple(d for _, d in found)
+    samples = _Samples(lines[sound], points[sound], values, slopes)
     # What lies on the circle within rounding tells no side, unless something is clearly outside.
-    near = samples.radius()
-    sided = np.abs(near - 1) > UNSURE
-    return _Samples(
-        samples.points[sided],
-        tuple(one[sided] for one in samples.values),
-        tuple(one[sided] for one in samples.slopes),
-    )
+    return samples.chosen(np.abs(samples.radius() - 1) > UNSURE)
 
 
-def _widths(points: Floats, least: float) -> Floats:
-    """Return the cells' widths relative to their values."""
-    return np.diff(points) / np.maximum(np.maximum(np.abs(points[1:]), np.abs(points[:-1])), least)
+def _widths(samples: _Samples, cells: NDArray[np.intp], least: Floats) -> Floats:
+    """Return the cells' widths relative to their values, or to the least of their lines."""
+    low, high = samples.points[cells], samples.points[cells + 1]
+    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), least[samples.lines[cells]])
+    return np.asarray((high - low) / size)
 
 
-def _middles(points: Floats) -> Floats:
-    low, high = points[:-1], points[1:]
+def _between(samples: _Samples, cells: NDArray[np.intp], parts: int) -> tuple[Integers, Floats]:
+    """Return the points that divide cells into parts, and their lines: in even ratios on one side of 0."""
+    low, high = samples.points[cells, None], samples.points[cells + 1, None]
+    share = np.arange(1, parts) / parts
     apart = low * high > 0
-    root = np.sign(high) * np.sqrt(np.abs(low)) * np.sqrt(np.abs(high))
-    return np.where(apart, root, (low + high) / 2)
+    ratios = np.sign(high) * np.abs(low) ** (1 - share) * np.abs(high) ** share
+    between = np.where(apart, ratios, low + (high - low) * share)
+    return np.repeat(samples.lines[cells], parts - 1), between.reshape(-1)
 
 
-def _open(samples: _Samples) -> Truths:
+def _open(samples: _Samples, cells: NDArray[np.intp]) -> Truths:
     """Say of each cell whether it may hide a crossing beside the one that its ends show, if they do."""
-    width = np.diff(samples.points)[:, None]
+    low, high = samples.chosen(cells), samples.chosen(cells + 1)
+    width = (high.points - low.points)[:, None]
     inside = np.ones(len(width), dtype=bool)
     outside = np.zeros(len(width), dtype=bool)
     crossing = np.zeros(len(width), dtype=np.int64)
-    for values, slopes in zip(samples.values, samples.slopes, strict=True):
-        if not values.shape[1]:
+    for start, rise, end, end_rise in zip(low.values, low.slopes, high.values, high.slopes, strict=True):
+        if not start.shape[1]:
             continue
         # Every cell both ways at once: forward, and as it looks from its end.
-        ends = np.concatenate([values[:-1], values[1:]]), np.concatenate([values[1:], values[:-1]])
-        rises = np.concatenate([slopes[:-1] * width, -slopes[1:] * width])
-        end_rises = np.concatenate([slopes[1:] * width, -slopes[:-1] * width])
-        least, most, single, upper = _extremes(ends[0], rises, ends[1], end_rises)
-        inside &= (most < 1).reshape(2, len(width), -1).all(axis=(0, 2))
+        least, most, single, upper = _extremes(
+            np.concatenate([start, end]),
+            np.concatenate([rise * width, -end_rise * width]),
+            np.concatenate([end, start]),
+            np.concatenate([end_rise * width, -rise * width]),
+        )
+        inside &= (most < 1).reshape(2, *start.shape).all(axis=(0, 2))
         least, most = least[: len(width)], most[: len(width)]
         single, upper = single[: len(width)], upper[: len(width)]
         outside |= (least > 1).any(axis=1)
@@ -240,8 +311,7 @@ def _open(samples: _Samples) -> Truths:
         crossing += ((most >= 1) & single & upper).sum(axis=1)
         lower = (most >= 1) & single & ~upper
         crossing -= 2 * lower.sum(axis=1)  # the conjugate of one that is counted
-    stable = samples.radius() < 1
-    simple = (stable[1:] != stable[:-1]) & (crossing == 1)
+    simple = ((low.radius() < 1) != (high.radius() < 1)) & (crossing == 1)
     hiding: Truths = ~(inside | outside | simple)
     return hiding
 
@@ -271,7 +341,7 @@ def _extremes(
     return sizes.min(axis=0) - off, sizes.max(axis=0) + off, single, value.imag >= 0
 
 
-def _roots(course: Course, samples: _Samples, cells: NDArray[np.intp]) -> tuple[Root, ...]:
+def _roots(courses: Courses, samples: _Samples, cells: NDArray[np.intp]) -> tuple[Root, ...]:
     """Find the crossing of each cell whose ends lie on different sides: Newton's method with a bracket."""
     if not len(cells):
         return ()
@@ -279,11 +349,11 @@ def _roots(course: Course, samples: _Samples, cells: NDArray[np.intp]) -> tuple[
     rising = samples.radius()[cells] < 1
     value = _starts(samples, cells)
     system, eigenvalue = np.zeros(len(cells), np.intp), np.zeros(len(cells), np.complex128)
-    slope = np.zeros(len(cells))
+    slope, lines = np.zeros(len(cells)), samples.lines[cells]
     busy = np.arange(len(cells))
     for _ in range(MOST_STEPS):
         here = value[busy]
-        lead = _leading(course, here)
+        lead = _leading(courses, lines[busy], here)
         system[busy], eigenvalue[busy], slope[busy] = lead
         size = np.abs(eigenvalue[busy])
         below = (size < 1) == rising[busy]  # the root is above
@@ -338,9 +408,9 @@ def _cubic(t: Floats, value: Complexes, rise: Complexes, end: Complexes, end_ris
     return found + t * t * (3 - 2 * t) * end + t * t * (t - 1) * end_rise
 
 
-def _leading(course: Course, points: Floats) -> tuple[NDArray[np.intp], Complexes, Floats]:
+def _leading(courses: Courses, lines: Integers, points: Floats) -> tuple[NDArray[np.intp], Complexes, Floats]:
     """Return the eigenvalue of largest magnitude at each point: its system, itself, its magnitude's slope."""
-    found = [eigenvalues(matrix, slope) for matrix, slope in course(points)]
+    found = [eigenvalues(matrix, slope) for matrix, slope in courses(lines, points)]
     system = np.repeat(np.arange(len(found)), [values.shape[1] for values, _ in found])
     values = np.concatenate([values for values, _ in found], axis=1)
     slopes = np.concatenate([slopes for _, slopes in found], axis=1)

@@ -18,9 +18,9 @@ from fractions import Fraction
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.multiples import common_divisor
 from apc.runtime.analysis.analysis import Prepared, lifted_groups
 from apc.runtime.analysis.plan import LONG_LINES
-from apc.runtime.frame.hyperperiod import common_divisor
 from apc.runtime.frame.names import Free
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.frame.parameters import resolve
@@ -62,8 +62,7 @@ def delay_now(system: CompiledSystem, free: Free) -> Fraction:
     for timing in system.timings:
         if timing.name == free.name:
             return timing.value
-    value = next(one.value for one in system.parameters if one.name == free.name)
-    return Fraction(repr(float(value)))
+    return next(one.number for one in system.parameters if one.name == free.name)
 
 
 def delay_pieces(

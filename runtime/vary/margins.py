@@ -26,10 +26,10 @@ from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.batch import BatchEvaluator
-from apc.runtime.vary.crossings import scan
+from apc.runtime.vary.crossings import scan_lines
 from apc.runtime.vary.delays import delay_now
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size
-from apc.runtime.vary.search import Crossing, Line, proved_crossing, search_delay, spread
+from apc.runtime.vary.search import Crossing, Line, courses_of, proved_crossing, reach, search_delay, spread
 
 Floats = NDArray[np.float64]
 
@@ -148,23 +148,42 @@ def _parameter_margins(
         here = family.matrices(base[None, base != 0])
     if not _radius(here) < 1:
         return "none: the scene is not stable as it is"
-    found = []
-    for one, line in zip(free, lines, strict=True):
-        present = float(line.base[line.column])
-        if all(not slope.any() for _, slope in line.course(np.array([present]))):
-            continue  # nothing depends on it
-        scale = line.scale()
-        top = GROWTH * scale
-        limit = parameter_of(system, one).maximum
-        if limit is not None:
-            top = min(top, limit)
-        if not top > present:
+    found: list[Margin | None] = [None] * len(free)
+    for family in {id(line.family): line.family for line in lines}.values():
+        own = [place for place, line in enumerate(lines) if line.family is family]
+        for place, one in zip(own, _along(system, [(free[i], lines[i]) for i in own]), strict=True):
+            found[place] = one
+    return [one for one in found if one]
+
+
+def _along(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Margin | None]:
+    """Return the margins of parameters of one evaluator, None where nothing can grow or depends on it.
+
+    Their lines are looked at in step.
+    """
+    courses = courses_of([line for _, line in ways])
+    present = np.array([line.base[line.column] for _, line in ways])
+    here = courses(np.arange(len(ways)), present)
+    scales = np.zeros(len(ways))
+    points: list[Floats] = []
+    for place, (free, _) in enumerate(ways):
+        own = [(matrix[[place]], slope[[place]]) for matrix, slope in here]
+        points.append(np.empty(0))
+        if all(not slope.any() for _, slope in own):
             continue
-        scanned = scan(line.course, spread(present, top, scale), least=scale / GROWTH)
-        roots = [root for root in scanned.roots if root.rising and root.value > present]
+        scales[place] = abs(present[place]) or reach(own)
+        limit = parameter_of(system, free).maximum
+        top = min(GROWTH * scales[place], np.inf if limit is None else limit)
+        if top > present[place]:
+            points[place] = spread(float(present[place]), float(top), float(scales[place]))
+    scans = scan_lines(courses, points, scales / GROWTH, first=True)
+    found: list[Margin | None] = []
+    for (free, line), start, some, scanned in zip(ways, present.tolist(), points, scans, strict=True):
+        roots = [root for root in scanned.roots if root.rising and root.value > start]
         crossing = proved_crossing(roots[0], line, scanned) if roots else None
-        reached = float(scanned.points[-1]) if len(scanned.points) else present
-        found.append(_margin(one.label, parameter_of(system, one).unit, present, crossing, reached))
+        reached = float(scanned.points[-1]) if len(scanned.points) else start
+        unit = parameter_of(system, free).unit
+        found.append(_margin(free.label, unit, start, crossing, reached) if len(some) else None)
     return found
 
 

@@ -1,8 +1,8 @@
 """All crossings of the stability boundary along one parameter or delay, each proved where it can be.
 
 Takes: a `CompiledSystem` and what varies in it.
-Gives: `Crossing`, `Search`, `search`, `search_delay`; `Line`, `spread`, `proved_crossing` to search along a
-line through several parameters.
+Gives: `Crossing`, `Search`, `search`, `search_delay`; `Line`, `courses_of`, `reach`, `spread`,
+`proved_crossing` to search along a line through several parameters.
 Guarantees: every crossing has a bound on its error, proved by ball arithmetic wherever the equations can be
 had exactly, and said to be an estimate where not.
 Does not: choose which crossing matters (see `critical`).
@@ -31,12 +31,13 @@ from apc.runtime.eigen.spectrum import DRIFTS
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.bracket import Bracket, bracket, bracket_in_floats
-from apc.runtime.vary.crossings import Root, Scan, eigenvalues, scan
+from apc.runtime.vary.crossings import Courses, Root, Scan, eigenvalues, scan
 from apc.runtime.vary.delays import Piece, delay_pieces, system_with_delay
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
 from apc.runtime.vary.marginal import marginal_motion
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 # Is told, in words, how far a search is.
 Told = Callable[[str], None]
@@ -131,11 +132,28 @@ class Line:
     def scale(self) -> float:
         """Return the present value or, where it is 0, the change that would move some eigenvalue by 1."""
         present = abs(float(self.base[self.column]))
-        if present:
-            return present
-        rates = [np.abs(eigenvalues(*pair)[1]) for pair in self.course(np.zeros(1)) if pair[0].size]
-        fastest = max((float(one.max(initial=0.0)) for one in rates), default=0.0)
-        return 1 / fastest if fastest > 0 else 1.0
+        return present or reach(self.course(np.zeros(1)))
+
+
+def reach(pairs: Sequence[tuple[Floats, Floats]]) -> float:
+    """Return the change that would move some eigenvalue by 1, of the matrices and derivatives at a point."""
+    rates = [np.abs(eigenvalues(*pair)[1]) for pair in pairs if pair[0].size]
+    fastest = max((float(one.max(initial=0.0)) for one in rates), default=0.0)
+    return 1 / fastest if fastest > 0 else 1.0
+
+
+def courses_of(lines: Sequence[Line]) -> Courses:
+    """Return the matrices and their derivatives on several lines of one evaluator, all in one call."""
+    base, columns = np.array([one.base for one in lines]), np.array([one.column for one in lines])
+
+    def courses(which: Integers, values: Floats) -> Sequence[tuple[Floats, Floats]]:
+        points, along = base[which], np.zeros((len(values), base.shape[1]))
+        rows = np.arange(len(values))
+        points[rows, columns[which]] = values
+        along[rows, columns[which]] = 1.0
+        return lines[0].family.slopes(points, along)
+
+    return courses
 
 
 def search(
@@ -249,6 +267,7 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
         held = bracket_in_floats(root, all_of_them, low=float(low), high=float(high))
         return _described(root, held, [(one, _free(one)) for one in all_of_them(root.value)])
 
+    @functools.cache
     def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
         listed = zip(family.exact_at(point(value)), family.wirings, strict=True)
         return [(one, _free(one) if wiring.moving else wiring.rigid) for one, wiring in listed]

@@ -1,7 +1,8 @@
 """Every figure by one command: `python -m tests.bench` writes README.md beside it, and what the project's
 README.md shows, its pictures too.
 
-`--quick` takes smaller runs of each, `--only NAME` one or more of them, and keeps the rest of the page.
+`--quick` takes smaller runs of each, `--only NAME` one or more of them, and keeps the rest of the page. It
+ends with code 1 if a part did, which is when a number is wrong; with `--strict` also when a time is missed.
 """
 
 from __future__ import annotations
@@ -9,12 +10,12 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from apc.runtime.bench.bench import machine
+from apc.runtime.bench.timing import waited
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -24,16 +25,21 @@ AVERAGE = "models/scenes/three-users-average.yaml"
 
 @dataclass(frozen=True)
 class Part:
-    """A section of the page: its title, the words after `python -m`, and those of a quick run."""
+    """A section of the page: its title, the words after `python -m`, and those of a quick run.
+
+    `timed` says that it knows `--strict`.
+    """
 
     name: str
     title: str
     words: tuple[str, ...]
     quick: tuple[str, ...] | None = None
+    timed: bool = True
 
-    def command(self, quick: bool) -> tuple[str, ...]:
+    def command(self, quick: bool, strict: bool = False) -> tuple[str, ...]:
         """Return the words after `python -m`."""
-        return self.quick if quick and self.quick is not None else self.words
+        words = self.quick if quick and self.quick is not None else self.words
+        return (*words, "--strict") if strict and self.timed else words
 
 
 def _own(name: str, *words: str) -> tuple[str, ...]:
@@ -41,7 +47,7 @@ def _own(name: str, *words: str) -> tuple[str, ...]:
 
 
 PARTS = (
-    Part("readme", "Pictures and blocks of the README", _own("readme")),
+    Part("readme", "Pictures and blocks of the README", _own("readme"), timed=False),
     Part("process", "Whole processes", _own("process"), _own("process", "--runs", "3")),
     Part(
         "scenes",
@@ -49,10 +55,10 @@ PARTS = (
         _own("scenes"),
         _own("scenes", "--rounds", "3"),
     ),
-    Part("needs", "What each scene needs", _own("needs")),
-    Part("bench", "Speed against error on the paper's scene", ("apc", "bench", AVERAGE)),
-    Part("hard", "Hard cases", ("apc", "bench", "--hard", "tests/hard")),
-    Part("scale", "More peers", ("apc", "bench", AVERAGE, "--scale", "3,30,300,3000,30000,1e6")),
+    Part("needs", "What each scene needs", _own("needs"), timed=False),
+    Part("bench", "Speed against error on the paper's scene", ("apc", "bench", AVERAGE), timed=False),
+    Part("hard", "Hard cases", ("apc", "bench", "--hard", "tests/hard"), timed=False),
+    Part("scale", "More peers", ("apc", "bench", AVERAGE, "--scale", "3,30,300,3000,30000,1e6"), timed=False),
     Part("random", "Random scenes", _own("random_scenes"), _own("random_scenes", "--points", "200")),
     Part("comparison", "Other programs", _own("comparison")),
     Part("work_precision", "Methods of simulation", _own("work_precision")),
@@ -62,23 +68,24 @@ PARTS = (
     Part("critical", "Critical values", _own("critical")),
     Part("region", "Regions", _own("region"), _own("region", "--quick")),
     Part("map", "The paper's map", _own("map"), _own("map", "--points", "400")),
-    Part("sweep", "Sweeps", _own("sweep"), _own("sweep", "--points", "5000", "--kills", "1")),
+    Part("sweep", "Sweeps", _own("sweep"), _own("sweep", "--points", "5000", "--kills", "1"), timed=False),
 )
 
 
-def run(part: Part, quick: bool) -> str:
-    """Return a section of the page."""
-    words = part.command(quick)
-    began = time.perf_counter()
-    ran = subprocess.run(
-        [sys.executable, "-m", *words], cwd=ROOT, capture_output=True, text=True, check=False
+def run(part: Part, quick: bool, strict: bool = False) -> tuple[str, int]:
+    """Return a section of the page and the code its program ended with."""
+    words = part.command(quick, strict)
+    taken, ran = waited(
+        lambda: subprocess.run(
+            [sys.executable, "-m", *words], cwd=ROOT, capture_output=True, text=True, check=False
+        )
     )
-    taken = time.perf_counter() - began
     shown = " ".join(words if words[0] == "apc" else ("python", "-m", *words))
-    text = ran.stdout.rstrip() or ran.stderr.rstrip()
+    text = "\n\n".join(said for said in (ran.stdout.rstrip(), ran.stderr.rstrip()) if said)
     end = "" if ran.returncode == 0 else f"\n\nIt ended with code {ran.returncode}."
     day = datetime.now(tz=UTC).date().isoformat()
-    return f"## {part.title}\n\n`{shown}` ({day}, {taken:.0f} s)\n\n```text\n{text}\n```{end}\n"
+    page = f"## {part.title}\n\n`{shown}` ({day}, {taken:.0f} s)\n\n```text\n{text}\n```{end}\n"
+    return page, ran.returncode
 
 
 def sections(page: str) -> dict[str, str]:
@@ -91,17 +98,20 @@ def main() -> None:
     """Run the parts and write the page."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="smaller runs")
+    parser.add_argument("--strict", action="store_true", help="a missed target of time is a failure too")
     names = [part.name for part in PARTS]
     parser.add_argument("--only", action="append", choices=names, help="may be repeated")
     given = parser.parse_args()
     before = sections(PAGE.read_text(encoding="utf-8")) if given.only and PAGE.is_file() else {}
-    found = []
+    found, failed = [], []
     for part in PARTS:
         if given.only and part.name not in given.only:
             found += [before[part.title]] if part.title in before else []
             continue
-        found.append(run(part, given.quick))
-        print(found[-1], flush=True)
+        text, code = run(part, given.quick, given.strict)
+        found.append(text)
+        failed += [part.name] if code else []
+        print(text, flush=True)
     where = "\n".join(f"| {name} | {value} |" for name, value in machine().items() if value)
     head = (
         "# Figures\n\nSpeed against error, as last measured. This makes them again and writes this page:\n\n"
@@ -110,6 +120,8 @@ def main() -> None:
         f"| | |\n|---|---|\n{where}\n"
     )
     PAGE.write_text("\n".join([head, *found]), encoding="utf-8")
+    if failed:
+        raise SystemExit(f"failed: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

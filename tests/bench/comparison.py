@@ -24,35 +24,49 @@ from __future__ import annotations
 import importlib.util
 import math
 import statistics
-import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.bench.reference import Truth, exact_course, spectral_truth
+from apc.runtime.bench.timing import median_time, take_turns
 from apc.runtime.simulate.blocks import blocks
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import Simulation, prepare
 from apc.runtime.threads import single_threaded
 from tests.bench.drake import played_by_drake
+from tests.bench.judge import Judge, parser_of
+from tests.bench.paper_scene import (
+    CUBE_DAMPING,
+    CUBE_MASS,
+    DEVICE_DAMPING,
+    DEVICE_MASS,
+    K_C,
+    K_T,
+    TICK,
+    TICKS,
+    USERS,
+    Floats,
+)
 from tests.bench.pathsim import played_by_pathsim
 from tests.bench.simulate import MOVED, numpy_loop
 from tests.topologies import AVERAGE, compiled
 
-Floats = NDArray[np.float64]
-
 ROUNDS = 15
-TICK, TICKS, USERS = 1e-3, 8, 3
-DEVICE, CUBE = 0.1, 0.2  # kg
-K_C, K_T = 1000.0, 500.0  # N/m
 # Damping of device and cube, in N·s/m: the paper's, and one at which the textbook's form loses its digits.
-DAMPINGS = (5.0, 1e-6)
+assert DEVICE_DAMPING == CUBE_DAMPING
+DAMPINGS = (DEVICE_DAMPING, 1e-6)
 SECONDS = 1  # that are played
+# Most that a state may be off, in m and m/s: of 1000 ticks each rounds states of at most 1 by 1e-16, which
+# all in one direction are 1e-13; ten times that is no rounding.
+ROUNDED = 1e-12
 # By its name: what is installed for it, and the tolerances asked of it after the one it comes with.
 SIMULATORS = {
     "Drake": ("pydrake", "drake", played_by_drake, (None, 1e-8)),
@@ -60,6 +74,15 @@ SIMULATORS = {
 }
 WHOLE = "apc's time is that of the whole answer:\nevery mode and its shape, and a bound on its error\n"
 WITHOUT = "FMPy is left out: what it runs another program has to export,\nand none that can comes with pip"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A program: its median `seconds`, its error, and what it says itself that this is at most."""
+
+    seconds: float
+    error: float
+    bound: float | None = None
 
 
 def by_exponential(mass: float, damping: float) -> Floats:
@@ -85,7 +108,7 @@ def by_control(mass: float, damping: float) -> Floats:
 
 def radius(step: Callable[[float, float], Floats], damping: float) -> float:
     """Return the spectral radius of a frame of all users over (x, v, x_O, v_O, F_C, F_T, packet)."""
-    device, cube = step(DEVICE, damping), step(CUBE, damping)
+    device, cube = step(DEVICE_MASS, damping), step(CUBE_MASS, damping)
     tick = np.zeros((7, 7))
     tick[:2, :2], tick[:2, 4] = device[:, :2], -device[:, 2]
     tick[2:4, 2:4], tick[2:4, 4], tick[2:4, 5] = cube[:, :2], cube[:, 2], -cube[:, 2]
@@ -104,8 +127,8 @@ def radius(step: Callable[[float, float], Floats], damping: float) -> float:
     return float(np.abs(np.delete(values, np.argmin(np.abs(values - 1)))).max())
 
 
-def compare(damping: float, rounds: int = ROUNDS) -> dict[str, tuple[float, float]]:
-    """Return (median seconds, error) by program, all taking turns."""
+def compare(damping: float, rounds: int = ROUNDS) -> dict[str, Row]:
+    """Return what each program takes and is off by, all taking turns."""
     system = scene(damping)
     truth = spectral_truth(system)
     assert isinstance(truth, Truth)
@@ -116,17 +139,14 @@ def compare(damping: float, rounds: int = ROUNDS) -> dict[str, tuple[float, floa
     }
     if importlib.util.find_spec("control"):
         calls["python-control"] = lambda: radius(by_control, damping)
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    found: dict[str, float] = {}
+    found = {name: call() for name, call in calls.items()}
     with single_threaded():
-        for _ in range(rounds):
-            for name, call in calls.items():
-                began = time.process_time()
-                found[name] = call()
-                times[name].append(time.process_time() - began)
+        times = take_turns(calls, rounds)
     exact = Fraction(truth.digits)
+    bounds = {"apc": analyze(system).spectral_radius_error}
     return {
-        name: (statistics.median(times[name]), float(abs(Fraction(found[name]) - exact))) for name in calls
+        name: Row(statistics.median(times[name]), float(abs(Fraction(found[name]) - exact)), bounds.get(name))
+        for name in calls
     }
 
 
@@ -136,31 +156,28 @@ def scene(damping: float) -> CompiledSystem:
     return apc.set_parameters(compiled(AVERAGE), {"device.damping": value, "cube.damping": value})
 
 
-def play(rounds: int = ROUNDS) -> dict[str, tuple[float, float]]:
-    """Return (median seconds, largest error of a state in m and m/s) by program; others play once."""
+def play(rounds: int = ROUNDS) -> dict[str, Row]:
+    """Return what each program takes and its largest error of a state, in m and m/s; others play once."""
     system = compiled(MOVED)
     truth = exact_course(system, Fraction(SECONDS))
     assert not isinstance(truth, str), truth
-    ready = prepare(system, Fraction(SECONDS), signals=["*.x", "*.v"])
+    ready = prepare(system, Settings(Fraction(SECONDS)), signals=["*.x", "*.v"])
     ticks = round(SECONDS / TICK) + 1
     calls: dict[str, Callable[[], Floats]] = {
-        "apc": lambda: _rows(ready),
+        "apc": partial(_rows, ready),
         "NumPy by hand": lambda: numpy_loop(ticks)[:, :, :4].reshape(ticks, -1),
     }
-    found: dict[str, tuple[float, float]] = {}
+    found: dict[str, Row] = {}
     with single_threaded():
         for name, call in calls.items():
-            times = []
-            for _ in range(rounds):
-                began = time.process_time()
-                rows = call()
-                times.append(time.process_time() - began)
-            found[name] = statistics.median(times), float(np.abs(rows - truth[1]).max())
+            taken, rows = median_time(call, rounds)
+            bound = ROUNDED if name == "apc" else None
+            found[name] = Row(taken, float(np.abs(rows - truth[1]).max()), bound)
         for name, (module, _, played, tolerances) in SIMULATORS.items():
             for tolerance in tolerances if importlib.util.find_spec(module) else ():
                 rows, taken = played(float(SECONDS), tolerance)
                 title = name if tolerance is None else f"{name}, {tolerance:g}"
-                found[title] = taken, float(np.abs(rows - truth[1]).max())
+                found[title] = Row(taken, float(np.abs(rows - truth[1]).max()))
     return found
 
 
@@ -168,26 +185,30 @@ def _rows(ready: Simulation) -> Floats:
     return np.concatenate([block.values for block in blocks(ready)])
 
 
-def show(title: str, table: dict[str, tuple[float, float]]) -> None:
-    """Print a table of times and errors."""
+def show(title: str, table: dict[str, Row], judge: Judge) -> None:
+    """Print a table of times and errors, and judge those that come with a bound."""
     print(f"{title}\n\n  program              median      ratio      error")
-    for name, (seconds, error) in table.items():
-        print(f"  {name:<16} {1e3 * seconds:8.3f} ms {seconds / table['apc'][0]:10.3f} {error:10.1e}")
+    for name, row in table.items():
+        said = "" if row.bound is None else judge.within(f"{name}, {title}", row.error, row.bound)
+        ratio = row.seconds / table["apc"].seconds
+        print(f"  {name:<16} {1e3 * row.seconds:8.3f} ms {ratio:10.3f} {row.error:10.1e}  {said}".rstrip())
     print()
 
 
 def main() -> None:
     """Print a table for each question, and who is left out."""
+    judge = Judge(parser_of("comparison", __doc__).parse_args().strict)
     for damping in DAMPINGS:
-        show(f"spectral radius of the paper's scene, damping {damping:g} N·s/m", compare(damping))
+        show(f"spectral radius of the paper's scene, damping {damping:g} N·s/m", compare(damping), judge)
     print(WHOLE)
-    show(f"12 states of three users at every tick of {SECONDS} s, error in m and m/s", play())
+    show(f"12 states of three users at every tick of {SECONDS} s, error in m and m/s", play(), judge)
     packages = {"python-control": ("control", "control")}
     packages |= {name: (module, package) for name, (module, package, *_) in SIMULATORS.items()}
     for name, (module, package) in packages.items():
         if not importlib.util.find_spec(module):
             print(f"{name} is left out: it is not installed (pip install {package})")
     print(WITHOUT)
+    judge.end()
 
 
 if __name__ == "__main__":

@@ -9,26 +9,22 @@ hold that switched at the very tick would be read a tick late.
 
 from __future__ import annotations
 
-import time
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-FAST, SLOW = 1e-3, 8e-3
-USERS = 3
+from apc.runtime.bench.timing import timed
+from tests.bench.paper_scene import FRAME, K_C, K_T, START, TICK, USERS, user_plant
 
 
 def matrices() -> tuple[NDArray[np.float64], ...]:
     """Return A (12, 12), B (12, 6), the forces' gain on the states (6, 12) and on what is heard (6, 3)."""
-    one = np.zeros((4, 4))
-    one[0, 1] = one[2, 3] = 1
-    one[1, 1], one[3, 3] = -50.0, -25.0
-    push = np.zeros((4, 2))
-    push[1, 0], push[3, 0], push[3, 1] = -10.0, 5.0, -5.0
-    own = np.array([[1000.0, 0, -1000.0, 0], [0, 0, 500.0, 0]])
+    one, push = user_plant()
+    own = np.array([[K_C, 0, -K_C, 0], [0, 0, K_T, 0]])
     others = np.zeros((2 * USERS, USERS))
-    others[1::2] = -500.0 * (np.ones((USERS, USERS)) - np.eye(USERS)) / (USERS - 1)
+    others[1::2] = -K_T * (np.ones((USERS, USERS)) - np.eye(USERS)) / (USERS - 1)
     users = np.eye(USERS)
     return np.kron(users, one), np.kron(users, push), np.kron(users, own), others
 
@@ -50,10 +46,10 @@ def diagram() -> tuple[Any, Any, Any]:
     add, connect = builder.AddSystem, builder.Connect
     plant = add(LinearSystem(a, b, np.eye(12), np.zeros((12, 6))))
     of_states, of_heard, total = add(MatrixGain(own)), add(MatrixGain(others)), add(Adder(2, 6))
-    delay = add(DiscreteTimeDelay(FAST, 1, 6))
+    delay = add(DiscreteTimeDelay(TICK, 1, 6))
     cubes = add(MatrixGain(np.kron(np.eye(USERS), [[0.0, 0, 1, 0]])))
-    taken = add(ZeroOrderHold(period_sec=SLOW, vector_size=USERS))
-    due = add(ZeroOrderHold(period_sec=SLOW, vector_size=USERS, offset_sec=SLOW - FAST / 2))
+    taken = add(ZeroOrderHold(period_sec=FRAME, vector_size=USERS))
+    due = add(ZeroOrderHold(period_sec=FRAME, vector_size=USERS, offset_sec=FRAME - TICK / 2))
     connect(plant.get_output_port(), of_states.get_input_port())
     connect(plant.get_output_port(), cubes.get_input_port())
     connect(cubes.get_output_port(), taken.get_input_port())
@@ -63,7 +59,7 @@ def diagram() -> tuple[Any, Any, Any]:
     connect(of_heard.get_output_port(), total.get_input_port(1))
     connect(total.get_output_port(), delay.get_input_port())
     connect(delay.get_output_port(), plant.get_input_port())
-    log = LogVectorOutput(plant.get_output_port(), builder, publish_period=FAST)
+    log = LogVectorOutput(plant.get_output_port(), builder, publish_period=TICK)
     return builder.Build(), plant, log
 
 
@@ -75,12 +71,10 @@ def played_by_drake(seconds: float, accuracy: float | None) -> tuple[NDArray[np.
     simulator = Simulator(built)
     context = simulator.get_mutable_context()
     start = np.zeros(12)
-    start[0] = 0.01
+    start[0] = START
     plant.GetMyMutableContextFromRoot(context).SetContinuousState(start)
     if accuracy is not None:
         simulator.get_mutable_integrator().set_target_accuracy(accuracy)
     simulator.Initialize()
-    began = time.process_time()
-    simulator.AdvanceTo(seconds)
-    taken = time.process_time() - began
+    taken, _ = timed(partial(simulator.AdvanceTo, seconds))
     return log.FindLog(context).data().T.copy(), taken

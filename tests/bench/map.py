@@ -7,9 +7,7 @@ each column times 1 ± 1e-9. Wrong verdicts must be none; an error beside its bo
 
 from __future__ import annotations
 
-import argparse
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -19,16 +17,20 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import Prepared, analyze, prepare
+from apc.runtime.bench.timing import timed
 from apc.runtime.eigen.balls import precision
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.threads import single_threaded
+from tests.bench.judge import Judge, parser_of
+from tests.bench.paper_scene import CUBE_DAMPING, DEVICE_DAMPING, DEVICE_MASS, SHARED_MASS, TICKS, USERS
 from tests.bruteforce import Scene, frame_matrix
 from tests.topologies import AVERAGE, MESH, compiled
 
-DIGITS_60 = 200  # bits
-K_C, K_T = 5000.0, 1500.0  # the limits of the scene's own study; with dampers, twice that holds
-TICKS, TICK = 8, Fraction(1, 1000)
-DEVICE, CUBE = Fraction(0.1), Fraction(0.6) / 3  # the numbers a compiled scene holds
+BITS = 200  # of precision: 60 decimal digits
+CERTAIN = 1e-40  # so far, and no more, the truth itself may be off (`check_truth`)
+MOST_K_C, MOST_K_T = 5000.0, 1500.0  # the limits of the scene's own study; with dampers, twice that holds
+MS = Fraction(1, 1000)
+DEVICE, CUBE = Fraction(DEVICE_MASS), Fraction(SHARED_MASS) / USERS  # the numbers a compiled scene holds
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ def truth(mesh: bool, k_c: float, k_t: float, damping: float) -> Truth:
         found = flint.acb_mat(flint.arb_mat(matrix).mid()).eig(algorithm="approx")
         found.sort(key=lambda value: float(abs(value - 1).mid()))
         values += found
-        assert not rigid or float(abs(found[0] - 1).mid()) < 1e-40
+        assert not rigid or float(abs(found[0] - 1).mid()) < CERTAIN
         radius = max([radius, *(abs(value).mid() for value in found[1 if rigid else 0 :])])
     return Truth(values, radius)
 
@@ -58,7 +60,7 @@ def _frame(
     own: int, share: flint.arb, k_c: flint.arb, k_t: flint.arb, damping: flint.arb
 ) -> list[list[flint.arb]]:
     """Return one user's frame over (x, v, x_O, v_O, F_C, F_T, packet x_O, packet v_O), as rows."""
-    steps = [_step(DEVICE), _step(CUBE)]
+    steps = [_step(DEVICE, DEVICE_DAMPING), _step(CUBE, CUBE_DAMPING)]
     columns = []
     for column in range(8):
         x, v, x_o, v_o, f_c, f_t, p_x, p_v = (flint.arb(int(column == row)) for row in range(8))
@@ -74,10 +76,10 @@ def _frame(
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def _step(kilograms: Fraction) -> tuple[flint.arb, ...]:
-    """Return what of x and v a millisecond leaves and what a force adds to them, with 5 N·s/m."""
-    mass, t = _arb(kilograms), _arb(TICK)
-    b = flint.arb(5)
+def _step(kilograms: Fraction, damping: float) -> tuple[flint.arb, ...]:
+    """Return what of x and v a millisecond leaves and what a force adds to them."""
+    mass, t = _arb(kilograms), _arb(MS)
+    b = flint.arb(damping)
     decay = (-b * t / mass).exp()
     rise = (1 - decay) / b  # ∫₀ᵗ e^(−b s/m)/m ds
     return decay, rise, mass * rise, (t - mass * rise) / b
@@ -98,7 +100,7 @@ def check_truth() -> None:
         whole = flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
         whole.sort(key=lambda value: float(abs(value - 1).mid()))
         radius = max(abs(value).mid() for value in whole[1:])
-        assert float(abs(radius - truth(mesh, 1500.0, 800.0, 2.0).radius)) < 1e-40
+        assert float(abs(radius - truth(mesh, 1500.0, 800.0, 2.0).radius)) < CERTAIN
 
 
 def _arb(value: object) -> flint.arb:
@@ -122,21 +124,20 @@ class Tally:
 
     def add(self, system: CompiledSystem, shared: Prepared, values: dict[str, float], known: Truth) -> None:
         """Analyse a point and compare."""
-        began = time.perf_counter()
-        changed = apply(system, [Override(name, None, Fraction(value)) for name, value in values.items()])
-        found = analyze(changed, prepared=shared)
-        self.seconds += time.perf_counter() - began
+        drawn = [Override(name, None, Fraction(value)) for name, value in values.items()]
+        taken, found = timed(lambda: analyze(apply(system, drawn), prepared=shared))
+        self.seconds += taken
         self.points += 1
         self.undecided += found.stable is None
         self.wrong += found.stable is not None and found.stable != bool(known.radius < 1)
         self.proved += bool(found.proof)
         off = float(abs(known.radius - flint.arb(found.spectral_radius)).mid())
-        self.radius = max(self.radius, off / found.spectral_radius_error)
+        self.radius = max(self.radius, _beside(off, found.spectral_radius_error))
         self.bound = max(self.bound, found.spectral_radius_error)
         for mode in found.modes:
             place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
             distance = min(float(abs(place - value).mid()) for value in known.values)
-            self.mode = max(self.mode, distance / mode.error if mode.error else math.inf * bool(distance))
+            self.mode = max(self.mode, _beside(distance, mode.error))
 
     def __str__(self) -> str:
         each = 1e3 * self.seconds / max(self.points, 1)
@@ -146,13 +147,22 @@ class Tally:
         )
 
 
+def _beside(error: float, bound: float) -> float:
+    """Return error ÷ bound; a bound that says nothing is as bad as one that does not hold."""
+    if not math.isfinite(bound):
+        return math.inf
+    if error <= CERTAIN:  # of an eigenvalue that is exactly 0 the analysis knows it, the truth 100 digits
+        return 0.0
+    return error / bound if bound else math.inf
+
+
 def one_map(text: str, mesh: bool, damping: float, side: int) -> tuple[Tally, Tally]:
     """Compare a map of side² points, and the points next to its boundary."""
     system = compiled(text)
     shared = prepare(system)
     inner, edge = Tally(), Tally()
     grid = (np.arange(side) + 1) / side
-    most = 2 * K_T if damping else K_T
+    most = 2 * MOST_K_T if damping else MOST_K_T
 
     def values(k_c: float, k_t: float) -> dict[str, float]:
         return {
@@ -162,7 +172,7 @@ def one_map(text: str, mesh: bool, damping: float, side: int) -> tuple[Tally, Ta
             "coordination.damping": damping,
         }
 
-    for k_c in (grid * K_C).tolist():
+    for k_c in (grid * MOST_K_C).tolist():
         stable = []
         for k_t in (grid * most).tolist():
             known = truth(mesh, k_c, k_t, damping)
@@ -181,20 +191,25 @@ def one_map(text: str, mesh: bool, damping: float, side: int) -> tuple[Tally, Ta
 
 def main() -> None:
     """Print one line a map."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.map", description=__doc__)
+    parser = parser_of("map", __doc__)
     parser.add_argument("--points", type=int, default=10_000, help="of all four maps together")
-    side = max(2, math.isqrt(parser.parse_args().points // 4))
-    failed = 0
-    with single_threaded(), precision(DIGITS_60):
+    given = parser.parse_args()
+    side = max(2, math.isqrt(given.points // 4))
+    judge = Judge(given.strict)
+    with single_threaded(), precision(BITS):
         check_truth()
         for text, mesh in ((AVERAGE, False), (MESH, True)):
             for damping in (0.0, 2.0):
+                name = f"{'mesh' if mesh else 'mean'} {'PD' if damping else 'P '}"
                 inner, edge = one_map(text, mesh, damping, side)
-                print(f"{'mesh' if mesh else 'mean'} {'PD' if damping else 'P '}  {inner}")
+                print(f"{name}  {inner}")
                 print(f"  boundary·(1 ± 1e-9)  {edge}", flush=True)
-                failed += inner.wrong + edge.wrong + inner.undecided + edge.undecided
-                failed += max(inner.radius, inner.mode, edge.radius, edge.mode) > 1
-    print("every verdict right, every bound holds" if not failed else "FAILED")
+                for place, tally in ((name, inner), (f"{name} at the boundary", edge)):
+                    judge.right(f"{place}: {tally.wrong} verdicts wrong", not tally.wrong)
+                    judge.right(f"{place}: {tally.undecided} verdicts left open", not tally.undecided)
+                    judge.within(f"{place}: error of the radius / bound", tally.radius, 1)
+                    judge.within(f"{place}: error of a mode / bound", tally.mode, 1)
+    judge.end()
 
 
 if __name__ == "__main__":

@@ -12,22 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-Floats = NDArray[np.float64]
+from tests.bench.paper_scene import TICK, TICKS, USERS, Floats, user_plant
 
-USERS = 3
-MASS, DAMPING = 0.1, 5.0  # of a device
-COPY_MASS, COPY_DAMPING = 0.2, 5.0  # of a cube's copy
-TICK = 1e-3
-TICKS = 8  # in a frame
-STATES = 12 + 6 + 3
+STATES = 4 * USERS + 2 * USERS + USERS
 
 
 def plant() -> tuple[Floats, Floats]:
     """Return x⁺ = A x + B F of all users over a tick, F = (F_C, F_T) of each user, held."""
-    a = np.array(
-        [[0, 1, 0, 0], [0, -DAMPING / MASS, 0, 0], [0, 0, 0, 1], [0, 0, 0, -COPY_DAMPING / COPY_MASS]]
-    )
-    b = np.array([[0, 0], [-1 / MASS, 0], [0, 0], [1 / COPY_MASS, -1 / COPY_MASS]])
+    a, b = user_plant()
     both = expm(np.block([[a, b], [np.zeros((2, 6))]]) * TICK)
     return np.kron(np.eye(USERS), both[:4, :4]), np.kron(np.eye(USERS), both[:4, 4:])
 

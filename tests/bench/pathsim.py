@@ -9,12 +9,14 @@ millisecond before it is due, as in Drake.
 
 from __future__ import annotations
 
-import time
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.bench.drake import FAST, SLOW, matrices
+from apc.runtime.bench.timing import timed
+from tests.bench.drake import matrices
+from tests.bench.paper_scene import FRAME, START, TICK
 
 
 def played_by_pathsim(seconds: float, tolerance: float | None) -> tuple[NDArray[np.float64], float]:
@@ -25,12 +27,12 @@ def played_by_pathsim(seconds: float, tolerance: float | None) -> tuple[NDArray[
 
     a, b, own, others = matrices()
     start = np.zeros(12)
-    start[0] = 0.01
+    start[0] = START
     plant = StateSpace(a, b, np.eye(12), np.zeros((12, 6)), initial_value=start)
     forces = Function(lambda *heard: own @ np.array(heard[:12]) + others @ np.array(heard[12:]))
-    computed, acting = SampleHold(FAST), SampleHold(FAST)
-    taken, due = SampleHold(SLOW), SampleHold(SLOW, SLOW - FAST / 2)
-    scope = Scope(sampling_period=FAST)
+    computed, acting = SampleHold(TICK), SampleHold(TICK)
+    taken, due = SampleHold(FRAME), SampleHold(FRAME, FRAME - TICK / 2)
+    scope = Scope(sampling_period=TICK)
     wires = [
         Connection(plant[:12], forces[:12], scope[:12]),
         *(Connection(plant[4 * user + 2], taken[user]) for user in range(3)),
@@ -42,9 +44,7 @@ def played_by_pathsim(seconds: float, tolerance: float | None) -> tuple[NDArray[
     ]
     blocks = [plant, forces, scope, acting, due, computed, taken]
     asked = {} if tolerance is None else {"tolerance_lte_abs": tolerance, "tolerance_lte_rel": tolerance}
-    simulation = Simulation(blocks, wires, dt=FAST / 2, Solver=RKDP54, log=False, **asked)
-    began = time.process_time()
-    simulation.run(seconds + FAST / 4)  # past the last tick, whatever its rounding
-    taken_s = time.process_time() - began
+    simulation = Simulation(blocks, wires, dt=TICK / 2, Solver=RKDP54, log=False, **asked)
+    taken_s, _ = timed(partial(simulation.run, seconds + TICK / 4))  # past the last tick, however rounded
     _, rows = scope.read()
-    return np.asarray(rows).T[: round(seconds / FAST) + 1], taken_s
+    return np.asarray(rows).T[: round(seconds / TICK) + 1], taken_s

@@ -1,25 +1,27 @@
 # ruff: noqa: E501 -- tables are printed by long lines
 """Populations of any size, time beside error: `python -m tests.bench.populations [--quick]`.
 
-Whole processes are started anew, those that are compared in turn, and of each the best of a few runs counts:
+Whole processes are started anew, those that are compared in turn, and of each the median of a few runs counts:
 their ratio does not depend on the machine. Their memory is the largest resident set. The truth is the dense
 matrix where it can be had, and for a long delay a Newton iteration at 50 digits.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
+import statistics
 import subprocess
 import sys
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from apc.runtime.analysis.analysis import Analysis, analyze, prepare
+from apc.runtime.bench.timing import median_time, waited
 from apc.runtime.threads import single_threaded
+from tests.bench.judge import Judge, parser_of
 from tests.populations import different
 from tests.sites import MS, grouped, linked, paper
 
@@ -35,6 +37,9 @@ found = analyze(scene({name!r}))
 memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 print(found.method, found.spectral_radius, found.spectral_radius_error, memory, found.verdict, sep="|")
 """
+
+# A million equal peers are the same two systems as three: a process of them takes as long but for luck.
+AS_LONG = 1.25
 
 GROUPS = (("left", {"device.mass": 0.2}), ("mid", {}), ("right", {"contact.stiffness": 700.0}))
 GAINS = {"kt": 400.0, "bt": 1.0, "kc": 1000.0, "bc": 1.0}
@@ -59,20 +64,20 @@ def scene(name: str) -> Any:
 
 
 def processes(names: tuple[str, ...], runs: int) -> dict[str, tuple[float, str]]:
-    """Return the seconds of the fastest process of each scene, run in turn, and what it printed."""
-    found: dict[str, tuple[float, str]] = {}
+    """Return the median seconds of the processes of each scene, run in turn, and what the last printed."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    times: dict[str, list[float]] = {name: [] for name in names}
+    printed = {}
     for _ in range(runs):
         for name in names:
-            code = PROCESS.format(root=str(ROOT), name=name)
-            began = time.perf_counter()
-            ran = subprocess.run(
-                [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+            words = [sys.executable, "-c", PROCESS.format(root=str(ROOT), name=name)]
+            start = partial(
+                subprocess.run, words, capture_output=True, text=True, check=True, env=environment
             )
-            took = time.perf_counter() - began
-            if name not in found or took < found[name][0]:
-                found[name] = took, ran.stdout.strip()
-    return found
+            took, ran = waited(start)
+            times[name].append(took)
+            printed[name] = ran.stdout.strip()
+    return {name: (statistics.median(times[name]), printed[name]) for name in names}
 
 
 def print_process(name: str, took: float, printed: str, note: str = "") -> None:
@@ -83,48 +88,45 @@ def print_process(name: str, took: float, printed: str, note: str = "") -> None:
     )
 
 
-def compared(names: tuple[str, str], runs: int) -> float:
-    """Print two processes and the ratio of their times; returns it."""
+def compared(names: tuple[str, str], runs: int, judge: Judge) -> None:
+    """Print two processes and the ratio of their times."""
     found = processes(names, runs)
     ratio = found[names[1]][0] / found[names[0]][0]
+    kept = judge.in_time(f"{names[1]} against {names[0]}", ratio, AS_LONG)
     print_process(names[0], *found[names[0]])
-    print_process(names[1], *found[names[1]], note=f"   ratio {ratio:.2f}")
-    return ratio
+    print_process(names[1], *found[names[1]], note=f"   ratio {ratio:.2f}, target {AS_LONG:g} {kept}")
 
 
 def warm(system: Any, method: str = "auto", runs: int = 5) -> tuple[float, Analysis]:
-    """Return the seconds of the fastest analysis in this process, and the analysis."""
-    prepared = prepare(system)
-    times = []
-    for _ in range(runs):
-        began = time.perf_counter()
-        found = analyze(system, method=method, prepared=prepared)
-        times.append(time.perf_counter() - began)
-    return min(times), found
+    """Return the median seconds of an analysis in this process, and the analysis."""
+    return median_time(partial(analyze, system, method=method, prepared=prepare(system)), runs)
 
 
-def print_against_dense(sizes: tuple[int, ...]) -> None:
+def print_against_dense(sizes: tuple[int, ...], judge: Judge) -> None:
     """Print analyses of different peers beside the dense matrix."""
     print("\ndifferent peers against the dense matrix, in a warm process")
     for graph, method in (("complete", "determinant"), ("ring", "krylov")):
         for peers in sizes:
             system = different(peers, graph=graph)
-            took, found = warm(system, method, runs=2)
+            took, found = warm(system, method, runs=3)
             whole_took, whole = warm(system, "dense", runs=1)
             apart = abs(found.spectral_radius - whole.spectral_radius)
+            most = found.spectral_radius_error + whole.spectral_radius_error
+            said = judge.within(f"{peers} {graph} against dense", apart, most)
             print(
-                f"{peers:>5} {graph:<9} {found.method:<12}{took:8.3f} s  ± {found.spectral_radius_error:.0e}  off by {apart:.0e}   dense {whole_took:8.3f} s"
+                f"{peers:>5} {graph:<9} {found.method:<12}{took:8.3f} s  ± {found.spectral_radius_error:.0e}  off by {apart:.0e} {said}   dense {whole_took:8.3f} s"
             )
 
 
-def print_long_delays(frames: tuple[int, ...]) -> None:
+def print_long_delays(frames: tuple[int, ...], judge: Judge) -> None:
     """Print analyses of long delays; the error is against Newton's method at 50 digits."""
     print("\nlong delays, in a warm process")
     for count in frames:
         took, found = warm(scene(f"delay {count}"))
         apart = abs(_in_50_digits(count, found) - found.spectral_radius)
+        said = judge.within(f"delay of {count} frames", apart, found.spectral_radius_error)
         print(
-            f"{count:>5} frames {found.method:<12}{took * 1e3:8.1f} ms  ± {found.spectral_radius_error:.0e}  off by {apart:.0e}"
+            f"{count:>5} frames {found.method:<12}{took * 1e3:8.1f} ms  ± {found.spectral_radius_error:.0e}  off by {apart:.0e} {said}"
         )
 
 
@@ -163,21 +165,24 @@ def _in_50_digits(frames: int, found: Analysis) -> float:
 
 def main() -> None:
     """Print every table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of("populations", __doc__)
     parser.add_argument("--quick", action="store_true", help="smaller sizes, fewer runs")
-    quick = parser.parse_args().quick
-    runs = 2 if quick else 5
+    given = parser.parse_args()
+    judge, quick = Judge(given.strict), given.quick
+    runs = 3 if quick else 5
     np.seterr(all="ignore")
-    print("whole processes, the best of some, run in turn")
-    compared(("equal 3", "equal 1000000"), runs)
-    compared(("groups 3", "groups 100000"), runs)
+    print("whole processes, medians of some, run in turn")
+    compared(("equal 3", "equal 1000000"), runs, judge)
+    compared(("groups 3", "groups 100000"), runs, judge)
     for name in ("ring 1000", "ring 100000", "different 1000", "different 100000", "different-ring 2000"):
         if not (quick and name in ("different 100000", "different-ring 2000")):
             took, printed = processes((name,), 1 if name.startswith("different") else runs)[name]
             print_process(name, took, printed)
+            judge.right(f"{name}: the verdict is left open", "undecided" not in printed)
     with single_threaded():
-        print_against_dense((10, 40) if quick else (10, 40, 100))
-        print_long_delays((1, 10, 1000) if quick else (1, 10, 100, 1000, 5000))
+        print_against_dense((10, 40) if quick else (10, 40, 100), judge)
+        print_long_delays((1, 10, 1000) if quick else (1, 10, 100, 1000, 5000), judge)
+    judge.end()
 
 
 if __name__ == "__main__":

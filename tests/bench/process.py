@@ -6,17 +6,19 @@ own files; memory is the most it held. This program loads nothing large itself, 
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
+import resource
 import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from pathlib import Path
+
+from apc.runtime.bench.timing import spread_of, waited
+from tests.bench.judge import Judge, parser_of
 
 SCENES = Path(__file__).resolve().parents[2] / "models" / "scenes"
 RUNS = 7
@@ -34,13 +36,16 @@ LINE = re.compile(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)")
 
 def once(words: tuple[str, ...], folder: Path) -> tuple[float, float, int]:
     """Return the seconds, those of a processor, and the most bytes of one process."""
-    began = time.perf_counter()
     command = [sys.executable, *words]
-    process = subprocess.Popen(command, cwd=folder, env=_environment(folder), stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    seconds = time.perf_counter() - began
-    process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0, words
+
+    def run() -> tuple[int, resource.struct_rusage]:
+        process = subprocess.Popen(command, cwd=folder, env=_environment(folder), stdout=subprocess.DEVNULL)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        return process.returncode, used
+
+    seconds, (code, used) = waited(run)
+    assert code == 0, words
     return seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
@@ -65,21 +70,24 @@ def _environment(folder: Path) -> dict[str, str]:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.process", description=__doc__)
+    parser = parser_of("process", __doc__)
     parser.add_argument("--runs", type=int, default=RUNS)
-    runs = parser.parse_args().runs
+    given = parser.parse_args()
+    judge = Judge(given.strict)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shutil.copy(SCENES / f"{SCENE}.yaml", folder)
         print(f"{'process':<12} {'median':>9} {'spread':>9} {'processor':>10} {'memory':>9}   target")
         for title, words in COMMANDS:
-            measured = [once(words, folder) for _ in range(runs + 1)][1:]
-            times = sorted(seconds for seconds, _, _ in measured)
+            measured = [once(words, folder) for _ in range(given.runs + 1)][1:]
+            times = [seconds for seconds, _, _ in measured]
             busy = statistics.median(seconds for _, seconds, _ in measured)
             memory = max(size for _, _, size in measured) / 2**20
-            target = f"{TARGETS[title]:g} s" if title in TARGETS else ""
+            median, target = statistics.median(times), ""
+            if title in TARGETS:
+                target = f"{TARGETS[title]:g} s {judge.in_time(title, median, TARGETS[title])}"
             print(
-                f"{title:<12} {statistics.median(times):7.3f} s {(times[-1] - times[0]) / 2:7.3f} s "
+                f"{title:<12} {median:7.3f} s {spread_of(times):7.3f} s "
                 f"{busy:8.3f} s "
                 f"{memory:5.0f} MiB   {target}".rstrip()
             )
@@ -87,6 +95,7 @@ def main() -> None:
             found = imports(words, folder)
             listed = ", ".join(f"{one} {size / 1e3:.0f} ms" for one, size in found.most_common(MOST_PACKAGES))
             print(f"\nimports of {title}: {sum(found.values()) / 1e3:.0f} ms in all\n  {listed}")
+    judge.end()
 
 
 if __name__ == "__main__":

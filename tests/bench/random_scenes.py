@@ -3,18 +3,18 @@
 
 Graphs, clocks, delays, groups and couplings are drawn, and for each such structure numbers over many decades.
 The truth comes from the compiled functions alone, event by event (see `bench.reference`). A bound that does
-not hold and a wrong verdict must be none.
+not hold and a wrong verdict must be none, verdicts left open and scenes refused hardly any.
 """
 
 from __future__ import annotations
 
-import argparse
+import math
 import random
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 
 import flint
 
@@ -22,14 +22,22 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Analysis, analyze
 from apc.runtime.bench.reference import RIGID, classes_of, eigenvalues, frame_matrices
+from apc.runtime.bench.timing import timed
 from apc.runtime.eigen.balls import precision
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.threads import single_threaded
+from tests.bench.judge import Judge, parser_of
 from tests.topologies import compiled
 
 BITS = 256  # a chain of four equal eigenvalues still keeps 19 digits
 DRAWS = 20  # of numbers for each structure
-UNDECIDED = "undecided"
+
+# Shares of all scenes. Left open: gains drawn over decades come no nearer to a boundary than floats tell, and
+# what is on one by its structure (no damping, no coupling) balls decide; one in a thousand is a draw's luck.
+MOST_UNDECIDED = 1e-3
+# Refused as beyond floats: a tick of 2 ms drives 1e-4 kg on 1e5 N/m apart 1e4-fold at most, and a frame has
+# 20 ticks at most: 1e80, which is a float. None should be refused; one in a thousand is a draw's luck.
+MOST_REFUSED = 1e-3
 
 
 def structure(generator: random.Random) -> str:
@@ -112,10 +120,11 @@ class Tally:
     def __str__(self) -> str:
         """Return a few lines."""
         each = 1e3 * self.seconds / max(self.scenes, 1)
+        share = 100 / max(self.scenes + self.refused, 1)
         words = ", ".join(f"{count} {name}" for name, count in sorted(self.verdicts.items()))
         return (
-            f"{self.scenes} analyses: {words}\n{len(self.wrong)} wrong, {self.undecided} undecided, "
-            f"{self.proved} proved in balls, {self.refused} beyond floats; error/bound at most "
+            f"{self.scenes} analyses: {words}\n{len(self.wrong)} wrong, {self.undecided} undecided ({share * self.undecided:.2g} %), "
+            f"{self.proved} proved in balls, {self.refused} beyond floats ({share * self.refused:.2g} %); error/bound at most "
             f"{self.tightest:.2g}; {each:.1f} ms an analysis"
         )
 
@@ -134,9 +143,10 @@ def truth(system: CompiledSystem) -> tuple[flint.arb, int]:
 
 def check(found: Analysis, radius: flint.arb, rigid: int) -> str:
     """Return what is wrong with an analysis, "" if nothing is."""
-    if not float(abs(radius - flint.arb(found.spectral_radius)).mid()) <= found.spectral_radius_error * (
-        1 + 1e-9
-    ):
+    apart = abs(
+        radius - flint.arb(found.spectral_radius)
+    ).mid()  # 256 bits: no rounding that floats could see
+    if not apart <= flint.arb(found.spectral_radius_error) or not math.isfinite(found.spectral_radius_error):
         return f"radius {found.spectral_radius} ± {found.spectral_radius_error}, truth {radius.str(20)}"
     if found.stable is None:
         return ""
@@ -174,9 +184,8 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
             known = None
             for method in methods:
                 values = ", ".join(f"{one.name}={float(one.value)!r}" for one in drawn)
-                began = time.perf_counter()
                 try:
-                    found = analyze(system, method=method)
+                    taken, found = timed(partial(analyze, system, method=method))
                 except ApcError as error:
                     assert error.mistakes[0].code in ("E806", "E850"), error
                     tally.refused += 1
@@ -184,7 +193,7 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
                 except Exception as error:  # whatever it is, it is a bug
                     tally.wrong.append(f"{method}: {error!r}\n{text}{values}")
                     continue
-                tally.seconds += time.perf_counter() - began
+                tally.seconds += taken
                 known = known or truth(system)
                 tally.scenes += 1
                 tally.undecided += found.stable is None
@@ -201,16 +210,20 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
 
 def main() -> None:
     """Print what came out, and every scene that is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.random_scenes", description=__doc__)
+    parser = parser_of("random_scenes", __doc__)
     parser.add_argument("--points", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--methods", default="auto", help="auto,dense,determinant,krylov")
     given = parser.parse_args()
+    judge = Judge(given.strict)
     tally = run(given.points, seed=given.seed, methods=given.methods.split(","))
     print(tally)
     for one in tally.wrong:
-        print(f"\nWRONG {one}")
-    raise SystemExit(bool(tally.wrong))
+        judge.right(one, holds=False)
+    most = tally.scenes + tally.refused
+    judge.within("verdicts left open", tally.undecided, MOST_UNDECIDED * most)
+    judge.within("scenes beyond floats", tally.refused, MOST_REFUSED * most)
+    judge.end()
 
 
 if __name__ == "__main__":

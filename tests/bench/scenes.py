@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.bench.bench import FAILED, bench
+from apc.runtime.bench.bench import FAILED, WRONG, bench
+from tests.bench.judge import Judge, parser_of
 from tests.topologies import SCENES
 
 
 def main() -> None:
-    """Print a line a scene and task; exit 1 if a default is off the front, or something is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.scenes", description=__doc__)
+    """Print a line a scene and task; a default off the front is a missed target, as times decide it too."""
+    parser = parser_of("scenes", __doc__)
     parser.add_argument("--rounds", type=int, default=15)
     names = sorted(path.stem for path in SCENES.glob("*.yaml"))
     parser.add_argument("names", nargs="*", metavar="SCENE", help="only these")
     given = parser.parse_args()
     print(f"{'scene':<20} {'task':<9} {'chosen':<12} {'median':>9} {'error':>9} {'bound':>9}  front")
-    failed = 0
+    judge = Judge(given.strict)
     for name in given.names or names:
         for one in bench(compile_topology(SCENES / f"{name}.yaml"), rounds=given.rounds).comparisons:
             chosen = one.chosen
@@ -33,14 +34,16 @@ def main() -> None:
                 f"{error:>9} {bound:>9}  {where}",
                 flush=True,
             )
-            failed += chosen.error is not None and not chosen.front
-            wrong = [note for note in one.notes if note.startswith("WRONG")]
+            if chosen.error is not None and not chosen.front:
+                judge.missed.append(f"{name}, {one.task}: {chosen.name} is not on the front")
+            says = chosen.bound is None or math.isfinite(chosen.bound)
+            judge.right(f"{name}, {one.task}: the bound says nothing", says)
+            wrong = [note for note in one.notes if note.startswith(WRONG)]
             wrong += [f"{method} {why}" for method, why in one.refused if why.startswith(FAILED)]
-            failed += len(wrong)
             for line in wrong:
                 print(f"  {line}")
-    print("every default is on the front, every bound holds" if not failed else f"{failed} FAILED")
-    raise SystemExit(bool(failed))
+                judge.right(f"{name}, {one.task}: {line}", holds=False)
+    judge.end()
 
 
 if __name__ == "__main__":

@@ -10,11 +10,12 @@ import argparse
 import hashlib
 import resource
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
 
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.store import save
+from apc.runtime.bench.timing import timed, waited
 from apc.runtime.frame.overrides import apply
 from apc.runtime.sweep.grid import build_grid, parse_axis
 from apc.runtime.sweep.quantities import find_quantity
@@ -42,18 +43,27 @@ def plain(model: Path, over: dict[str, str], count: int) -> float:
     quantity = find_quantity(system, "analyze")
     with single_threaded():
         quantity.evaluate(system)
-        began = time.process_time()
-        for point in range(count):
-            quantity.evaluate(apply(system, grid.overrides(point)))
-        return (time.process_time() - began) / count
+
+        def loop() -> None:
+            for point in range(count):
+                quantity.evaluate(apply(system, grid.overrides(point)))
+
+        return timed(loop)[0] / count
 
 
 def finish(folder: Path, words: list[str]) -> tuple[str, float]:
     """Run a sweep to its end; return what it printed and the seconds it took."""
-    began = time.perf_counter()
-    out, err = start(folder, *words).communicate()
+    seconds, (out, err) = waited(lambda: start(folder, *words).communicate())
     assert not err, err
-    return out, time.perf_counter() - began
+    return out, seconds
+
+
+def _kill(folder: Path, words: list[str], target: Path, moment: int) -> None:
+    """Start a sweep and kill it once so many parts are finished."""
+    running = start(folder, *words)
+    wait_for_parts(running, target, moment)
+    running.kill()
+    running.communicate()
 
 
 def killed(folder: Path, words: list[str], target: Path, kills: int, points: int) -> float:
@@ -63,12 +73,7 @@ def killed(folder: Path, words: list[str], target: Path, kills: int, points: int
     seconds = 0.0
     before: dict[str, tuple[int, int]] = {}
     for moment in moments:
-        began = time.perf_counter()
-        running = start(folder, *words)
-        wait_for_parts(running, target, max(moment, len(before) + 1))
-        running.kill()
-        running.communicate()
-        seconds += time.perf_counter() - began
+        seconds += waited(partial(_kill, folder, words, target, max(moment, len(before) + 1)))[0]
         now = parts(target)
         kept = before.items() <= now.items()
         print(f"  killed with {len(now):>6} parts of {whole} finished; those of before untouched: {kept}")

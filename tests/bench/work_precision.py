@@ -6,27 +6,33 @@ Run it from the project's folder: `python -m tests.bench.work_precision [--plot 
     soft contact    the same on foam; a contact lasts twenty
     arm             an arm holds a device that pushes a tool by a spring, forces at ticks: linear
 
-The error is that of the positions, relative to the way they go, against the exact motion where there is one
-and CVODES at 1e-14 elsewhere; that of the exact motion is what its roundings amount to. The time is that of
-the run, without preparing it, as a part of real time.
+The error is that of the positions, relative to the way they go, against programs that share no method with
+those compared: fifty digits event by event (`bench.reference`) for the arm, equations by hand and a method of
+order 8 (`tests.bench.contact_reference`) for the contacts. The time is that of the run, without preparing it,
+as a part of real time.
 """
 
 from __future__ import annotations
 
-import argparse
-import time
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.runtime.bench.reference import exact_course
+from apc.runtime.bench.timing import median_time
 from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.methods import Method
-from apc.runtime.simulate.simulation import prepare
+from apc.runtime.simulate.methods import CVODES, EXACT, TOLERANCE, Method
+from apc.runtime.simulate.settings import Settings
+from apc.runtime.simulate.simulation import Simulation, prepare
 from apc.runtime.threads import single_threaded
+from tests.bench.contact_reference import Bounce, reference
+from tests.bench.judge import Judge, parser_of
 from tests.topologies import compiled
 
 DURATION = Fraction(1, 2)
@@ -54,11 +60,10 @@ couplers:
   spring: {type: SampledSpringDamper, a: device, b: tool, stiffness: 600 N/m, damping: 1 N*s/m, clock: haptic}
 hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 300 N/m, damping: 2 N*s/m}}
 """
-SCENES = {
-    "stiff contact": BALL.replace("STIFF", "3e6 N/m^(3/2)").replace("DAMPING", "1e6 N*s/m^(5/2)"),
-    "soft contact": BALL.replace("STIFF", "2e4 N/m^(3/2)").replace("DAMPING", "1e4 N*s/m^(5/2)"),
-    "arm": ARM,
-}
+CONTACTS = {"stiff contact": (3e6, 1e6), "soft contact": (2e4, 1e4)}  # N/m^(3/2), N·s/m^(5/2)
+# Errors of a step add up over a run: of CVODES, at the default's tolerance and tighter ones, to some hundred
+# times the tolerance (see `methods.TOLERANCE`). Exact transitions round at each of 500 ticks.
+ADDED_UP, ROUNDED = 1e3, 1e-12
 MS = Fraction(1, 1000)
 STEPS = (MS, MS / 2, MS / 5, MS / 10, MS / 20, MS / 50, MS / 100)
 METHODS = {
@@ -84,37 +89,64 @@ class Point:
     part: float
 
 
-def played(system: CompiledSystem, method: Method) -> tuple[NDArray[np.float64], float]:
-    """Return the positions and the seconds that the run took, the best of some."""
-    ready = prepare(system, DURATION, signals=["*.x"], method=method)
-    taken = []
-    for _ in range(REPEATS):
-        began = time.perf_counter()
-        rows = [block.values for block in blocks(ready)]
-        taken.append(time.perf_counter() - began)
-    return np.concatenate(rows), min(taken)
+def played(system: CompiledSystem, method: Method) -> tuple[NDArray[np.float64], float, tuple[str, ...]]:
+    """Return the positions, the median seconds of some runs, and the names of the positions."""
+    ready = prepare(system, Settings(DURATION, method), signals=["*.x"])
+    seconds, rows = median_time(partial(_rows, ready), REPEATS)
+    return rows, seconds, tuple(signal.name for signal in ready.signals)
 
 
-def measured(text: str) -> dict[str, list[Point]]:
-    """Return the points of all methods on a scene."""
-    system = compiled(text)
-    linear = "HuntCrossley" not in text
-    truth, _ = played(system, Method("exact") if linear else Method("cvodes", tolerance=1e-14))
+def _rows(ready: Simulation) -> NDArray[np.float64]:
+    return np.concatenate([block.values for block in blocks(ready)])
+
+
+def contact_text(stiffness: float, damping: float) -> str:
+    """Return the scene of a device and a ball."""
+    text = BALL.replace("STIFF", f"{stiffness!r} N/m^(3/2)")
+    return text.replace("DAMPING", f"{damping!r} N*s/m^(5/2)")
+
+
+def contact(name: str, methods: Sequence[Method]) -> tuple[dict[Method, Point], float]:
+    """Return a point a method on a scene with a contact, and how far its reference is certain."""
+    truth, doubt = reference(Bounce(*CONTACTS[name]), int(DURATION / MS))
+    system = compiled(contact_text(*CONTACTS[name]))
+    return _points(system, methods, ("user[1].device.x", "user[1].ball.x"), truth), doubt
+
+
+def arm(methods: Sequence[Method]) -> dict[Method, Point]:
+    """Return a point a method on the linear scene."""
+    system = compiled(ARM)
+    course = exact_course(system, DURATION)
+    assert not isinstance(course, str), course
+    names, rows = course
+    places = [place for place, name in enumerate(names) if name.endswith(".x")]
+    return _points(system, methods, tuple(names[place] for place in places), rows[:, places])
+
+
+def _points(
+    system: CompiledSystem, methods: Sequence[Method], names: tuple[str, ...], truth: NDArray[np.float64]
+) -> dict[Method, Point]:
+    """Return what each method takes and is off by; `names` are those of the columns of `truth`."""
     span = np.ptp(truth, axis=0)
-    found: dict[str, list[Point]] = {}
-    for name, methods in METHODS.items():
-        if name == "exact" and not linear:
-            continue
-        for method in methods:
-            rows, seconds = played(system, method)
-            if name == "exact":  # it is the truth but for rounding: what that amounts to
-                rows, _ = played(system, Method("exact", shaken=True))
-            error = float((np.abs(rows - truth) / span).max())
-            found.setdefault(name, []).append(Point(method, error, seconds / float(DURATION)))
+    found = {}
+    for method in methods:
+        rows, seconds, of_rows = played(system, method)
+        apart = np.abs(rows[:, [of_rows.index(name) for name in names]] - truth)
+        found[method] = Point(method, float((apart / span).max()), seconds / float(DURATION))
     return found
 
 
-def draw(results: dict[str, dict[str, list[Point]]], path: Path) -> None:
+def check(scene: str, points: Iterable[Point], doubt: float, judge: Judge) -> None:
+    """Judge what a scene's points must keep; `doubt` is how far its truth is certain."""
+    for one in points:
+        method = one.method
+        if method.name == EXACT:
+            judge.within(f"{scene}, {method}", one.error, ROUNDED)
+        elif method.name == CVODES and method.tolerance is not None and method.tolerance <= TOLERANCE:
+            judge.within(f"{scene}, {method}", one.error, ADDED_UP * method.tolerance + doubt)
+
+
+def draw(results: dict[str, dict[Method, Point]], path: Path) -> None:
     """Draw a panel a scene."""
     from matplotlib.figure import Figure
 
@@ -123,7 +155,10 @@ def draw(results: dict[str, dict[str, list[Point]]], path: Path) -> None:
     figure = Figure(figsize=(11, 4), layout="constrained")
     axes = figure.subplots(1, len(results), sharey=True)
     for ax, (scene, found) in zip(axes, results.items(), strict=True):
-        for name, points in found.items():
+        for name, methods in METHODS.items():
+            points = [found[method] for method in methods if method in found]
+            if not points:
+                continue
             marker, line = LOOKS[name]
             errors = [one.error for one in points]
             parts = [one.part for one in points]
@@ -139,21 +174,28 @@ def draw(results: dict[str, dict[str, list[Point]]], path: Path) -> None:
 
 def main() -> None:
     """Print the table, and draw it if a file is named."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.work_precision", description=__doc__)
+    parser = parser_of("work_precision", __doc__)
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it: .png, .svg or .pdf")
-    path = parser.parse_args().plot
-    results = {}
+    given = parser.parse_args()
+    judge = Judge(given.strict)
+    every = [method for methods in METHODS.values() for method in methods]
+    stepped = [method for method in every if method.name != EXACT]
+    results: dict[str, dict[Method, Point]] = {}
     with single_threaded():
-        for scene, text in SCENES.items():
-            results[scene] = measured(text)
-            print(
-                f"\n{scene}, {float(DURATION):g} s\n  {'method':<24}{'error / range':>14}{'of real time':>14}"
-            )
-            for points in results[scene].values():
-                for one in points:
-                    print(f"  {one.method!s:<24}{one.error:>14.1e}{one.part:>14.5f}")
-    if path is not None:
-        draw(results, path)
+        for scene in (*CONTACTS, "arm"):
+            doubt = 0.0
+            if scene in CONTACTS:
+                results[scene], doubt = contact(scene, stepped)
+            else:
+                results[scene] = arm(every)
+            print(f"\n{scene}, {float(DURATION):g} s, the truth certain to {doubt:.0e}")
+            print(f"  {'method':<24}{'error / range':>14}{'of real time':>14}")
+            for one in results[scene].values():
+                print(f"  {one.method!s:<24}{one.error:>14.1e}{one.part:>14.5f}")
+            check(scene, results[scene].values(), doubt, judge)
+    if given.plot is not None:
+        draw(results, given.plot)
+    judge.end()
 
 
 if __name__ == "__main__":

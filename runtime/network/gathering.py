@@ -28,9 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.listener import START, Seen
 from apc.runtime.frame.schedule import Heard, Kept, Schedule, Sent
-from apc.runtime.frame.timetable import Route, Timetable
+from apc.runtime.network.listener import START, Seen
+from apc.runtime.network.timetable import Route, Timetable
+from apc.runtime.network.weights import weight_matrix
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -39,8 +40,8 @@ MISSING = 0  # the row of what is missing
 Packet = Callable[[int, Sent, int], Any]  # of a member, a slot, frames ago: one number a peer, in a row
 
 
-class Listeners(Protocol):
-    """What a gathering asks of the members of a population."""
+class GroupPeers(Protocol):
+    """What a gathering asks of a member of a population: peers of one group."""
 
     @property
     def group(self) -> int:
@@ -111,7 +112,7 @@ def build_gates(
     kept: Mapping[str, Kept],
     exchange: Exchange,
     schedules: Sequence[Schedule],
-    members: Sequence[Listeners],
+    members: Sequence[GroupPeers],
 ) -> tuple[Gate, ...]:
     """Return the gates of routes.
 
@@ -147,7 +148,7 @@ class Gathering:
     """The gates as symbols of the frame's function: what they hold, which rows come in, what comes out."""
 
     def __init__(
-        self, gates: Sequence[Gate], exchange: Exchange, members: Sequence[Listeners], packet: Packet
+        self, gates: Sequence[Gate], exchange: Exchange, members: Sequence[GroupPeers], packet: Packet
     ) -> None:
         """Make the symbols; `packet` gives what was sent, or zeros for what isn't (or not yet)."""
         self.gates, self.exchange, self.members, self.packet = gates, exchange, members, packet
@@ -219,12 +220,10 @@ class Gathering:
         way = heard.way
         key = (number, listener, way.operator, way.delay)
         if key not in self._weights:
-            self._weights[key] = self._sparse_weights(number, listener, heard)
+            self._weights[key] = self._weigh_afresh(number, listener, heard)
         return self._weights[key]
 
-    def _sparse_weights(self, number: int, listener: int, heard: Heard) -> Any:
-        import scipy.sparse
-
+    def _weigh_afresh(self, number: int, listener: int, heard: Heard) -> Any:
         route, exchange, member = self.gates[number].route, self.exchange, self.members[listener]
         groups = np.searchsorted(exchange.starts, route.pairs[:, 0], side="right") - 1
         delays = [exchange.delay(route.link, int(group), member.group) for group in groups]
@@ -238,9 +237,7 @@ class Gathering:
             weights /= totals[route.pairs[:, 1]]
         column = np.searchsorted(member.peers, route.pairs[mine, 1])
         shape = (len(route.pairs), member.count)
-        whole = scipy.sparse.coo_array((weights[mine], (np.flatnonzero(mine), column)), shape=shape).tocsc()
-        whole.sort_indices()  # CasADi wants the rows of a column in order
-        return casadi.DM(whole)
+        return weight_matrix(weights[mine], np.flatnonzero(mine), column, shape)
 
 
 class Arrivals:

@@ -1,13 +1,15 @@
 """What an unreliable link does to packets, in numbers.
 
-Takes: a link's `Channel` and the scene's numbers.
-Gives: `ChannelLaw`, `channel_law`; `nominal_notes`.
-Guarantees: one law for all ways of a link with one delay.
+Takes: a link's `Channel` and the scene's numbers; for `deviates`, random numbers from 0 to less than 1.
+Gives: `ChannelLaw`, `channel_law`; `deviates`, the jitter's distributions, and `LATEST`; `nominal_notes`.
+Guarantees: one law for all ways of a link with one delay; nothing is drawn here, so that it is the same with
+every version of NumPy.
 Does not: draw a packet (see `packets`).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -16,9 +18,17 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.jitter import LATEST
 
 Floats = NDArray[np.float64]
+
+# netem's Pareto table (iproute2, netem/pareto.c): shape 3, its mean 3/2 taken off, times 4/3, and no more
+# than 4, the largest number that the table can hold (32767/8192).
+PARETO_SHAPE = 3
+
+PARETO_MOST = 4.0
+
+# The largest numbers that `deviates` gives: of 53 random bits, a normal is never beyond √(2·53·ln 2) = 8.57.
+LATEST = {"uniform": 1.0, "normal": math.sqrt(2 * 53 * math.log(2)), "pareto": PARETO_MOST}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +104,29 @@ def channel_law(system: CompiledSystem, link: Link, delay: Fraction) -> ChannelL
     return ChannelLaw(
         p, r, one_minus_h, one_minus_k, float(delay), jitter, channel.distribution, channel.trace
     )
+
+
+def deviates(distribution: str, one: Floats, two: Floats) -> Floats:
+    """Return what a jitter of 1 adds to a delay, drawn from a distribution.
+
+    Parameters
+    ----------
+    distribution
+        "uniform": evenly from −1 to 1; "normal": of mean 0 and standard deviation 1; "pareto": netem's, from
+        −2/3 to 4, many a little early and few very late, of mean −0.033 and standard deviation 0.84.
+    one, two
+        Independent numbers (n,) from 0 to less than 1.
+    """
+    match distribution:
+        case "uniform":
+            return 2 * one - 1
+        case "normal":  # Box and Muller (1958)
+            normal = np.sqrt(-2 * np.log1p(-one)) * np.cos(2 * np.pi * two)
+            return np.asarray(normal, dtype=np.float64)
+    assert distribution == "pareto", f"no such distribution: {distribution}"
+    tail = (1 - one) ** (-1 / PARETO_SHAPE)
+    late = (tail - PARETO_SHAPE / (PARETO_SHAPE - 1)) * 4 / 3
+    return np.asarray(np.minimum(late, PARETO_MOST), dtype=np.float64)
 
 
 def nominal_notes(system: CompiledSystem) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """The packets of one frame of all peers, as they are sent, remembered and heard.
 
 Takes: the members of a population, the exchange between them, the gates of unreliable links.
-Gives: `Ear`.
+Gives: `FramePackets`.
 Guarantees: sums and means over a complete graph cost one addition a peer, over any other graph one product
 an arc.
 Does not: move a peer (see `writing`).
@@ -18,14 +18,15 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.gathering import Gate, Gathering
 from apc.runtime.frame.schedule import Heard, Sent
+from apc.runtime.network.gathering import Gate, Gathering
+from apc.runtime.network.weights import weight_matrix
 from apc.runtime.simulate.member import Member
 from apc.runtime.simulate.pairs import Pairs
 from apc.runtime.simulate.program import Segment, seconds_at
 
 
-class Ear:
+class FramePackets:
     """The packets of one frame, as they are sent, remembered and heard."""
 
     def __init__(
@@ -157,9 +158,8 @@ class Ear:
                 whole = whole @ scipy.sparse.diags_array(1 / np.where(sums == 0, 1.0, sums))
             self.weights[link, mean] = whole.tocsc()
         columns = self.weights[link, mean][:, self.members[receiver].peers]
-        block = columns.tocsr()[self.members[sender].peers].tocsc()
-        block.sort_indices()  # CasADi wants the rows of a column in order
-        return casadi.DM(block)
+        block = columns.tocsr()[self.members[sender].peers].tocoo()
+        return weight_matrix(block.data, block.row, block.col, block.shape)
 
     def _averages(self, peer: int, link: str) -> bool:
         """Say whether a peer takes a mean over a link."""

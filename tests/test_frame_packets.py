@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.ear`: what hearing costs."""
+"""Claims about `apc.runtime.simulate.frame_packets`: what hearing costs."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from fractions import Fraction
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
+from apc.runtime.simulate.settings import Settings
 from apc.runtime.simulate.simulation import prepare
 from tests.sites import grouped, linked, paper
 
 
 def _instructions(system: CompiledSystem) -> int:
-    return int(prepare(system, Fraction(1), jit=False).population.frame.n_instructions())
+    return int(prepare(system, Settings(Fraction(1), jit=False)).population.frame.n_instructions())
 
 
 @pytest.mark.parametrize("operator", ["mean", "sum"])

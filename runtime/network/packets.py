@@ -22,8 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.channel_law import ChannelLaw
-from apc.runtime.frame.jitter import deviates
+from apc.runtime.network.channel_law import ChannelLaw, deviates
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -1,0 +1,1 @@
+"""Packets of a whole population over unreliable links: which are lost, late, heard, and at which tick."""
