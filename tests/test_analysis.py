@@ -154,7 +154,12 @@ def test_a_graph_that_splits_and_one_that_does_not_say_so() -> None:
         ("5 systems, one an eigenvalue of the graph of lan (ring)",),
     )
     assert ring.to_dict()["notes"] == list(ring.notes)
-    different = analyze(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.1]))
+    alike = analyze(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.1]))
+    assert (alike.method, alike.notes) == (
+        "modes",
+        ("2 systems, as peers that can change places move alike or apart",),
+    )
+    different = analyze(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.3]))
     assert different.method == "dense"
     assert different.notes == ("all peers as one system: the peers on lan (ring) differ",)
     assert analyze(paper()).notes == ()
@@ -199,7 +204,7 @@ def test_peers_that_differ_only_at_the_start_are_equal_however_many() -> None:
 def test_a_matrix_too_large_is_refused_and_so_is_a_method_that_cannot_serve() -> None:
     with pytest.raises(ApcError, match=r"E804 200 peers make one system of 1,600 states; the matrix of one"):
         analyze(paper(peers=200), method="dense")
-    different = columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.1])
+    different = columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.3])
     with pytest.raises(ApcError, match=r"E850 method modes can't serve this scene: all peers as one system"):
         analyze(different, method="modes")
     with pytest.raises(ApcError, match=r"E850 method krylov can't serve this scene: user looks at each"):

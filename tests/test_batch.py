@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.vary.batch`, `evaluator` and `crossings.eigenvalues`."""
+"""Claims about `apc.runtime.vary.batch`, `evaluator` and `eigenvalues`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from apc.runtime.eigen.modes import split
 from apc.runtime.frame.names import Free
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
-from apc.runtime.vary.crossings import eigenvalues
+from apc.runtime.vary.eigenvalues import eigenvalues
 from apc.runtime.vary.evaluator import evaluator, reaches_time
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 

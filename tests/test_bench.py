@@ -13,8 +13,9 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.bench.bench import (
+    MOST_PLAYED,
     SAME,
     Bench,
     Measured,
@@ -24,6 +25,7 @@ from apc.runtime.bench.bench import (
     pareto_front,
 )
 from apc.runtime.bench.figure import draw_bench, save_bench
+from apc.runtime.bench.reference import MOST_MOVING
 from apc.runtime.bench.report import bench_report, scale_report
 from apc.runtime.bench.scale import scale, with_count
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
@@ -153,13 +155,42 @@ def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     assert "one clock of forces (here are haptic and slow)" in reason
 
 
-def test_a_matrix_of_all_peers_that_would_take_minutes_is_left_out() -> None:
+def test_a_matrix_of_all_peers_that_is_too_large_is_left_out_with_the_reason_of_who_refuses_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     many = compiled(replaced(AVERAGE, ("count: 3", "count: 1000000")))
     found = bench_analysis(many, rounds=1)
-    for name in ("dense", "krylov"):
-        assert dict(found.refused)[name] == "its matrix of 8,000,000 states takes minutes"
-    assert dict(found.refused)["paper"] == "its matrix of 32,000,000 states takes minutes"
+    reasons = dict(found.refused)
+    assert reasons["krylov"] == "its matrix of 8,000,000 states is above the 2,500 tried here"
+    for name in ("dense", "paper"):
+        assert "system of 8,000,000 states; the matrix of one may have 1,000" in reasons[name]
+    assert not any("Write:" in reason for reason in reasons.values())
     assert {"modes", "certified"} <= {one.name for one in found.measured}
+    monkeypatch.setattr("apc.runtime.analysis.openloop.MOST_ROWS", 5)
+    [(name, reason)] = bench_analysis(compiled(AVERAGE), rounds=1).refused
+    assert name == "paper"
+    assert reason.endswith("have more than 5 rows")
+
+
+def test_a_proof_that_was_not_had_is_left_out_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apc.runtime.eigen.spectrum.MOST_PROVED", 3)
+    found = bench_analysis(compiled(AVERAGE), rounds=1)
+    assert "not proved, as it has" in dict(found.refused)["certified"]
+    assert "certified" not in {one.name for one in found.measured}
+
+
+def test_what_is_too_large_to_be_played_is_analysed_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("apc.runtime.simulate.simulation.MOST_NUMBERS", 10)
+    found = bench(compiled(AVERAGE), rounds=1)
+    analysis, simulation = found.comparisons
+    assert analysis.measured
+    assert simulation.measured == ()
+    text = bench_report(found)
+    assert "every method left out: 3 peers hold" in text
+    assert "--signals" not in text
+    save_bench(found, tmp_path / "bench.png")
 
 
 def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
@@ -168,6 +199,20 @@ def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
     assert max(map(len, text.splitlines())) <= 80
     assert "analyze chooses modes, which is" in text
     assert "simulate chooses exact, which is" in text
+    words = " ".join(text.split())
+    assert "are of 1 run: processor time of an analysis, from the compiled scene to its verdict" in words
+    assert "processor time of a run, without what prepares it" in words
+    assert "error and bound are relative to the largest value of a state's unit" in words
+    assert "faster by more than both spreads and no less right, or more right and no slower" in words
+
+
+def test_a_spread_needs_several_runs_and_a_time_has_no_exponent(found: Bench) -> None:
+    [analysis, _] = found.comparisons
+    one = replace(analysis.measured[0], seconds=0.9997e-3, spread=0.9996e-3)
+    lines = bench_report(replace(found, comparisons=(replace(analysis, measured=(one,)),))).splitlines()
+    assert next(line for line in lines if one.name in line).split()[1:4] == ["0.9997", "ms", "–"]
+    many = replace(analysis, measured=(replace(one, rounds=3),))
+    assert "0.9996 ms" in bench_report(replace(found, comparisons=(many,)))
     json.dumps(found.to_dict(), allow_nan=False)
 
 
@@ -213,12 +258,30 @@ def test_more_peers_are_measured_each_in_a_process_of_its_own(tmp_path: Path) ->
     text = scale_report(found)
     assert max(map(len, text.splitlines())) <= 80
     assert "3,000" in text
+    assert "peers of group user\n" in text
+
+
+def test_the_group_that_grows_is_named_and_a_number_is_measured_once(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    two = replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}"))
+    path.write_text(two, encoding="utf-8")
+    found = scale(path, [5, 5])
+    assert [(row.count, row.peers) for row in found.rows] == [(5, 6)]
+    assert "peers of group many, beside 1 of other groups" in scale_report(found)
+
+
+def test_numbers_none_of_which_can_be_analysed_are_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(AVERAGE, encoding="utf-8")
+    with pytest.raises(ApcError, match=r"E921 leaves nothing to measure: 1 peer of user: .* 2 peers"):
+        scale(path, [1])
 
 
 @pytest.mark.parametrize("counts", [[], [0], [3, -1]])
 def test_numbers_of_peers_that_are_none_are_refused(tmp_path: Path, counts: list[int]) -> None:
-    with pytest.raises(ApcError, match="E921"):
+    with pytest.raises(ApcError, match="E921") as raised:
         scale(tmp_path / "scene.yaml", counts)
+    assert "[" not in str(raised.value)
 
 
 def test_a_scene_of_a_table_has_no_count_to_grow() -> None:
@@ -253,12 +316,38 @@ def test_a_picture_that_cannot_be_drawn_is_refused_before_anything_is_measured(
     assert "E875 matplotlib is not installed" in capsys.readouterr().err
 
 
-def test_a_picture_that_cannot_be_written_costs_no_figures(
+def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: pytest.fail("it is measured"))
+    folder = tmp_path / "folder.png"
+    folder.mkdir()
+    for plot, message in (
+        (str(tmp_path / "nowhere" / "bench.png"), "E601 can't be written: No such file or directory"),
+        (str(folder), "E601 can't be written: Is a directory"),
+        (".", "--plot: E878 the file wants a name like bench.png, got none"),
+        ("", "--plot: E878 the file wants a name like bench.png, got none"),
+    ):
+        assert run(["bench", str(SCENES / "template.yaml"), "--plot", plot]) == 1
+        assert message in capsys.readouterr().err
+
+
+def test_a_picture_that_could_not_be_written_in_the_end_costs_no_figures(
     found: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    def full(*_: object) -> None:
+        raise ApcError(Mistake("E601", Place("bench.png"), "can't be written: no space"))
+
     monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: found)
-    words = ["bench", str(SCENES / "template.yaml"), "--plot", str(tmp_path / "nowhere" / "bench.png")]
-    assert run(words) == 1
+    monkeypatch.setattr("apc.runtime.bench.figure.save_bench", full)
+    assert run(["bench", str(SCENES / "template.yaml"), "--plot", str(tmp_path / "bench.png")]) == 1
     printed = capsys.readouterr()
     assert "E601 can't be written" in printed.err
     assert "analyze chooses modes" in printed.out
+
+
+def test_the_help_names_the_limits_of_the_reference(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["bench", "--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert f"in at most {MOST_MOVING} states" in words
+    assert f"at most {MOST_PLAYED} peers" in words

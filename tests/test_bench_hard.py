@@ -106,6 +106,7 @@ def test_the_report_fits_a_terminal(tmp_path: Path) -> None:
     text = hard_report(found)
     assert max(map(len, text.splitlines())) <= 80 + len(str(tmp_path))
     assert "every bound holds; every verdict is right" in text
+    assert "stable*: stable up to a common translation" in text
     assert "other.yaml has no truth beside it: left out" in text
 
 
@@ -129,4 +130,5 @@ def test_truths_that_are_none_are_refused(tmp_path: Path, text: str | None, mess
         (tmp_path / "truths.json").write_text(text, encoding="utf-8")
     with pytest.raises(ApcError, match=message) as raised:
         run_hard_cases(tmp_path)
+    assert "Write: --hard tests/hard" not in str(raised.value)
     assert raised.value.mistakes[0].code == "E920"

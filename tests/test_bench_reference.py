@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import math
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import flint
@@ -10,9 +13,12 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
+from apc.runtime.bench import events
+from apc.runtime.bench import reference as fifty_digits
 from apc.runtime.bench.events import refusal
 from apc.runtime.bench.reference import Truth, classes_of, exact_course, spectral_truth
 from apc.runtime.eigen.balls import precision
+from tests.bench.contact_reference import Bounce, positions, reference
 from tests.bruteforce import Scene, frame_matrix
 from tests.eventwise import experiment, play
 from tests.sites import MS, columned, edged, grouped, linked, paper
@@ -113,3 +119,39 @@ def test_the_mesh_is_the_average_with_twice_the_gain() -> None:
     mesh = compiled(replaced(MESH, ("stiffness: 500 N/m", "stiffness: 250 N/m")))
     with precision(600):
         assert float(abs(_truth(mesh).radius - _truth(compiled(AVERAGE)).radius)) < 1e-50
+
+
+def test_the_reference_shares_with_the_runtime_what_it_says_and_no_more() -> None:
+    shared = set()
+    for module in (events, fifty_digits):
+        tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            module_name = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
+            if module_name.startswith("apc.runtime.") and "apc.runtime.bench" not in module_name:
+                shared |= {alias.name for alias in node.names}  # type: ignore[attr-defined] # it is an import
+    functions = {"evaluate_exact", "is_rational", "guards_of", "rational_ball", "precision"}
+    assert shared == functions | {"resolve", "arcs", "ROW"}
+    assert all(name in str(events.__doc__) for name in shared)
+
+
+def test_before_it_touches_the_device_flies_as_in_closed_form() -> None:
+    rows = positions(Bounce(3e6, 1e6), 7)  # they touch after 7.3 ms
+    mass, drag, hand, x_0, v_0 = 0.1, 0.1, 3.0, -3e-3, 0.3
+    for tick, (x, ball) in enumerate(rows.tolist()):
+        t = tick * 1e-3
+        flown = mass / drag * (v_0 - hand / drag) * -math.expm1(-drag * t / mass)
+        assert x == pytest.approx(x_0 + hand / drag * t + flown, abs=1e-15)
+        assert ball == 0
+
+
+def test_a_contact_conserves_what_nothing_takes_away() -> None:
+    """Without damping, seat and hand: momentum, and the speeds after an elastic collision."""
+    bounce = Bounce(3e6, 0.0, device=(0.1, 0.0), ball=(0.3, 0.0), seat=(0.0, 0.0), hand=0.0)
+    rows = positions(bounce, 20)
+    before, after = rows[1] - rows[0], rows[-1] - rows[-2]
+    assert before == pytest.approx([3e-4, 0], abs=1e-17)
+    assert after == pytest.approx([-1.5e-4, 1.5e-4], rel=1e-11)
+
+
+def test_a_soft_contact_is_certain_to_thirteen_digits() -> None:
+    assert reference(Bounce(2e4, 1e4), 60)[1] < 1e-13

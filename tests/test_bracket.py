@@ -6,7 +6,7 @@ import pytest
 
 from apc.runtime.vary import bracket as brackets
 from apc.runtime.vary.critical import critical
-from tests.topologies import AVERAGE, compiled
+from tests.topologies import AVERAGE, ROOT, compiled
 
 LIMIT = 1096.410868365630  # tests.reference, of the paper's scene
 PATH = "coordination.stiffness"
@@ -35,3 +35,17 @@ def test_a_delays_crossing_is_held_in_floats_as_well(monkeypatch: pytest.MonkeyP
     assert held.proof == "bounded in floats"
     assert abs(held.value - proved.value) <= held.error + proved.error
     assert held.error < 1e-9 * proved.value
+
+
+def test_a_defective_cluster_is_held_where_its_eigenvalue_alone_crosses() -> None:
+    """Four equal peers in a chain have one eigenvector; floats scatter their eigenvalue by a part in 10⁴."""
+    text = (ROOT / "tests" / "hard" / "defective.yaml").read_text(encoding="utf-8")
+    chain = critical(compiled(text), PATH).crossings[0]
+    # One of them behind the first moves as each of them does; a copy keeps its share of the mass.
+    alone = text.replace("count: 4", "count: 1").replace("mass: 1 kg", "mass: 0.4 kg")
+    alone = alone.replace("[1, 2, 1], [2, 3, 1], [3, 4, 1], [4, 5, 1]", "[1, 2, 1]")
+    one = critical(compiled(alone), PATH).crossings[0]
+    assert one.proof.startswith("proved with")
+    assert chain.proof == "bounded in floats"
+    assert abs(chain.value - one.value) <= chain.error + one.error
+    assert chain.error < 1e-11 * chain.value

@@ -15,7 +15,7 @@ from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.critical import critical
-from apc.runtime.vary.crossings import scan
+from apc.runtime.vary.crossings import scan, scan_lines
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
@@ -132,6 +132,34 @@ def test_islands_of_any_width_above_the_cell_are_found_by_construction() -> None
         assert [root.rising for root in found.roots] == [False, True]
         expected = [centre - width, centre + width]
         assert [root.value for root in found.roots] == pytest.approx(expected, rel=1e-12)
+
+
+def test_lines_scanned_in_step_have_the_crossings_of_each_and_none_beyond_the_first() -> None:
+    """|λ| = 1 + c (p − a)(p − b)(p − d): it rises at a, falls at b and rises again at d."""
+    edges = np.array([[1.7, 2.3, 40.0], [0.3, 0.31, 5.0], [200.0, 300.0, 400.0]])
+
+    def course(which: np.ndarray, p: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        a, b, d = edges[which].T
+        size = 1 + 1e-6 * (p - a) * (p - b) * (p - d)
+        slope = 1e-6 * ((p - b) * (p - d) + (p - a) * (p - d) + (p - a) * (p - b))
+        turn = np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
+        return [(size[:, None, None] * turn, slope[:, None, None] * turn)]
+
+    points = [np.geomspace(0.01, 100, 25), np.geomspace(0.1, 10, 13), np.geomspace(1, 10, 7)]
+    every = scan_lines(course, points, [0.01] * 3)
+    assert [[root.value for root in one.roots] for one in every] == [
+        pytest.approx(edges[0], rel=1e-7),
+        pytest.approx(edges[1], rel=1e-7),
+        [],
+    ]
+    first = scan_lines(course, points, [0.01] * 3, first=True)
+    assert [[root.value for root in one.roots] for one in first] == [
+        pytest.approx(edges[0][:1], rel=1e-7),
+        pytest.approx(edges[1][:1], rel=1e-7),
+        [],
+    ]
+    assert all(one.whole for one in every)
+    assert scan_lines(course, [np.empty(0)], [1.0])[0].roots == ()
 
 
 def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import casadi
+import flint
 import mpmath
 import numpy as np
 import pytest
 
 from apc.compiler.pipeline import compile_topology
+from apc.runtime.bench.pushes import Push, impulse, push_of, switches
+from apc.runtime.eigen.balls import precision
+from apc.runtime.frame.parameters import resolve
+from apc.runtime.simulate import forcing as forcings
+from apc.runtime.simulate.forcing import Forcing, SiteForcing, forcing_of, impulses
+from apc.runtime.simulate.propagate import rates, transitions
+from apc.runtime.simulate.quadrature import kernel_of
 from apc.runtime.simulate.trajectory import simulate
-from tests.topologies import ONE_MASS
+from tests.topologies import ONE_MASS, SCENES
 
 CLOCK = "clocks: {haptic: 10 ms}\n"
 
@@ -94,3 +104,80 @@ def test_a_pulse_within_one_interval_is_not_missed(tmp_path: Path) -> None:
     found = simulate(compile_topology(path), duration=Fraction(1, 2))
     expected = exact(lambda s: 1000 * (0.1243 <= s < 0.1244), [0.1243, 0.1244], 0.5)
     assert found["user[1].device.x"][-1] == pytest.approx(expected[0], rel=1e-11)
+
+
+IMPULSES = {
+    "a slow sine": ("SineForce, force: 2 N, frequency: 3 Hz, phase: 0.3 rad", 1e-15),
+    # Of 435 rad, a rounding is a change of the force by 5e-14.
+    "a fast sine": ("SineForce, force: 2 N, frequency: 3456.7 Hz", 3e-13),
+    "a ramp": ("RampForce, force: 2 N, start: 3.3 ms, rise: 11.123 ms", 2e-15),
+    "a step within an interval": ("StepForce, force: 2 N, start: 3.3 ms", 2e-15),
+    "a step at a tick": ("StepForce, force: 2 N, start: 3 ms", 2e-15),
+    "a step just before a tick": ("StepForce, force: 2 N, start: 3.99999 ms", 2e-15),
+    "a step just after the start": ("StepForce, force: 2 N, start: 1 ns", 2e-15),
+}
+
+
+DEVICES = {
+    "mass: 0.1 kg, damping: 5 N*s/m": 0.0,
+    # It forgets a push within 2 ns; a node of a quadrature is right to 1e-19 s, and there are many.
+    "mass: 1 mg, damping: 500 N*s/m": 1e-13,
+}
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("what", IMPULSES)
+def test_an_impulse_is_that_of_ball_arithmetic(what: str, device: str, tmp_path: Path) -> None:
+    hand, allowed = IMPULSES[what]
+    text = (SCENES / "finger.yaml").read_text(encoding="utf-8")
+    ramp = "type: RampForce, flange: device, force: 2 N, rise: 0.5 s"
+    assert ramp in text
+    text = text.replace(ramp, f"flange: device, type: {hand}")
+    path = tmp_path / "scene.yaml"
+    path.write_text(text.replace("mass: 0.1 kg, damping: 5 N*s/m", device), encoding="utf-8")
+    system = compile_topology(path)
+    [kind] = system.kinds
+    vector = resolve(system).parameters[0][0]
+    linear = rates(kind)
+    tick, count = Fraction(1, 1000), 20
+    a = transitions(linear, vector, [tick]).a
+    forcing = forcing_of(linear)
+    site = SiteForcing(forcing, vector, (kernel_of(a, forcing.pushed, tick),))
+    found = impulses(site, np.arange(count) / 1000, np.zeros(count, np.int64))
+    exact_a = flint.fmpq_mat(
+        len(a), len(a), [flint.fmpq(*Fraction(one).as_integer_ratio()) for one in a.ravel()]
+    )
+    push = push_of(kind, [Fraction(float(one)) for one in vector], exact_a)
+    assert push is not None
+    expected = np.array([_in_balls(push, k * tick, tick) for k in range(count)])
+    # Of what the force adds to each state in any of the intervals.
+    off = np.abs(found - expected).max(axis=0) / np.abs(expected).max(axis=0)
+    assert (off <= max(allowed, DEVICES[device])).all(), off
+
+
+def _in_balls(push: Push, start: Fraction, length: Fraction) -> list[float]:
+    """Return the impulse of an interval, piece by piece between its switches."""
+    with precision(192):
+        total = flint.arb_mat(push.a.nrows(), 1, [0] * push.a.nrows())
+        edges = sorted({start, start + length, *switches(push, start, start + length)})
+        for low, high in itertools.pairwise(edges):
+            left = flint.fmpq(*(start + length - high).as_integer_ratio())
+            added = flint.arb_mat(push.a.nrows(), 1, impulse(push, low, high - low))
+            total += flint.arb_mat(push.a * left).exp() * added
+        return [float(one.mid()) for one in total.entries()]
+
+
+def test_a_force_that_crosses_zero_is_not_halved_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What rounding an instant changes near a zero of a sine is no reason to look more closely."""
+    p, t = casadi.SX.sym("p", 1), casadi.SX.sym("t")
+    force = casadi.Function("force", [p, t], [casadi.sin(p * t)])
+    drift = casadi.Function("drift", [p, t], [t * p * casadi.cos(p * t)])
+    nothing = casadi.Function("switches", [p, t], [casadi.SX(0, 1)])
+    tick = Fraction(1, 1000)
+    kernel = kernel_of(np.array([[Fraction(-1)]]), [0], tick)
+    # Half-way through these intervals the sine is 0, so that its impulse is next to nothing.
+    starts = np.pi * np.arange(1, 200) / 20 - 0.0005
+    site = SiteForcing(Forcing((0,), force, drift, nothing, affine=True), np.array([20.0]), (kernel,))
+    monkeypatch.setattr(forcings, "panels", pytest.fail)
+    found = impulses(site, starts, np.zeros(len(starts), np.int64))
+    assert (np.abs(found) < 1e-8).all()

@@ -54,8 +54,9 @@ WIDE = {
     "stiff-contact": 1e-9,
 }
 
-# Bounds of Arnoldi's method likewise; where every motion drifts it has nothing to tell a radius by.
-WIDE_KRYLOV = {"coasting": 1.0, "defective": 1e-3}
+# Bounds of Arnoldi's method likewise; where every motion drifts it has nothing to tell a radius by; a
+# frame of a thousand ticks sums as many roundings.
+WIDE_KRYLOV = {"coasting": 1.0, "defective": 1e-3, "high-rate-ratio": 1e-5}
 
 # What other scenes' bounds are within, relative to a radius above 1: a verdict needs hardly more.
 USEFUL = 1e-6

@@ -71,7 +71,8 @@ def test_graphs_and_different_peers_are_counted_as_they_are_analysed() -> None:
     assert str(needs(linked(paper(peers=8), "ring"))).endswith("8 peers; analysed as 5 modes of 8")
     different = columned(paper(), device__mass=[0.1, 0.2, 0.3])
     assert str(needs(different)).endswith("3 peers; analysed as 1 system of 24")
-    assert needs(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.1])).systems == ((1, 24),)
+    assert needs(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.3])).systems == ((1, 24),)
+    assert needs(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.1])).systems == ((1, 16), (1, 8))
 
 
 def test_what_is_evaluated_once_a_pair_of_peers_is_named() -> None:

@@ -3,12 +3,12 @@
 Takes: a `CompiledSystem`.
 Gives: `Peer`, `build_peers`; `Happening`, `Play`; `refusal`, `ticks_between`.
 Guarantees: shares with the analysis and the simulation what says what the scene is, and nothing that says
-what it does: no Jacobian of theirs, no schedule, no lifted map, no mode. Shared are the compiled functions; the
-numbers of each peer (`parameters.resolve`); the walk through a function's operations over exact numbers and
-whether that is possible (`exact.evaluate_exact`, `is_rational`, `guards.guards_of`); how a rational becomes a
-ball (`balls.rational_ball`, `precision`); and in `bench.reference` who hears whom on a graph
-(`exchange.arcs`). A mistake in one of these is the reference's too: `tests.bruteforce` and `tests.eventwise`
-share none of them and stand beside it in its tests.
+what it does: no Jacobian of theirs, no schedule, no lifted map, no mode. Shared are the compiled functions;
+the numbers of each peer (`parameters.resolve`); the walk through a function's operations over exact numbers
+and whether that is possible (`exact.evaluate_exact`, `is_rational`, `guards.guards_of`); how a rational
+becomes a ball (`balls.rational_ball`, `precision`); and in `bench.reference` who hears whom on a graph
+(`exchange.arcs`) and the row of a scene without clocks (`simulation.ROW`). A mistake in one of these is the
+reference's too: `tests.bruteforce` and `tests.eventwise` share none of them and stand beside it in its tests.
 Does not: serve what is not linear between events, or draw lots: it says why.
 
 Every computed value and every packet is kept with its time; whoever needs one takes the newest that counts.

@@ -65,7 +65,8 @@ def _panel(ax: Any, found: Comparison) -> None:
     ax.set_ylabel(f"error of the {found.quantity}", fontsize=9)
     points = [one for one in found.measured if one.error is not None]
     if not points:
-        ax.text(0.5, 0.5, "no reference", transform=ax.transAxes, ha="center")
+        why = "no reference" if found.measured else found.reference
+        ax.text(0.5, 0.5, why, transform=ax.transAxes, ha="center")
         return
     ax.set_xscale("log")
     ax.set_yscale("log")

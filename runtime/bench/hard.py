@@ -26,6 +26,7 @@ from apc.runtime.bench.timing import median_time
 from apc.runtime.threads import single_threaded
 
 TRUTHS = "truths.json"
+FOLDER = "--hard FOLDER, of scenes and their truths, as tests/hard of a copy of the repository"
 REPEATS = 3  # of each analysis; its time is the median
 ENOUGH = 2.0  # seconds after which one is not repeated
 
@@ -127,7 +128,7 @@ def run_hard_cases(
         cases.append(compare(system, found, truths[path.stem], seconds, path.stem))
     if not cases:
         what = "holds no topology whose truth is known"
-        raise ApcError(Mistake("E920", Place(str(folder)), what, hint="--hard tests/hard"))
+        raise ApcError(Mistake("E920", Place(str(folder)), what, hint=FOLDER))
     return HardReport(str(folder), tuple(cases), tuple(without))
 
 
@@ -189,7 +190,7 @@ def _truths(folder: Path) -> dict[str, Any]:
         found = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         what = f"can't be read: {error.strerror or error}"
-        raise ApcError(Mistake("E920", place, what, hint="--hard tests/hard")) from error
+        raise ApcError(Mistake("E920", place, what, hint=FOLDER)) from error
     except ValueError as error:
         raise ApcError(Mistake("E920", place, f"is not JSON: {error}")) from error
     listed: list[tuple[str, Any]] = list(found.items()) if isinstance(found, dict) else [("", None)]

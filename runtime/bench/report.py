@@ -10,11 +10,16 @@ from __future__ import annotations
 import math
 
 from apc.compiler.words import counted, wrapped
-from apc.runtime.bench.bench import Bench, Comparison, Measured
+from apc.runtime.bench.bench import SAME, Bench, Comparison, Measured
 from apc.runtime.bench.hard import HardReport
-from apc.runtime.bench.scale import Scale
+from apc.runtime.bench.scale import REPEATS, Scale
 
 NOTHING = "–"
+BETTER = (
+    "* on the Pareto front: none here is faster by more than both spreads and no less right, or more right "
+    f"and no slower; errors below {SAME:.1g} are roundings, and equal"
+)
+STARRED = "stable*: stable up to a common translation"
 
 
 def bench_report(found: Bench) -> str:
@@ -26,26 +31,42 @@ def bench_report(found: Bench) -> str:
 
 
 def _task(found: Comparison) -> str:
+    title = f"apc {found.task}: time against error of the {found.quantity}"
+    left_out = [_filled(f"{name} left out: {reason}") for name, reason in found.refused]
+    if not found.measured:
+        return "\n".join([title, "", *left_out])
     lines = [
-        f"apc {found.task}: time against error of the {found.quantity}",
+        title,
         "",
         "  method                      median     spread      error      bound",
     ]
     for one in found.measured:
         marks = ("*" if one.front else " ") + (" chosen" if one.chosen else "")
         lines.append(
-            f"  {one.name:<22} {_time(one.seconds):>11} {_time(one.spread):>10} "
+            f"  {one.name:<22} {_time(one.seconds):>11} {_spread(one):>10} "
             f"{_size(one.error):>10} {_size(one.bound):>10} {marks}".rstrip()
         )
+    lines += ["", _filled(_times(found))]
     if _known(found):
-        lines += ["", "  * nothing here is both faster and more right (the Pareto front)"]
+        lines += [_filled(f"error and bound are {found.relative}"), _filled(BETTER)]
     lines.append(_filled(_choice(found)))
     lines.append(
         _filled(f"reference: {found.reference}" if _known(found) else f"no reference: {found.reference}")
     )
     lines += [_filled(note) for note in found.notes]
-    lines += [_filled(f"{name} left out: {reason}") for name, reason in found.refused]
-    return "\n".join(lines)
+    return "\n".join([*lines, *left_out])
+
+
+def _times(found: Comparison) -> str:
+    """Say what the columns of times are."""
+    least, most = (pick(one.rounds for one in found.measured) for pick in (min, max))
+    runs = counted(most, "run") if least == most else f"{least} to {most} runs"
+    columns = "median and spread (half the distance between the quartiles)"
+    return f"{columns} are of {runs}: processor time of {found.timed}"
+
+
+def _spread(one: Measured) -> str:
+    return NOTHING if one.rounds < 2 else _time(one.spread)
 
 
 def _known(found: Comparison) -> bool:
@@ -78,6 +99,8 @@ def hard_report(found: HardReport) -> str:
             f"{_time(case.seconds):>11}  {mark}"
         )
     lines += ["", _filled("error and bound are of the spectral radius ρ, divided by ρ where it is above 1")]
+    if any(_short(case.verdict) == "stable*" for case in found.cases if not case.failed):
+        lines.append(_filled(STARRED))
     lines += [_filled(f"{name} has no truth beside it: left out") for name in found.without]
     lines += [_filled(f"FAILED {case.name}: {case.failed}") for case in found.failures]
     if found.failures:
@@ -97,23 +120,27 @@ def _short(verdict: str) -> str:
 
 def scale_report(found: Scale) -> str:
     """Return a line a number of peers."""
+    beside = {one.peers - one.count for one in found.rows} - {0}
+    others = "".join(f", beside {number:,} of other groups" for number in sorted(beside))
     lines = [
-        f"{found.topology}: more peers in group {found.group}",
+        *wrapped(f"{found.topology}: peers of group {found.group}{others}"),
         "",
-        "       peers     compile     analyze      memory      error      bound  method",
+        "       peers    compile    analyze     memory    error    bound  method",
     ]
     lines += [
-        f"  {one.peers:>10,} {_time(one.compile_s):>11} {_time(one.analyze_s):>11} "
-        f"{one.memory / 2**20:>7.0f} MiB {_size(one.error):>10} {_size(one.bound):>10}  {one.method}"
+        f"  {one.count:>10,} {_time(one.compile_s):>10} {_time(one.analyze_s):>10} "
+        f"{one.memory / 2**20:>6.0f} MiB {_size(one.error):>8} {_size(one.bound):>8}  {one.method}"
         for one in found.rows
     ]
-    lines += ["", _filled("memory is the most the whole process took, of which " + found.floor)]
-    lines += [_filled(f"{count:,} peers: {reason}") for count, reason in found.refused]
+    times = f"processor time of compiling, and the median of {REPEATS} analyses"
+    lines += ["", _filled(f"{times}; error of the spectral radius")]
+    lines += [_filled("memory is the most the whole process took, of which " + found.floor)]
+    lines += [_filled(f"{counted(count, 'peer', ',')}: {reason}") for count, reason in found.refused]
     return "\n".join(lines)
 
 
 def _time(seconds: float) -> str:
-    if seconds < 1e-3:
+    if seconds < 0.9995e-3:  # above, three digits would round it to 1e+03
         return f"{seconds * 1e6:.3g} us"
     return f"{seconds * 1e3:.4g} ms" if seconds < 1 else f"{seconds:.4g} s"
 

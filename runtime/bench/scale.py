@@ -25,7 +25,9 @@ from apc.compiler.pipeline import stages_of
 from apc.compiler.scene.groups import LARGEST_COUNT
 from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import parse_source, read_source
+from apc.compiler.words import counted
 from apc.runtime.analysis.analysis import analyze
+from apc.runtime.bench.bench import reason_of
 from apc.runtime.bench.reference import Truth, spectral_truth
 from apc.runtime.bench.timing import median_time, timed
 from apc.runtime.threads import single_threaded
@@ -35,8 +37,12 @@ REPEATS = 3  # of each analysis; its time is the median
 
 @dataclass(frozen=True, slots=True)
 class ScaleRow:
-    """One number of peers: seconds to compile and analyse, bytes at most, the error of the radius."""
+    """One number of peers: seconds to compile and analyse, bytes at most, the error of the radius.
 
+    `count` is of the group that grows, `peers` of the whole scene.
+    """
+
+    count: int
     peers: int
     compile_s: float
     analyze_s: float
@@ -73,26 +79,32 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
     path
         The topology.
     counts
-        How many peers the group that grows has.
+        How many peers the group that grows has; each is measured once.
 
     Raises
     ------
     ApcError
-        E921 no group has a written count, or a number is none; and those of compiling.
+        E921 no group has a written count, a number is none, or none of them can be analysed; and those of
+        compiling.
     """
     if not counts or min(counts) < 1 or max(counts) > LARGEST_COUNT:
         expected = f"numbers from 1 to {LARGEST_COUNT:,}, like 3,30,300"
-        raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, str(counts)[:80]))
+        got = ",".join(map(str, counts))[:80]
+        raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, got))
     name, _ = _largest(path)
     rows, refused = [], []
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         floor = pool.submit(_memory).result()
-        for count in counts:
+        for count in dict.fromkeys(counts):
             found = pool.submit(_measure, path, count).result()
             if isinstance(found, str):
                 refused.append((count, found))
             else:
                 rows.append(found)
+    if not rows:
+        count, reason = refused[0]
+        what = f"leaves nothing to measure: {counted(count, 'peer')} of {name}: {reason}"
+        raise ApcError(Mistake("E921", Place("--scale"), what))
     said = f"{floor / 2**20:.0f} MiB are the program itself"
     return Scale(path.stem, name, tuple(rows), tuple(refused), said)
 
@@ -139,11 +151,12 @@ def _measure(path: Path, count: int) -> ScaleRow | str:
             memory = _memory()
             truth = spectral_truth(system)
     except ApcError as error:
-        return str(error.mistakes[0].sentence)
+        return reason_of(error)
     off = None
     if isinstance(truth, Truth):
         off = float(abs(Fraction(truth.digits) - Fraction(found.spectral_radius)))
     return ScaleRow(
+        count=count,
         peers=system.peers,
         compile_s=compiled,
         analyze_s=analyzed,

@@ -2,9 +2,9 @@
 
 Takes: the `Rates` of a kind, parameter vectors, when the intervals begin and how long they last.
 Gives: `Forcing`, `forcing_of`, `SiteForcing`, `impulses`.
-Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of a
-table), so that what is integrated is smooth; an impulse is within a few roundings of its terms, of what pushes
-at all within the interval, and of the instants.
+Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
+a table), so that what is integrated is smooth; an impulse is right to a few roundings of its terms and of
+the instants.
 Does not: integrate what depends on the motion.
 
     c = ∫₀ᵀ e^{A (T − s)} g(t + s) ds
@@ -34,10 +34,10 @@ MOST_HALVINGS = 30  # below 1e-9 of an interval, what a jump is missed by is far
 MOST_PANELS = 256  # integrated at once: what is held of them stays within some MB, however many there are
 LOOKS = 5  # instants of an interval at which a switch that is not linear in time is looked for
 
-# A switch is found to this share of the interval, below a rounding of what it changes, or to that of an instant.
+# A switch is found to this share of the interval, or to a rounding of its instant.
 PLACED = 2.0**-60
-# Where it is looked for between two instants that it lies between: evenly, which leaves 1/32 of them, and nearer and
-# nearer to where a straight line through both would cross 0, which leaves nothing if it is one.
+# Where it is looked for between two instants: evenly, which leaves 1/32 of what is between them, and nearer
+# and nearer to where a straight line through both would cross 0, which leaves nothing if it is one.
 EVENLY = np.arange(1, 32) / 32
 NEARER = 4.0 ** -np.arange(1, 31)
 
@@ -140,19 +140,19 @@ def _integrated(
 
     Returns
     -------
-    The integrals (k, n_x); which of them both rules do not agree upon (k,); what their terms add up to (k, n_x),
-    at least `size`.
+    The integrals (k, n_x); which of them both rules do not agree upon (k,); what their terms add up to
+    (k, n_x), at least `size`.
     """
     instants = starts[:, None] + found.after
     g = at_instants(site.forcing.force, site.parameters, instants)
     fine, apart = integrate(found, g)
     size = np.maximum(magnitude(found, g), size)
-    off = ~(apart <= AGREE * size).all(axis=1)
+    off: NDArray[np.bool_] = ~np.all(apart <= AGREE * size, axis=1)
     if off.any():  # it may be that of rounding the instants, which no halving mends
         some = found if len(found.after) == 1 else found.chosen(off)
         drift = at_instants(site.forcing.drift, site.parameters, instants[off])
         moved = magnitude(some, np.where(np.isfinite(drift), drift, 0.0))
-        off[off] = ~(apart[off] <= AGREE * (size[off] + moved)).all(axis=1)
+        off[off] = ~np.all(apart[off] <= AGREE * (size[off] + moved), axis=1)
     return fine, off, size
 
 

@@ -5,12 +5,14 @@ Gives: `at_instants`.
 Guarantees: the values are CasADi's, to the rounding of an elementary function.
 Does not: choose the instants (see `forcing`).
 
-An expression is walked once, each operation over all instants in one call of NumPy; what does not hang on time is
-computed once. CasADi's own map takes longer to build than to evaluate, and copies the parameters to each instant.
+An expression is walked once, each operation over all instants in one call of NumPy; what does not hang on
+time is computed once. CasADi's own map takes longer to build than to evaluate, and copies the parameters to
+each instant.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import casadi
@@ -25,7 +27,7 @@ Floats = NDArray[np.float64]
 MOST = 8192
 
 # Where Python's operators won't do for arrays. A condition is 0 or 1, as in CasADi.
-_RULES = {
+_RULES: dict[int, Callable[..., Any]] = {
     casadi.OP_SIGN: np.sign,
     casadi.OP_NOT: lambda a: 1.0 * (a == 0),
     casadi.OP_FLOOR: np.floor,

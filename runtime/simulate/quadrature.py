@@ -13,8 +13,8 @@ times the 2n-th derivative of the integrand (Davis and Rabinowitz, Methods of Nu
 2.7): for a sine of half a turn within h, 4e-27 at 10 nodes. Whether 10 nodes are enough is seen from 16.
 
 The exponential at the nodes of a part is that of the polynomial through the 16 nodes of the whole, where that
-polynomial is one to rounding; then only the whole needs exact ones. What a rounding there leaves is no more than
-what the rounding of the instant leaves at which the part begins or ends.
+polynomial is one to rounding; then only the whole needs exact ones. What a rounding there leaves is no more
+than what the rounding of the instant leaves at which the part begins or ends.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def integrate(found: Panels, g: Floats) -> tuple[Floats, Floats]:
 
 
 def magnitude(found: Panels, g: Floats) -> Floats:
-    """Return what the terms of the fine rule are right to some roundings of (k, n_x); g as for `integrate`."""
+    """Return what the fine rule is right to some roundings of (k, n_x); g as for `integrate`."""
     terms, sizes = _flat(found.sizes, g)
     first = FIRST_FINE * len(g)
     return _summed(np.abs(terms[:, first:]), sizes[:, first:])
@@ -147,7 +147,7 @@ def _flat(weights: Floats, g: Floats) -> tuple[Floats, Floats]:
 
 def _summed(terms: Floats, weights: Floats) -> Floats:
     if len(weights) == 1:
-        return terms @ weights[0]
+        return np.asarray(terms @ weights[0])
     return np.asarray((terms[:, None, :] @ weights)[:, 0])
 
 
@@ -166,9 +166,9 @@ def _exact(a: NDArray[Any], pushed: Sequence[int], duration: Fraction, after: Fl
 def _through_fine(at: Floats) -> Floats:
     """Return the polynomials (k, 16) that are 1 at one fine node and 0 at the others, at places in −1 … 1.
 
-    In the barycentric form, which is forward stable where the Lebesgue constant is small, as here (Higham, IMA
-    Journal of Numerical Analysis 24, 2004); for Legendre's nodes x its weights are (−1)^i √((1 − x²) w), w the
-    weights of the rule (Wang and Xiang, Mathematics of Computation 81, 2012).
+    In the barycentric form, which is forward stable where the Lebesgue constant is small, as here (Higham,
+    IMA Journal of Numerical Analysis 24, 2004); for Legendre's nodes x its weights are (−1)^i √((1 − x²) w),
+    w the weights of the rule (Wang and Xiang, Mathematics of Computation 81, 2012).
     """
     nodes, weights = FINE
     shares = (-1.0) ** np.arange(len(nodes)) * np.sqrt((1 - nodes**2) * weights)

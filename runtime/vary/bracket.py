@@ -48,6 +48,10 @@ _Above = Callable[[float], bool | None]
 # A bracket in floats reaches this many of the spectral radius's error bounds to either side at first.
 FLOAT_REACH = 2.0
 
+# Where the eigenvalue has no derivative in floats it is one of a defective cluster, which rounding scatters:
+# one of four by the fourth root of a rounding. The analysis takes such clusters apart where the graph does.
+SCATTER = 1e-4
+
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
@@ -106,9 +110,10 @@ def bracket_in_floats(root: Root, systems: FloatSystems, *, low: float, high: fl
         return (sides[verdict] == root.rising) if verdict in sides else None
 
     error = solve_spectrum(systems(root.value)).spectral_radius_error
-    if not (root.slope and np.isfinite(error)):
+    if not np.isfinite(error):
         return None
-    half = max(FLOAT_REACH * error / abs(root.slope), HALF * FIRST * _size(root))
+    reach = FLOAT_REACH * error / abs(root.slope) if root.slope else SCATTER * _size(root)
+    half = max(reach, HALF * FIRST * _size(root))
     held = _held(root, above, half, low, high)
     return None if held is None else Bracket(*held, "bounded in floats")
 

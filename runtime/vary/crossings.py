@@ -1,7 +1,7 @@
 """Where the largest eigenvalue magnitude of a family of matrices crosses 1 as one number varies.
 
 Takes: a function that gives the matrices and their derivatives at many points of an interval, or of many.
-Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`, `eigenvalues`.
+Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`.
 Guarantees: every cell between samples is either shown clear by the eigenvalues and their derivatives at both
 ends, or divided down to the cell size; every change found is bracketed.
 Does not: prove anything (see `critical`), or choose the interval.
@@ -19,6 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from apc.runtime.vary.eigenvalues import eigenvalues
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -45,20 +47,11 @@ PLACES = 9
 # Cells narrower than this, relative to the value, are divided no further.
 CELL = 1e-3
 
-# An inverse of the eigenvectors is used if it is one to this; derivatives then have half their digits.
-SPOILT = 1e-8
-
-# A derivative of an eigenvalue of worse condition than this is mostly rounding.
-WORST = 1e10
-
 # So few cells are divided into so many parts at once: a few matrices more take no longer, another call does.
 FEW, PARTS = 8, 8
 
 # Cells of a line divided at a time, and levels: what follows the circle would be sampled for ever.
 MOST_OPEN, MOST_LEVELS = 64, 40
-
-# What is smaller decides nothing; its derivative, one of a defective cluster at zero often, means nothing.
-SMALL = 0.05
 
 # A Newton step so small, relatively, is the last: what is left is about its square.
 SETTLED = 1e-7
@@ -95,39 +88,6 @@ class Scan:
     radius: Floats
     roots: tuple[Root, ...]
     whole: bool
-
-
-def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
-    """Return the eigenvalues (k, n) of matrices (k, n, n) and their derivatives, dλ = w dM v / (w v).
-
-    A derivative that means nothing, of an eigenvalue near zero or one that is hardly simple, comes as 0.
-    """
-    values, right = np.linalg.eig(matrix)
-    unit = np.eye(matrix.shape[1])
-    try:
-        left = np.linalg.inv(right)
-        # A defective cluster spoils the inverse for all the others as well.
-        spoilt = ~(np.abs(left @ right - unit) <= SPOILT).all(axis=(1, 2))
-    except np.linalg.LinAlgError:
-        left, spoilt = np.empty_like(right), np.ones(len(matrix), dtype=bool)
-    if spoilt.any():
-        left = left.astype(np.complex128)
-        left[spoilt] = _left_vectors(matrix[spoilt], values[spoilt])
-    with np.errstate(all="ignore"):
-        derivative = np.einsum("kij,kji->ki", left, slope @ right)
-        weight = np.einsum("kij,kji->ki", left, right)
-        derivative = derivative / weight
-    condition = np.linalg.norm(left, axis=2) * np.linalg.norm(right, axis=1)
-    vague = ~(condition < WORST * np.abs(weight)) | ~np.isfinite(derivative) | (np.abs(values) < SMALL)
-    return values.astype(np.complex128), np.where(vague, 0.0, derivative)
-
-
-def _left_vectors(matrix: Floats, values: Complexes) -> Complexes:
-    """Return left eigenvectors as rows, those of the transposed matrix whose eigenvalue is nearest."""
-    found, vectors = np.linalg.eig(matrix.swapaxes(1, 2))
-    nearest = np.argmin(np.abs(values[:, :, None] - found[:, None, :]), axis=2)
-    rows: Complexes = np.take_along_axis(vectors.swapaxes(1, 2), nearest[:, :, None], axis=1)
-    return rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,8 +167,8 @@ def scan_lines(
         Whether what lies beyond the first crossing at which the magnitude rises is left alone.
     """
     count = len(points)
-    if not count:
-        return ()
+    if not any(len(one) for one in points):
+        return tuple(Scan(np.empty(0), np.empty(0), (), whole=True) for _ in points)
     smallest = np.array(least, dtype=np.float64)
     lines = np.repeat(np.arange(count), [len(one) for one in points])
     samples = _sample(courses, lines, np.concatenate(points))

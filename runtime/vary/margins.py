@@ -164,7 +164,7 @@ def _along(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Ma
     courses = courses_of([line for _, line in ways])
     present = np.array([line.base[line.column] for _, line in ways])
     here = courses(np.arange(len(ways)), present)
-    scales = np.zeros(len(ways))
+    scales = [0.0] * len(ways)
     points: list[Floats] = []
     for place, (free, _) in enumerate(ways):
         own = [(matrix[[place]], slope[[place]]) for matrix, slope in here]
@@ -176,7 +176,7 @@ def _along(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Ma
         top = min(GROWTH * scales[place], np.inf if limit is None else limit)
         if top > present[place]:
             points[place] = spread(float(present[place]), float(top), float(scales[place]))
-    scans = scan_lines(courses, points, scales / GROWTH, first=True)
+    scans = scan_lines(courses, points, [scale / GROWTH for scale in scales], first=True)
     found: list[Margin | None] = []
     for (free, line), start, some, scanned in zip(ways, present.tolist(), points, scans, strict=True):
         roots = [root for root in scanned.roots if root.rising and root.value > start]

@@ -31,8 +31,9 @@ from apc.runtime.eigen.spectrum import DRIFTS
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.bracket import Bracket, bracket, bracket_in_floats
-from apc.runtime.vary.crossings import Courses, Root, Scan, eigenvalues, scan
+from apc.runtime.vary.crossings import Courses, Root, Scan, scan
 from apc.runtime.vary.delays import Piece, delay_pieces, system_with_delay
+from apc.runtime.vary.eigenvalues import eigenvalues
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
 from apc.runtime.vary.marginal import marginal_motion
 
@@ -253,6 +254,8 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
     """Prove a crossing, if it can be proved, and describe it."""
     place = int(np.searchsorted(found.points, root.value))
     low, high = found.points[max(place - 1, 0)], found.points[min(place, len(found.points) - 1)]
+    if not root.slope:  # a defective cluster: its samples are scattered as well
+        low, high = root.value - abs(root.value) / 2, root.value + abs(root.value) / 2
     family = line.family
 
     def point(value: float) -> list[float]:
