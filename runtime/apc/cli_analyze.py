@@ -29,7 +29,9 @@ METHODS = ("auto", "modes", "dense", "determinant", "krylov", "paper")
     "sparse matrix, for peers that differ on a sparse graph. paper: the lifted matrices of Rakhsha and "
     "Constantinescu, eqs. (18) to (20).",
 )
-@click.option("--certify", is_flag=True, help="Prove the verdict in ball arithmetic.")
+@click.option(
+    "--certify", is_flag=True, help="Prove the verdict in ball arithmetic, for the numbers as doubles."
+)
 @click.option(
     "--box",
     "box",

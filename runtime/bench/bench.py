@@ -223,7 +223,7 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
         )
         for name, found in results.items()
     ]
-    said = truth if isinstance(truth, str) else f"spectral radius {truth.digits}"
+    said = truth if isinstance(truth, str) else f"spectral radius {truth.digits} of the numbers as doubles"
     notes = [
         f"{WRONG}: {name} says {found.verdict}, {default.method} {default.verdict}"
         for name, found in results.items()
