@@ -346,6 +346,20 @@ def test_a_picture_that_could_not_be_written_in_the_end_costs_no_figures(
     assert "analyze chooses modes" in printed.out
 
 
+def test_a_bound_that_does_not_hold_ends_with_code_1_after_the_figures(
+    found: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert found.faults == ()
+    note = "WRONG: the bound of dense does not hold"
+    first, *rest = found.comparisons
+    broken = replace(found, comparisons=(replace(first, notes=(note,)), *rest))
+    monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: broken)
+    assert run(["bench", str(SCENES / "template.yaml")]) == 1
+    printed = capsys.readouterr()
+    assert "E922" in printed.err and note in printed.err
+    assert "analyze chooses modes" in printed.out
+
+
 def test_the_help_names_the_limits_of_the_reference(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["bench", "--help"]) == 0
     words = " ".join(capsys.readouterr().out.split())

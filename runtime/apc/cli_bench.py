@@ -110,6 +110,9 @@ def bench_command(
         save_bench(found, plot)
         if not as_json:
             click.echo(f"  {plot} is written")
+    if found.faults:
+        what = f"not everything came out right: {'; '.join(found.faults)}"
+        raise ApcError(Mistake("E922", Place(found.topology), what))
 
 
 def _check_folder(plot: Path) -> None:

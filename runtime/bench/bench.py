@@ -114,6 +114,12 @@ class Comparison:
         """The default method."""
         return next((one for one in self.measured if one.chosen), None)
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What must not be: a wrong verdict or bound, or a method that crashes."""
+        wrong = [note for note in self.notes if note.startswith(WRONG)]
+        return (*wrong, *(f"{name} {why}" for name, why in self.refused if why.startswith(FAILED)))
+
 
 @dataclass(frozen=True, slots=True)
 class Bench:
@@ -123,6 +129,11 @@ class Bench:
     peers: int
     machine: Mapping[str, str]
     comparisons: tuple[Comparison, ...]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What must not be, on any scene: none where all is well."""
+        return tuple(fault for one in self.comparisons for fault in one.faults)
 
     def __str__(self) -> str:
         """Return tables of at most 80 columns."""

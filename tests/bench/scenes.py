@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.bench.bench import FAILED, WRONG, bench
+from apc.runtime.bench.bench import bench
 from tests.bench.judge import Judge, parser_of
 from tests.topologies import SCENES
 
@@ -38,9 +38,7 @@ def main() -> None:
                 judge.missed.append(f"{name}, {one.task}: {chosen.name} is not on the front")
             says = chosen.bound is None or math.isfinite(chosen.bound)
             judge.right(f"{name}, {one.task}: the bound says nothing", says)
-            wrong = [note for note in one.notes if note.startswith(WRONG)]
-            wrong += [f"{method} {why}" for method, why in one.refused if why.startswith(FAILED)]
-            for line in wrong:
+            for line in one.faults:
                 print(f"  {line}")
                 judge.right(f"{name}, {one.task}: {line}", holds=False)
     judge.end()
