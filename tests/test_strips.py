@@ -103,6 +103,23 @@ def test_over_a_link_the_boundary_is_a_staircase_at_the_critical_values(scene: C
     assert curve.mode == "difference"
 
 
+def test_a_staircase_that_another_mode_takes_over_is_a_curve_a_mode(scene: CompiledSystem) -> None:
+    link = "lan.delay=0 ms:40 ms"
+    found = region(scene, parse_axes(scene, link, "coordination.stiffness=500 N/m:3000 N/m"), cells=4)
+    assert {curve.mode for curve in found.curves} == {"difference", "common"}
+    for curve in found.curves:
+        low, high = curve.frequency_hz
+        for delay, stiffness in curve.knots:
+            beside = [
+                Override("lan.delay", None, Fraction(float(delay))),
+                Override("coordination.stiffness", None, Fraction(float(stiffness))),
+            ]
+            listed = analyze(apply(scene, beside)).modes
+            near = min(listed, key=lambda mode: abs(mode.magnitude - 1) + (mode.shape != curve.mode))
+            assert low - 0.01 <= near.frequency_hz <= high + 0.01
+            assert near.shape == curve.mode
+
+
 def test_over_two_times_the_boundary_is_known_to_a_cell(scene: CompiledSystem) -> None:
     system = apply(scene, [Override("coordination.stiffness", None, Fraction(900))])
     axes = parse_axes(system, "contact.delay=0.5 ms:3 ms", "coordination.delay=0 ms:2 ms")

@@ -22,7 +22,6 @@ from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.words import counted
 from apc.runtime.analysis.analysis import Prepared, analyze, prepare
 from apc.runtime.analysis.ranges import Range
-from apc.runtime.eigen.rigid import find_rigid_modes
 from apc.runtime.frame.names import Free
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.region.area import stable_area
@@ -38,7 +37,7 @@ from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator, reaches_time
-from apc.runtime.vary.marginal import marginal_motion
+from apc.runtime.vary.marginal import marginal_motion, with_rigid
 from apc.runtime.vary.search import Told
 
 if TYPE_CHECKING:
@@ -91,7 +90,7 @@ class Curve:
         """The least and the largest frequency, along the curve, of the motion that neither grows nor dies."""
         angles = np.abs(np.angle(self.eigenvalues))
         middle = len(self.knots) // 2
-        places = {middle}
+        places = {middle} if self.smooth else set(range(len(self.knots)))
         if np.any(angles < FOLD) or np.any(angles > np.pi - FOLD):  # it may fold on the way
             places |= {0, len(self.knots) - 1}
         found: list[float] = []
@@ -260,7 +259,7 @@ def region(
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]
-        linear = all(site.affine and not site.edges for site in used)
+        linear = all(site.parameters_suffice for site in used)
         times = [place for place, one in enumerate(free) if reaches_time(system, one)]
         source: BatchEvaluator | PointEvaluator
         if times:
@@ -401,8 +400,7 @@ def _identify(
     source: BatchEvaluator | PointEvaluator, value: Floats, eigenvalue: complex
 ) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
-    listed = ((one, find_rigid_modes(one, with_drifts=False)) for one in source.closed_at(value.tolist()))
-    found = marginal_motion(listed, eigenvalue)
+    found = marginal_motion(with_rigid(source.closed_at(value.tolist())), eigenvalue)
     return found.name, found.turn, found.frame_s
 
 

@@ -32,6 +32,7 @@ from apc.runtime.region.surrogate import DirectFamily, Rectangle, point_errors, 
 from apc.runtime.vary.crossings import scan
 from apc.runtime.vary.delays import Piece, delay_pieces
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
+from apc.runtime.vary.marginal import marginal_motion, with_rigid
 from apc.runtime.vary.search import SPAN, Line, proved_crossing, spread
 
 Floats = NDArray[np.float64]
@@ -137,7 +138,12 @@ def trace_strips(
     edges = []
     for place in range(1, len(strips)):
         edges += _join(strips, arcs, place, SAME * tolerance, whole, rectangle)
-    listed = _joined([arc for own in arcs for arc in own] + edges)
+
+    def mode_of(arc: Arc) -> str:
+        value = rectangle.values(arc.knots)[0].tolist()
+        return marginal_motion(with_rigid(whole.closed_at(value)), complex(arc.values[0])).name
+
+    listed = _joined([arc for own in arcs for arc in own] + edges, mode_of)
     widest = max(one.end - one.start for one in strips)
     cell = (widest / cells, 1 / cells)
     return Striped(
@@ -336,10 +342,21 @@ def _edge_piece(
     return _straight(points if stable_before else points[::-1].copy(), knot, leading, float(np.spacing(1.0)))
 
 
-def _joined(arcs: Sequence[Arc]) -> list[Arc]:
-    """Return the arcs, straight ones that follow one another as one."""
-    listed = [arc for arc in arcs if not arc.smooth]
+def _joined(arcs: Sequence[Arc], mode_of: Callable[[Arc], str]) -> list[Arc]:
+    """Return the arcs, straight ones of one mode that follow one another as one."""
     found = [arc for arc in arcs if arc.smooth]
+    alike: dict[str, list[Arc]] = {}
+    for arc in arcs:
+        if not arc.smooth:
+            alike.setdefault(mode_of(arc), []).append(arc)
+    for listed in alike.values():
+        found += _chained(listed)
+    return found
+
+
+def _chained(listed: list[Arc]) -> list[Arc]:
+    """Return straight arcs, those that follow one another as one."""
+    found = []
     while listed:
         one = listed.pop()
         for tail, head in ((-1, 0), (0, -1)):  # first what follows it, then what it follows

@@ -1,7 +1,7 @@
 """The motion that neither grows nor dies out at a point of the stability boundary: whose it is, how fast.
 
 Takes: closed systems with their rigid motions, and the eigenvalue that lies on the circle.
-Gives: `Marginal`, `marginal_motion`.
+Gives: `Marginal`, `marginal_motion`, `with_rigid`.
 Guarantees: a rigid motion, whose eigenvalue is 1 everywhere, is never taken for the one that decides, even
 where that one is 1 as well: what changes sign from tick to tick is so after a frame of evenly many of them.
 Does not: find the point (see `search`).
@@ -9,13 +9,13 @@ Does not: find the point (see `search`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.rigid import RigidModes, relative_coordinates
+from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
 from apc.runtime.eigen.spectrum import angle_in_frame
 
 # An eigenvalue of 1 leaves open how far the peers stand aside together; next to the boundary, where it is
@@ -35,6 +35,11 @@ class Marginal:
     def frequency_hz(self) -> float:
         """The motion's frequency."""
         return abs(self.turn) / (2 * np.pi * self.frame_s)
+
+
+def with_rigid(systems: Iterable[ClosedSystem]) -> Iterator[tuple[ClosedSystem, RigidModes]]:
+    """Yield each closed system with its rigid motions, drifts left where they are."""
+    return ((one, find_rigid_modes(one, with_drifts=False)) for one in systems)
 
 
 def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenvalue: complex) -> Marginal:

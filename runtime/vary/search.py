@@ -35,7 +35,7 @@ from apc.runtime.vary.crossings import Courses, Root, Scan, scan
 from apc.runtime.vary.delays import Piece, delay_pieces, system_with_delay
 from apc.runtime.vary.eigenvalues import eigenvalues
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
-from apc.runtime.vary.marginal import marginal_motion
+from apc.runtime.vary.marginal import marginal_motion, with_rigid
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -423,7 +423,7 @@ def _delay_crossing(
     def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
         moved = system_with_delay(system, free, Fraction(value))
         listed = split(*lifted_groups(moved, prepared=prepared)).systems
-        return [(one, find_rigid_modes(one, with_drifts=False)) for one in listed]
+        return list(with_rigid(listed))
 
     held = bracket(root, systems, low=float(piece.low), high=float(piece.high))
     if held is None:
