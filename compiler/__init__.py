@@ -2,6 +2,7 @@
 
 errors words                what all are written in
 multiples                   common multiples and divisors of exact times
+weights                     exact sums of the decimals by which peers weigh one another
 source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
 language                    expression, lexer, grammar: text to trees; evaluation: trees to values
                             dimensions, unit_grammar, unit_names, units, unit_text, unit_check

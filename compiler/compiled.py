@@ -41,7 +41,8 @@ class Graph:
     """Who hears whom: "complete", "ring", "star" (the first peer is the centre), or "arcs".
 
     `arcs` (M, 2) are then (sender, receiver) pairs, peers counted from 0 over the groups in order, and
-    `weights` (M,) what a receiver multiplies that sender's packets by; for the other shapes both are empty.
+    `weights` (M,) what a receiver multiplies that sender's packets by, each standing for the shortest decimal
+    that means it (see `weights`); for the other shapes both are empty.
     """
 
     shape: str
@@ -225,7 +226,11 @@ class Ports:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`."""
+    """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
+
+    A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
+    `parameters`, the rationals that floats round, each float at most one of them.
+    """
 
     name: str
     states: tuple[State, ...]
@@ -235,6 +240,7 @@ class Kind:
     clocks: tuple[ClockPartition, ...]
     sends: tuple[SendPartition, ...]
     ports: Ports | None = None
+    rounded: tuple[tuple[int, tuple[Fraction, ...]], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from tests.topologies import AVERAGE, ROOT
 
 # Folder by folder, and in each its modules, earliest first: each may import only those before it.
 HOUSE = (
-    ("apc.compiler", "errors words multiples compiled cache"),
+    ("apc.compiler", "errors words multiples weights compiled cache"),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
         "apc.compiler.language",
@@ -69,7 +69,7 @@ HOUSE = (
     (
         "apc.runtime.analysis",
         """
-        plan selfcheck analysis needs ranges box box_proof openloop paper conventions switches
+        switches plan selfcheck analysis needs ranges box box_proof openloop paper conventions
         contact_modes
         """,
     ),

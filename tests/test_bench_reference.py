@@ -130,7 +130,7 @@ def test_the_reference_shares_with_the_runtime_what_it_says_and_no_more() -> Non
             if module_name.startswith("apc.runtime.") and "apc.runtime.bench" not in module_name:
                 shared |= {alias.name for alias in node.names}  # type: ignore[attr-defined] # it is an import
     functions = {"evaluate_exact", "is_rational", "guards_of", "rational_ball", "precision"}
-    assert shared == functions | {"resolve", "arcs", "ROW"}
+    assert shared == functions | {"resolve", "exact_numbers", "arcs", "ROW"}
     assert all(name in str(events.__doc__) for name in shared)
 
 

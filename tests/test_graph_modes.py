@@ -47,7 +47,7 @@ def test_equal_row_sums_are_an_exact_eigenvalue_as_often_as_peers_are_apart() ->
     pairs = _given((0, 1, 0.1), (1, 0, 0.1), (2, 3, 0.1), (3, 2, 0.1))
     found = graph_modes(pairs, 4, mean=False)
     assert found is not None
-    assert found[0] == GraphMode(Fraction(0.1), Fraction(0), 2, 0.0, True)
+    assert found[0] == GraphMode(Fraction(1, 10), Fraction(0), 2, 0.0, True)
 
 
 def test_a_cycle_one_way_has_complex_pairs() -> None:

@@ -40,6 +40,7 @@ from apc.compiler.language.values import Value, renamed
 from apc.compiler.scene.channels import SceneChannel
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene, SceneGroup
+from apc.compiler.weights import Sums, sum_weights
 
 NO_DELAY = "no delay"
 COUNT_ABOUT = "peers heard over the link, counted with their weights"
@@ -232,6 +233,7 @@ def compiled_groups(
         E215 a graph some of whose peers send nothing.
     """
     exact = {timing.name for timing in timings.found}
+    sums = {link.name: _heard(scene, link) for link in links if link.graph.shape == "arcs"}
     found = []
     start = 0
     for group in scene.groups:
@@ -246,9 +248,9 @@ def compiled_groups(
             name = count_of(link.name)
             if name not in kind.parameters:
                 continue
-            counts = _counts(scene, kinds, kind_of, link, group, start)
-            if (counts == counts[0]).all():
-                values.append(Parameter(name, "1", float(counts[0]), about=COUNT_ABOUT))
+            counts = _counts(scene, kinds, kind_of, link, group, start, sums.get(link.name))
+            if isinstance(counts, Fraction):
+                values.append(Parameter(name, "1", float(counts), about=COUNT_ABOUT, exact=counts))
             else:
                 columns.append(Column(name, counts))
         found.append(Group(group.name, group.count, kind_of[group.name], tuple(values), tuple(columns)))
@@ -263,7 +265,8 @@ def _counts(
     link: Link,
     group: SceneGroup,
     start: int,
-) -> NDArray[np.float64]:
+    sums: Sums | None,
+) -> Fraction | NDArray[np.float64]:
     """Return the summed weights of what each peer of a group hears: one number if they are all alike."""
     sends = {
         one.name: any(sending.link == link.name for sending in kinds[kind_of[one.name]].sends)
@@ -271,22 +274,50 @@ def _counts(
     }
     if link.graph.shape == "complete":
         total = sum(one.count for one in scene.groups if sends[one.name])
-        return np.array([float(total - sends[group.name])])
+        return Fraction(total - sends[group.name])
     silent = [name for name, does in sends.items() if not does]
     if silent:
         place = next(part.place for part in scene.links if part.name == link.name)
         what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
         raise ApcError(Mistake("E215", place, what))
     if link.graph.shape == "ring":
-        return np.array([float(min(2, scene.peers - 1))])
+        return Fraction(min(2, scene.peers - 1))
     if link.graph.shape == "star":
+        if start or scene.peers == 2:
+            return Fraction(1)
         counts = np.ones(group.count)
-        if start == 0:
-            counts[0] = scene.peers - 1
-        return counts
-    received = np.zeros(scene.peers)
-    np.add.at(received, link.graph.arcs[:, 1], link.graph.weights)
-    return received[start : start + group.count]
+        counts[0] = scene.peers - 1
+        return counts if group.count > 1 else Fraction(scene.peers - 1)
+    end = start + group.count
+    assert sums is not None, link.graph.shape
+    return sums.of(start) if sums.alike(start, end) else sums.floats[start:end]
+
+
+def _heard(scene: Scene, link: Link) -> Sums:
+    """Return what every peer of the scene hears in all over a link of arcs."""
+    return sum_weights(link.graph.arcs[:, 1], link.graph.weights, scene.peers)
+
+
+def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
+    """Return a kind that knows which counts of peers heard are rounded.
+
+    Raises
+    ------
+    ApcError
+        E217 sums of weights that differ and are one in floats.
+    """
+    rounded = []
+    for link in links:
+        if count_of(link.name) in kind.parameters and link.graph.shape == "arcs":
+            sums = _heard(scene, link)
+            values = {sums.of(peer) for peer in range(scene.peers)} if sums.rounded else set()
+            if len(set(map(float, values))) < len(values):
+                place = next(part.place for part in scene.links if part.name == link.name)
+                what = f"what two peers hear over {link.name} adds up to sums that doubles can't tell apart"
+                raise ApcError(Mistake("E217", place, what, hint="weights of at most 15 digits"))
+            if values:
+                rounded.append((kind.parameters.index(count_of(link.name)), tuple(sorted(values))))
+    return replace(kind, rounded=tuple(rounded))
 
 
 def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:

@@ -38,6 +38,7 @@ from apc.compiler.functions.exchange import (
     compiled_groups,
     used_clocks,
     used_links,
+    with_rounded,
 )
 from apc.compiler.functions.ports import held_ports
 from apc.compiler.functions.reached import Reached
@@ -65,7 +66,7 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         tuple(links),
         timings.found,
         all_parameters(scene, kinds, links),
-        tuple(kinds),
+        tuple(with_rounded(scene, kind, links) for kind in kinds),
         compiled_groups(scene, kinds, numbers, links, timings),
         tuple(dict.fromkeys([*dropped, *unheard, *silent])),
         origin,

@@ -18,7 +18,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.analysis.plan import cannot_serve, make_plan
+from apc.runtime.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.runtime.eigen.closing import close_loop
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.peer_group import PeerGroup, states_of
@@ -154,7 +154,7 @@ def analyze(
     ------
     ApcError
         E804 a system of too many states for its matrix, E806 numbers beyond floats, E850 a method that can't
-        serve this scene; and those of `peers.peer_groups`.
+        serve this scene; and those of `plan.refuse_varying` and `peers.peer_groups`.
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         numbers = resolve(system)
@@ -173,6 +173,7 @@ def analyze(
             raise cannot_serve(system, method, "what a frame's ticks round hides the peers' own eigenvalues")
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
+        linearized = not all(prepared.jacobians[group.kind].affine for group in system.groups)
     return Analysis(
         topology=system.name,
         peers=exchange.peers,
@@ -188,9 +189,9 @@ def analyze(
         spectral_radius_error=spectrum.spectral_radius_error,
         rigid_modes=spectrum.rigid_modes,
         modes=spectrum.modes,
-        linearized=not all(prepared.jacobians[group.kind].affine for group in system.groups),
+        linearized=linearized,
         notes=(*plan.notes, *notes, *spectrum.notes, *nominal_notes(system)),
-        proof=spectrum.proof,
+        proof=f"{spectrum.proof}, of the linearization" if spectrum.proof and linearized else spectrum.proof,
     )
 
 
@@ -244,9 +245,16 @@ def _solve_crowds(
 def lifted_groups(
     system: CompiledSystem, *, prepared: Prepared | None = None
 ) -> tuple[tuple[PeerGroup, ...], Exchange]:
-    """Return the peers of a system in groups of equal dynamics, lifted, and the exchange between them."""
+    """Return the peers of a system in groups of equal dynamics, lifted, and the exchange between them.
+
+    Raises
+    ------
+    ApcError
+        As `plan.refuse_varying` and `peers.peer_groups`.
+    """
     numbers = resolve(system)
     prepared = _timed(system, prepared or prepare(system), numbers)
+    refuse_varying(system, prepared.jacobians)
     exchange = build_exchange(system, numbers.timings)
     groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
     return groups, exchange

@@ -34,6 +34,7 @@ from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.linearize import site_of_row
 from apc.runtime.frame.names import find
 from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.frame.parameters import exact_numbers
 from apc.runtime.frame.site import LinearSite
 
 _PLACE = Place("box")
@@ -297,7 +298,8 @@ def _open_site(group: PeerGroup, opened: Mapping[str, Ratio], system: CompiledSy
     built = group.jacobians
     names = built.kind.parameters
     vector = [
-        opened.get(name, Fraction(float(value))) for name, value in zip(names, group.parameters, strict=True)
+        opened.get(name, value)
+        for name, value in zip(names, exact_numbers(built.kind, group.parameters), strict=True)
     ]
     zeros = [[Fraction(0)] * built.function.numel_in(argument) for argument in range(4)]
 

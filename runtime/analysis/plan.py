@@ -1,7 +1,7 @@
 """How a system is going to be analysed: by which method, as which systems.
 
 Takes: a `CompiledSystem` with its Jacobians, schedules and numbers, and the exchange between its peers.
-Gives: `Plan`, `make_plan`, `METHODS`.
+Gives: `Plan`, `make_plan`, `METHODS`; `refuse_varying`.
 Guarantees: nothing is solved, and no matrix of a whole system is built.
 Does not: analyse (see `analysis`).
 """
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.analysis.switches import varying_slopes
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.modes import arrange, dense_loop
 from apc.runtime.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
@@ -55,6 +56,29 @@ class Plan:
     notes: tuple[str, ...]
 
 
+def refuse_varying(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> None:
+    """Refuse equations whose slopes change with time: frozen at a moment, they'd answer for another scene.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    jacobians
+        One a kind.
+
+    Raises
+    ------
+    ApcError
+        E809 such an equation.
+    """
+    for site in jacobians:
+        if names := varying_slopes(site):
+            what = f"the equation of {names[0]} multiplies what moves by what changes with time"
+            why = "no one frame stands for all others, so that no verdict can be had; a simulation plays it"
+            place = Place(system.origin.topology)
+            raise ApcError(Mistake("E809", place, f"{what}: {why}", hint="apc simulate"))
+
+
 def make_plan(
     system: CompiledSystem,
     jacobians: Sequence[SiteJacobians],
@@ -78,9 +102,10 @@ def make_plan(
     ------
     ApcError
         E804 a system of too many states for its matrix, E850 a method that can't serve this scene; and those
-        of `peers.peer_groups`.
+        of `refuse_varying` and `peers.peer_groups`.
     """
     assert method in METHODS, f"no such method: {method}"
+    refuse_varying(system, jacobians)
     if method in ("auto", "determinant", "krylov"):
         reason = _not_crowds(system, jacobians)
         if method == "krylov" and reason:

@@ -1,7 +1,8 @@
 """Where a peer's equations switch between linear pieces: contacts, walls, limits.
 
 Takes: a kind of a `CompiledSystem`.
-Gives: `Decision`, `SwitchedKind`, `SwitchingPart`, `find_switches`, `switching_parts`, `bind`.
+Gives: `Decision`, `SwitchedKind`, `SwitchingPart`, `find_switches`, `switching_parts`, `bind`;
+`varying_slopes`.
 Guarantees: found in the equations themselves: a comparison, an `if`, a `max`, `min`, `abs` or `sign` of
 something that moves is a decision, whatever the part is called.
 Does not: know which pieces a motion can reach, or switch what depends on time and parameters alone.
@@ -173,6 +174,32 @@ def find_switches(kind: Kind) -> SwitchedKind:
                 changed |= dict.fromkeys(_changed(kind, one, symbol, walk.operands[number]))
         decisions.append(Decision(symbol, tuple(changed)))
     return SwitchedKind(kind, tuple(decisions), opened, walkable=True)
+
+
+def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
+    """Return the names of what has slopes that change with time in some piece, whatever else moves.
+
+    Of a kind with a nonlinear loop nothing is known: all that is in the loop depends on all that drives it.
+    """
+    if not site.timed:
+        return ()
+    kind = site.kind
+    found: dict[str, None] = {}
+    for one in find_switches(kind).functions:
+        *moving, _, t = one.inputs
+        slopes = casadi.jacobian(one.output, casadi.vertcat(*moving))
+        rows = [row for row in range(slopes.size1()) if casadi.depends_on(slopes[row, :], t)]
+        what, p, place = one.where
+        if what == "edge" and rows:
+            found[kind.clocks[p].receives[place].name] = None
+            continue
+        names = {
+            "derivative": [state.name for state in kind.states],
+            "tick": kind.clocks[p].outputs if what == "tick" else (),
+            "send": kind.sends[p].channels if what == "send" else (),
+        }.get(what, ())
+        found |= dict.fromkeys(names[row] for row in rows)
+    return tuple(found)
 
 
 def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> tuple[SwitchingPart, ...]:

@@ -30,6 +30,9 @@ LEAST_WIDTH = 12
 LEAST_SHARE = 0.005  # shows as zero
 HEADINGS = ("magnitude", "shape", "times", "frequency", "damping", "moves most")
 
+LINEARIZED = ", linearized at its start"
+NEAR_THE_START = "The scene is not linear: this is said of small motions around its start values."
+
 _WORDS = {
     "stable": "Every motion dies out.",
     "stable up to a common translation": (
@@ -107,8 +110,10 @@ def timings_report(taken: Sequence[tuple[str, float]]) -> str:
 
 def analysis_report(result: Analysis) -> str:
     """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
-    lines = [f"{result.topology}: {result.verdict}", ""]
+    lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}", ""]
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
+    if result.linearized:
+        words = f"{NEAR_THE_START}\n{words}"
     lines += [f"  {line}" for line in words.splitlines()]
     removed = ""
     if result.rigid_modes:

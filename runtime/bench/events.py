@@ -4,11 +4,12 @@ Takes: a `CompiledSystem`.
 Gives: `Peer`, `build_peers`; `Happening`, `Play`; `refusal`, `ticks_between`.
 Guarantees: shares with the analysis and the simulation what says what the scene is, and nothing that says
 what it does: no Jacobian of theirs, no schedule, no lifted map, no mode. Shared are the compiled functions;
-the numbers of each peer (`parameters.resolve`); the walk through a function's operations over exact numbers
-and whether that is possible (`exact.evaluate_exact`, `is_rational`, `guards.guards_of`); how a rational
-becomes a ball (`balls.rational_ball`, `precision`); and in `bench.reference` who hears whom on a graph
-(`exchange.arcs`) and the row of a scene without clocks (`simulation.ROW`). A mistake in one of these is the
-reference's too: `tests.bruteforce` and `tests.eventwise` share none of them and stand beside it in its tests.
+the numbers of each peer (`parameters.resolve`, `exact_numbers`); the walk through a function's operations
+over exact numbers and whether that is possible (`exact.evaluate_exact`, `is_rational`, `guards.guards_of`);
+how a rational becomes a ball (`balls.rational_ball`, `precision`); and in `bench.reference` who hears whom on
+a graph (`exchange.arcs`) and the row of a scene without clocks (`simulation.ROW`). A mistake in one of these
+is the reference's too: `tests.bruteforce` and `tests.eventwise` share none of them and stand beside it in its
+tests.
 Does not: serve what is not linear between events, or draw lots: it says why.
 
 Every computed value and every packet is kept with its time; whoever needs one takes the newest that counts.
@@ -32,7 +33,7 @@ from apc.runtime.bench.pushes import Push, impulse, in_the_way, push_of, switche
 from apc.runtime.eigen.balls import rational_ball
 from apc.runtime.frame.exact import evaluate_exact, is_rational
 from apc.runtime.frame.guards import guards_of
-from apc.runtime.frame.parameters import resolve
+from apc.runtime.frame.parameters import exact_numbers, resolve
 
 Number = Any  # flint.arb, an exact 0 or 1, or an array of these
 
@@ -246,7 +247,7 @@ def build_peers(
     for peer, group in zip(peers, groups, strict=True):
         kind = system.kinds[system.groups[group].kind]
         row = numbers.rows[group][peer - int(starts[group])]
-        parameters = [Fraction(float(value)) for value in numbers.parameters[group][row]]
+        parameters = exact_numbers(kind, numbers.parameters[group][row])
         value = dict(zip(kind.parameters, parameters, strict=True))
         delays = tuple(seconds[hold.delay] for hold in kind.holds)
         start_x = tuple(value[state.start] for state in kind.states)

@@ -17,6 +17,7 @@ import flint
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.weights import exact_weight
 from apc.runtime.bench.events import (
     Happening,
     Number,
@@ -92,7 +93,7 @@ def classes_of(system: CompiledSystem) -> Classes:
         else:
             table = [[Fraction(0)] * len(keys) for _ in keys]
             for (sender, receiver), weight in zip(*arcs(link.graph, number), strict=True):
-                table[receiver][sender] += Fraction(float(weight))
+                table[receiver][sender] += exact_weight(weight)
         weights[link.name] = tuple(tuple(row) for row in table)
     return Classes(
         tuple(counts.values()), tuple(first[key] for key in keys), tuple(key[0] for key in keys), weights
@@ -360,6 +361,6 @@ def _everybody(system: CompiledSystem) -> Classes:
         table = [[Fraction(link.graph.shape == "complete")] * n for _ in groups]
         if link.graph.shape != "complete":
             for (sender, receiver), weight in zip(*arcs(link.graph, n), strict=True):
-                table[receiver][sender] += Fraction(float(weight))
+                table[receiver][sender] += exact_weight(weight)
         weights[link.name] = tuple(tuple(row) for row in table)
     return Classes((1,) * n, tuple(range(n)), groups, weights)

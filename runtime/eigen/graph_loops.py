@@ -17,6 +17,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from apc.compiler.weights import sum_weights
 from apc.runtime.eigen.graph_modes import GraphMode, Surd
 from apc.runtime.eigen.loop import Coupling, Loop
 from apc.runtime.eigen.peer_group import PeerGroup
@@ -44,13 +45,8 @@ def common_graph(ways: Sequence[Way], exchange: Exchange) -> str:
 def _degree(link: str, exchange: Exchange) -> Fraction | None:
     """Return the sum of the weights that every peer hears over a link, None when it differs."""
     pairs, weights = exchange.arcs(link)
-    if np.all(weights == 1):
-        counts = np.bincount(pairs[:, 1], minlength=exchange.peers)
-        return Fraction(int(counts[0])) if np.all(counts == counts[0]) else None
-    sums = [Fraction(0)] * exchange.peers
-    for receiver, weight in zip(pairs[:, 1].tolist(), weights.tolist(), strict=True):
-        sums[receiver] += Fraction(weight)
-    return sums[0] if len(set(sums)) == 1 else None
+    sums = sum_weights(pairs[:, 1], weights, exchange.peers)
+    return sums.of(0) if sums.alike(0, exchange.peers) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +69,10 @@ def graph_scale(group: PeerGroup, ways: Sequence[Way], exchange: Exchange) -> Gr
     means = any(way.operator == "mean" for way in ways)
     pairs, weights = exchange.arcs(link)
     if means:
-        sums = np.bincount(pairs[:, 1], weights, minlength=exchange.peers)
+        sums = sum_weights(pairs[:, 1], weights, exchange.peers)
         hears = np.bincount(pairs[:, 1], minlength=exchange.peers) > 0
-        for peer in np.flatnonzero((sums == 0) | ~hears).tolist():
-            total = sum(map(Fraction, weights[pairs[:, 1] == peer].tolist()), Fraction(0))
-            check_mean(exchange, peer, link, "mean", bool(hears[peer]), total)
+        for peer in np.flatnonzero((sums.floats == 0) | ~hears).tolist():
+            check_mean(exchange, peer, link, "mean", bool(hears[peer]), sums.of(peer))
     degree = _degree(link, exchange)
     return GraphScale(
         {

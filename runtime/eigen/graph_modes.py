@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
+from apc.compiler.weights import exact_weight, sum_weights
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import arcs
 
@@ -151,7 +152,7 @@ def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...]
             return None
         # Bauer and Fike: an eigenvalue moves no further than the condition times the matrix.
         doubt = size * condition * float(np.linalg.norm(matrix))
-    exact_sum = _row_sum(plain, mean=mean)
+    exact_sum = _row_sum(graph, n, mean=mean)
     modes = []
     for cluster in _clusters(values, doubt):
         centre = complex(np.mean(values[cluster]))
@@ -179,12 +180,13 @@ def _clusters(values: NDArray[np.complex128], doubt: float) -> list[Integers]:
     return [np.flatnonzero(cluster == one) for one in np.unique(cluster)]
 
 
-def _row_sum(plain: Floats, *, mean: bool) -> Fraction | None:
+def _row_sum(graph: Graph, n: int, *, mean: bool) -> Fraction | None:
     """Return what all rows of W add up to exactly, or None when they differ."""
     if mean:
         return Fraction(1)
-    sums = {sum(map(Fraction, row[row != 0].tolist()), Fraction(0)) for row in plain}
-    return sums.pop() if len(sums) == 1 else None
+    pairs, weights = arcs(graph, n)
+    sums = sum_weights(pairs[:, 1], weights, n)
+    return sums.of(0) if sums.alike(0, n) else None
 
 
 def _is_exact(graph: Graph, n: int, value: Fraction, multiplicity: int, *, mean: bool) -> bool:
@@ -195,7 +197,7 @@ def _is_exact(graph: Graph, n: int, value: Fraction, multiplicity: int, *, mean:
     pairs, weights = arcs(graph, n)
     rows: dict[tuple[int, int], Fraction] = {}
     for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
-        rows[receiver, sender] = rows.get((receiver, sender), Fraction(0)) + Fraction(weight)
+        rows[receiver, sender] = rows.get((receiver, sender), Fraction(0)) + exact_weight(weight)
     for peer in range(n):
         rows.setdefault((peer, peer), Fraction(0))
     if mean:  # D (D⁻¹S − value) has the same null space

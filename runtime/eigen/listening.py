@@ -14,12 +14,13 @@ from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.weights import exact_weight
 from apc.runtime.eigen.peer_group import Gains
 from apc.runtime.eigen.runs import Peers
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.exchange import Exchange, check_mean
 from apc.runtime.frame.jacobians import SiteJacobians, edge_name
-from apc.runtime.frame.parameters import Numbers
+from apc.runtime.frame.parameters import Numbers, exact_numbers
 from apc.runtime.frame.schedule import Schedule
 from apc.runtime.frame.start import Listening, start_sends, start_values
 
@@ -52,7 +53,7 @@ class StartClasses:
         for site, vector in zip(self.sites, self.vectors, strict=True):
             key = (id(site), vector.tobytes())
             if key not in exact:
-                parameters = [Fraction(value) for value in vector.tolist()]
+                parameters = exact_numbers(site.kind, vector)
                 exact[key] = parameters, start_sends(site, parameters)
             self.parameters.append(exact[key][0])
             self.sent.append(exact[key][1])
@@ -63,7 +64,7 @@ class StartClasses:
                 hears: dict[int, list[tuple[int, Fraction]]] = {}
                 pairs, weights = exchange.arcs(name)
                 for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
-                    hears.setdefault(class_of[receiver], []).append((class_of[sender], Fraction(weight)))
+                    hears.setdefault(class_of[receiver], []).append((class_of[sender], exact_weight(weight)))
                 self.arcs[name] = hears
         self._edges: dict[tuple[Any, ...], list[Fraction]] = {}
 

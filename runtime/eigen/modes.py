@@ -25,6 +25,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from apc.compiler.weights import exact_weight
 from apc.runtime.eigen.closing import ClosedSystem, close_loop
 from apc.runtime.eigen.coupling import complete_degrees, couple
 from apc.runtime.eigen.graph_loops import common_graph, graph_loop, graph_scale
@@ -160,7 +161,7 @@ def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
     )
     weights = {
         link: {
-            (receiver, sender): Fraction(weight)
+            (receiver, sender): exact_weight(weight)
             for (sender, receiver), weight in zip(*(one.tolist() for one in exchange.arcs(link)), strict=True)
         }
         for link in exchange.links

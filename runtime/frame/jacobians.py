@@ -33,11 +33,12 @@ class Edge:
     """What a receive does with one sender: its edge function with its slopes.
 
     `function(x, u, m, s, p, t)` is a column: the value, then the slopes over x, u, m and s. `affine` says
-    that these hold everywhere.
+    that these hold everywhere, `timed` that some depend on time.
     """
 
     function: Any  # casadi.Function
     affine: bool
+    timed: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,8 @@ class SiteJacobians:
     """The Jacobians of a kind as one CasADi function of (x, u, m, r, p, t); m and r of all clocks in a row.
 
     The function's one output is every matrix of a `LinearSite`, in order, column-major; `shapes` cuts it.
-    `edges` are those of its receives by (clock partition, receive).
+    `edges` are those of its receives by (clock partition, receive). `timed` says that some entry depends on
+    time, if only on whether something has switched (see `switches.varying_slopes`).
     """
 
     kind: Kind
@@ -53,6 +55,7 @@ class SiteJacobians:
     shapes: tuple[tuple[int, int], ...]
     pattern: LinearSite
     affine: bool
+    timed: bool
     edges: Mapping[tuple[int, int], Edge]
 
     @property
@@ -110,7 +113,7 @@ def jacobians(kind: Kind) -> SiteJacobians:
     inside = casadi.vertcat(x, u, m_all, r_all)
     affine = (
         plain
-        and not (flat.numel() and casadi.depends_on(flat, moving))
+        and not _depends(flat, moving)
         # A force that jumps has the same slopes on either side.
         and not guards_of(casadi.vertcat(*values), inside)
         and all(edge.affine for edge in edges.values())
@@ -126,6 +129,7 @@ def jacobians(kind: Kind) -> SiteJacobians:
         shapes=tuple((int(block.size1()), int(block.size2())) for block in blocks),
         pattern=with_own_parts(pattern, own, np.logical_or, lambda a, b: a[:, None] & b[None, :]),
         affine=affine,
+        timed=_depends(flat, t) or any(edge.timed for edge in edges.values()),
         edges=edges,
     )
 
@@ -143,6 +147,11 @@ def structural_pattern(block: Any) -> NDArray[np.bool_]:
     rows, columns = sparsity.get_triplet()
     pattern[rows, columns] = True
     return pattern
+
+
+def _depends(expression: Any, symbols: Any) -> bool:
+    """Say whether an expression, which may be empty, depends on any of these symbols."""
+    return bool(expression.numel() and casadi.depends_on(expression, symbols))
 
 
 def _refuse_loop_with_edges(kind: Kind) -> None:
@@ -174,9 +183,9 @@ def _edge(kind: Kind, partition: ClockPartition, receive: Receive) -> Edge:
     value = s[receive.channel] if receive.edge is None else receive.edge(x, u, m, s, p, t)
     slopes = casadi.densify(casadi.jacobian(value, casadi.vertcat(x, u, m, s)).T)
     smooth = receive.operator in ("sum", "mean") and not guards_of(value, casadi.vertcat(x, u, m, s))
-    moves = casadi.depends_on(slopes, casadi.vertcat(x, u, m, s, t)) if slopes.numel() else False
+    moves = _depends(slopes, casadi.vertcat(x, u, m, s, t))
     function = casadi.Function("edge", [x, u, m, s, p, t], [casadi.vertcat(casadi.densify(value), slopes)])
-    return Edge(function, smooth and not moves)
+    return Edge(function, smooth and not moves, _depends(slopes, t))
 
 
 def _listening(

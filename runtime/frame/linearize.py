@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.jacobians import SiteJacobians
+from apc.runtime.frame.parameters import exact_numbers
 from apc.runtime.frame.site import LinearSite, assemble, cut, matrices_of, with_own_parts
 from apc.runtime.frame.start import Listening, start_arguments
 
@@ -62,7 +63,7 @@ def linearize_exact(
     """
     assert listening is not None or not site.edges, "who is heard decides what an edge function does"
     assert site.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
-    arguments = start_arguments(site, [Fraction(float(value)) for value in parameters], Fraction, listening)
+    arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
     flat = np.array(evaluate_exact(site.function, arguments)[0], dtype=object)
     exact = assemble(site.kind, site.affine, cut(flat, site.shapes), _channels_of(site))
     if listening is None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from apc.compiler.compiled import PEERS, CompiledSystem, Parameter
+from apc.compiler.equations.reductions import count_of
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 
 # The sections of a topology, which a name may start with.
@@ -39,7 +40,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     Raises
     ------
     ApcError
-        E622 no such parameter, E623 the number of peers.
+        E622 no such parameter, E623 the number of peers, or of those that are heard.
     """
     known = {parameter.name for parameter in system.parameters} | {timing.name for timing in system.timings}
     groups = {group.name for group in system.groups}
@@ -58,8 +59,12 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
         raise ApcError(
             Mistake("E623", place, "peers is the number of peers: change a count and compile again")
         )
+    counts = {count_of(link.name) for link in system.links}
+    if name in counts:
+        what = f"{name} follows from who hears whom: change the link's graph and compile again"
+        raise ApcError(Mistake("E623", place, what))
     if name not in known:
-        near = nearest(name, sorted(known - {PEERS}))
+        near = nearest(name, sorted(known - {PEERS} - counts))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
     return name, group
 

@@ -1,7 +1,7 @@
 """The numbers with which a compiled system becomes matrices.
 
 Takes: a `CompiledSystem` and overrides.
-Gives: `Numbers`, `resolve`.
+Gives: `Numbers`, `resolve`; `exact_numbers`.
 Guarantees: peers with the same parameters share one row; what depends on a parameter that differs from peer
 to peer is worked out peer by peer, in floats, in a time that grows with the number of peers.
 Does not: read or apply overrides (`overrides`); build a matrix (`linearize`, `scheduling`).
@@ -16,7 +16,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import CompiledSystem, Kind
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.frame.rows import Floats, different_rows
 
@@ -50,3 +50,19 @@ def resolve(system: CompiledSystem, overrides: Sequence[Override] = ()) -> Numbe
         rows=tuple(rows for _, rows in found),
         timings={timing.name: timing.value for timing in system.timings},
     )
+
+
+def exact_numbers(kind: Kind, vector: Floats) -> list[Fraction]:
+    """Return a peer's parameters (n_p,) exactly: as the floats they are, or what these floats round.
+
+    Parameters
+    ----------
+    kind
+        Of the peer: knows what is rounded.
+    vector
+        Its parameters (n_p,), in the order of `Kind.parameters`.
+    """
+    numbers = [Fraction(value) for value in vector.tolist()]
+    for place, rationals in kind.rounded:
+        numbers[place] = next((one for one in rationals if float(one) == vector[place]), numbers[place])
+    return numbers

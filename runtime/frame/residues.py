@@ -1,7 +1,7 @@
 """Rational numbers modulo a prime, whole columns at once: exact zeros among a hundred thousand rows.
 
 Takes: columns of floats, as the rationals they are.
-Gives: `Residues`, `residues_of`, `PRIMES`.
+Gives: `Residues`, `residues_of`, `residues_of_rounded`, `PRIMES`.
 Guarantees: sums, products and quotients are those of the rationals modulo the prime: what is not 0 modulo it
 is not 0. What is 0 modulo two of them is 0, but for one chance in 2^62.
 Does not: compare, or take roots.
@@ -9,6 +9,7 @@ Does not: compare, or take roots.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -93,3 +94,15 @@ def residues_of(column: NDArray[np.float64], prime: int) -> Residues:
     different, place = np.unique(exponent, return_inverse=True)
     powers = np.array([pow(2, int(power) - MANTISSA, prime) for power in different], np.int64)
     return Residues(whole * powers[place] % prime, prime)
+
+
+def residues_of_rounded(column: NDArray[np.float64], rationals: Sequence[Fraction], prime: int) -> Residues:
+    """Return a column of floats, each the one of these rationals that it rounds, modulo a prime.
+
+    Raises
+    ------
+    ValueError
+        A denominator is 0 modulo the prime.
+    """
+    exact = {float(one): one.numerator * pow(one.denominator, -1, prime) % prime for one in rationals}
+    return Residues(np.array([exact[value] for value in column.tolist()], np.int64), prime)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.weights import sum_weights
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.schedule import Heard, Sent
@@ -96,7 +97,7 @@ def _hearing(
         pairs, weights = exchange.arcs(link)
         kept = sends[pairs[:, 0]]
         sender, receiver, weight = pairs[kept, 0], pairs[kept, 1], weights[kept]
-        total = np.bincount(receiver, weight, minlength=exchange.peers)
+        total = sum_weights(receiver, weight, exchange.peers).floats
         for g, crowd in enumerate(listed):
             for line, heard in enumerate(crowd.schedule.heard):
                 if heard.way.link == link:

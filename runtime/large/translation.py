@@ -21,6 +21,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.weights import sum_weights
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.modes import complete_loops
 from apc.runtime.eigen.peer_group import PeerGroup, states_of, used_ways
@@ -29,7 +30,7 @@ from apc.runtime.eigen.rigid import find_rigid_modes, stays_rigid
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.linearize import site_of_entries
-from apc.runtime.frame.residues import PRIMES, Residues, residues_of
+from apc.runtime.frame.residues import PRIMES, Residues, residues_of, residues_of_rounded
 from apc.runtime.frame.schedule import Way
 from apc.runtime.frame.site import LinearSite
 from apc.runtime.large.crowds import Crowd
@@ -208,13 +209,12 @@ def _totals(listed: Sequence[Crowd], exchange: Exchange) -> list[dict[str, Fract
         pairs, weights = exchange.arcs(link)
         sends = np.repeat([crowd.sends(link) for crowd in listed], [len(crowd.rows) for crowd in listed])
         heard = sends[pairs[:, 0]]
-        sums = np.bincount(pairs[heard, 1], weights[heard], minlength=exchange.peers)
+        sums = sum_weights(pairs[heard, 1], weights[heard], exchange.peers)
         for crowd, totals in zip(listed, found, strict=True):
             start = int(exchange.starts[crowd.group])
-            own = sums[start : start + len(crowd.rows)]
-            if np.any(own != own[0]):
+            if not sums.alike(start, start + len(crowd.rows)):
                 return None
-            totals[link] = Fraction(float(own[0]))
+            totals[link] = sums.of(start)
     return found
 
 
@@ -273,6 +273,8 @@ def _all_peers(crowd: Crowd, prime: int) -> LinearSite:
     """Return the matrices of all different peers of a crowd, each entry a column modulo a prime."""
     built = crowd.jacobians
     columns = [residues_of(column, prime) for column in crowd.parameters.T]
+    for place, rationals in built.kind.rounded:
+        columns[place] = residues_of_rounded(crowd.parameters[:, place], rationals, prime)
     zero = Residues(np.zeros(len(crowd.parameters), np.int64), prime)
     arguments = [[zero] * built.function.numel_in(argument) for argument in range(4)]
 

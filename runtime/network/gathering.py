@@ -27,6 +27,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.weights import sum_weights
 from apc.runtime.frame.exchange import Exchange, check_mean
 from apc.runtime.frame.schedule import Heard, Kept, Schedule, Sent
 from apc.runtime.network.listener import START, Seen
@@ -230,7 +231,7 @@ class Gathering:
         mine = np.isin(route.pairs[:, 1], member.peers) & (np.array(delays) == heard.way.delay)
         weights = route.weights.copy()
         if heard.way.operator == "mean":
-            totals = np.bincount(route.pairs[:, 1], route.weights, minlength=exchange.peers)
+            totals = sum_weights(route.pairs[:, 1], route.weights, exchange.peers).floats
             for peer in member.peers[totals[member.peers] == 0].tolist():
                 hears = bool((route.pairs[:, 1] == peer).any())
                 check_mean(exchange, peer, route.link, "mean", hears, Fraction(0))

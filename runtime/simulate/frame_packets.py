@@ -17,6 +17,7 @@ import casadi
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.weights import sum_weights
 from apc.runtime.frame.exchange import Exchange, check_mean
 from apc.runtime.frame.schedule import Heard, Sent
 from apc.runtime.network.gathering import Gate, Gathering
@@ -150,7 +151,7 @@ class FramePackets:
             n = exchange.peers
             whole = scipy.sparse.coo_array((weights, (pairs[:, 0], pairs[:, 1])), shape=(n, n)).tocsc()
             if mean:
-                sums = np.asarray(whole.sum(axis=0)).ravel()
+                sums = sum_weights(pairs[:, 1], weights, n).floats
                 for peer in np.flatnonzero(sums == 0):
                     if self._averages(int(peer), link):
                         hears = bool((pairs[:, 1] == peer).any())

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.weights import sum_weights
 from apc.runtime.frame.exchange import Exchange, check_mean
 from apc.runtime.frame.jacobians import edge_name
 from apc.runtime.frame.schedule import Heard
@@ -245,7 +246,7 @@ class Pairs:
             return
         member = self.members[listener]
         hears = np.bincount(listing.receivers, minlength=member.count) > 0
-        totals = np.bincount(listing.receivers, listing.weights, minlength=member.count)
+        totals = sum_weights(listing.receivers, listing.weights, member.count).floats
         enough = hears & (totals != 0) if operator == "mean" else hears
         for place in np.flatnonzero(~enough).tolist():
             peer = int(member.peers[place])
@@ -267,7 +268,7 @@ def _reduction(pair: Any, operator: str, listing: _Listing, count: int) -> Any:
             result = _joined(values, receivers, JOINS[operator])
         else:
             if operator == "mean":
-                weights = weights / np.bincount(receivers, weights, minlength=count)[receivers]
+                weights = weights / sum_weights(receivers, weights, count).floats[receivers]
             places, shape = np.arange(len(receivers)), (len(receivers), count)
             result = casadi.densify(values @ weight_matrix(weights, places, receivers, shape))
     return casadi.Function("look", [own, sent, missing, t], [result])

@@ -166,6 +166,7 @@ def evaluator(
     prepared = prepared or prepare(system)
     used = [prepared.jacobians[group.kind] for group in system.groups]
     if not all(site.parameters_suffice for site in used):
+        lifted_groups(system, prepared=prepared)  # what is refused at every value is refused here
         return PointEvaluator(system, tuple(free), prepared)
     groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
     return batch_evaluator(system, free, groups, exchange)
