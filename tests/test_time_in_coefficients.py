@@ -102,7 +102,7 @@ def test_a_contact_that_a_push_decides_about_is_linearized_and_says_so(tmp_path:
     assert found.linearized
     first, _, second, *_ = str(found).splitlines()
     assert first == f"timed: {found.verdict}, linearized at its start"
-    assert second == "  The scene is not linear: this is said of small motions around its start values."
+    assert second == "  The scene is not linear: this is said of small motions around the start."
 
 
 def test_a_proof_of_a_linearization_says_of_what(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ LEAST_SHARE = 0.005  # shows as zero
 HEADINGS = ("magnitude", "shape", "times", "frequency", "damping", "moves most")
 
 LINEARIZED = ", linearized at its start"
-NEAR_THE_START = "The scene is not linear: this is said of small motions around its start values."
+NEAR_THE_START = "The scene is not linear: this is said of small motions around the start."
 
 _WORDS = {
     "stable": "Every motion dies out.",
