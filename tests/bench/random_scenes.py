@@ -36,7 +36,7 @@ from tests.bench.shapes import PARTS, Shape, draw_shape
 from tests.topologies import compiled
 
 BITS = 256  # a chain of four equal eigenvalues still keeps 19 digits
-DRAWS = 20  # of numbers for each structure
+DRAWS = 8  # of numbers for each structure
 
 # Shares of all scenes. Left open: gains drawn over decades come no nearer to a boundary than floats tell, and
 # what is on one by its structure (no damping, no coupling) balls decide; one in a thousand is a draw's luck.
