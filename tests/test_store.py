@@ -162,7 +162,7 @@ def test_an_interrupted_write_leaves_the_old_file(model: Path) -> None:
 _SAVED: dict[str, bytes] = {}
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(place=st.floats(0, 1, exclude_max=True), byte=st.integers(0, 255), cut=st.booleans())
 def test_a_byte_changed_or_an_end_cut_off_is_refused_or_harmless(
     tmp_path: Path, place: float, byte: int, cut: bool
