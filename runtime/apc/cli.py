@@ -190,7 +190,7 @@ def _compile(path: Path, target: Path, *, timings: bool) -> None:
     system = cast("CompiledSystem", values[-1])
     difference = check_frame(system)
     lap("self-check")
-    save(system, target)
+    save(system, target, sealed=True)
     lap("save")
     click.echo(compile_report(system, needs(system), target, difference))
     if timings:
