@@ -18,7 +18,8 @@ equations                   connections: where connectors meet; flatten
                             blocks: solving; jets, aliases, index: derivatives and states; structure
 functions                   casadi_writer, reached: what is written; exchange, ports: what lies beside;
                             functions
-compiled, store, cache      the compiled model; on disk; whether it still is what its texts compile to
+compiled, plain, store      the compiled model; its functions as data; on disk
+seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another
 view                        schema, listing; diagram, graphviz, marks, layers, picture, svg
 """

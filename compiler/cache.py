@@ -1,9 +1,9 @@
 """Whether a compiled model on disk is still what its texts compile to.
 
-Takes: the path of a NAME.apc. Gives: `Record`, what it was made from, and `changed`, the first of it that is
-different now.
-Guarantees: decided by content alone: no modification time, nothing unpickled, no algebra imported; a file
-that is damaged or of another format has no record.
+Takes: the path of a NAME.apc. Gives: `read_archive`, its document and arrays as they are; `Record`, what it
+was made from, and `changed`, the first of it that is different now.
+Guarantees: decided by content alone: no modification time, nothing unpickled, no algebra imported; nothing is
+unpacked that is larger than a model; a file that is damaged or of another format has no record.
 Does not: compile, or read what a model holds (see `store`).
 
 What a model was made from, by name:
@@ -29,16 +29,21 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from typing import Any
 
-FORMAT = 5  # of NAME.apc
+from apc.compiler.seal import is_sealed
+
+FORMAT = 6  # of NAME.apc
 MEMBER = "model.json"  # of the archive: structure, numbers and the digests of the other members
-LARGEST = 256 * 2**20
+SEAL = "seal"  # of the archive: who wrote the document, see `seal`
+LARGEST = 256 * 2**20  # bytes of all members
+MOST_VALUES = 2**22  # in the document: each takes up to a hundred bytes of memory
 PROGRAM = "apc"
 LIBRARIES = ("casadi", "sympy")  # a newer one may write other functions
 # What zipfile, its decompressors, json and our own reading of the document raise at what isn't theirs.
 DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError),
-    *(AttributeError, KeyError, IndexError, ValueError, TypeError, RuntimeError),
+    *(AttributeError, KeyError, IndexError, ValueError, TypeError, RuntimeError, ArithmeticError),
 )
 
 
@@ -50,23 +55,57 @@ class Record:
     texts: tuple[tuple[str, str], ...]
 
 
-def read_record(path: Path) -> Record | None:
-    """Return what a compiled model was made from; None if it isn't there, is damaged or of another format."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(info.file_size for info in archive.infolist()) > LARGEST:
-                return None
-            document = json.loads(archive.read(MEMBER))
-            if document["format"] != FORMAT:
-                return None
-            for name, digest in document["members"].items():
-                if hashlib.sha256(archive.read(name)).hexdigest() != digest:
-                    return None
-            origin = document["system"]["origin"]
-            texts = tuple((str(name), str(digest)) for name, digest in origin["texts"])
-            return Record(str(origin["topology"]), texts)
-    except (OSError, *DAMAGE):
-        return None
+@dataclass(frozen=True, slots=True)
+class Archive:
+    """A model's file, unpacked: its JSON, the bytes of its arrays by name, and whether this user wrote it."""
+
+    document: Any
+    members: dict[str, bytes]
+    sealed: bool
+
+
+class DamageError(ValueError):
+    """What is wrong with a file, for a person."""
+
+
+def read_archive(path: Path) -> Archive:
+    """Unpack a compiled model.
+
+    Raises
+    ------
+    OSError
+        The file can't be read.
+    DamageError
+        It is larger than a model can be, or a member was changed.
+    ValueError
+        Or another of DAMAGE: it is none. A document of another format is returned without members.
+    """
+    with zipfile.ZipFile(path) as archive:
+        listed = archive.infolist()
+        if any(one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for one in listed):
+            raise ValueError("it is packed otherwise")
+        if sum(one.file_size for one in listed) > LARGEST:
+            raise DamageError(f"it unpacks to more than {LARGEST >> 20} MiB")
+        text = archive.read(MEMBER)
+        if sum(map(text.count, (b"[", b"{", b","))) > MOST_VALUES:
+            raise DamageError(f"it holds more than {MOST_VALUES} values")
+        document = json.loads(text)
+        if document["format"] != FORMAT:
+            return Archive(document, {}, sealed=False)
+        members = {}
+        for name, digest in document["members"].items():
+            members[name] = archive.read(name)
+            if hashlib.sha256(members[name]).hexdigest() != digest:
+                raise DamageError(f"its member {name} was changed")
+        found = archive.read(SEAL).decode() if SEAL in archive.namelist() else ""
+        return Archive(document, members, is_sealed(text, found))
+
+
+def record_of(archive: Archive) -> Record:
+    """Return what an unpacked model was made from. Raises one of DAMAGE if it doesn't say."""
+    origin = archive.document["system"]["origin"]
+    texts = tuple((str(name), str(digest)) for name, digest in origin["texts"])
+    return Record(str(origin["topology"]), texts)
 
 
 def changed(record: Record, folder: Path) -> str:

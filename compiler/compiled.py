@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 PEERS = "peers"  # the parameter that holds the number of peers
+LARGEST_COUNT = 10**9  # of peers in one group
 
 
 @dataclass(frozen=True, slots=True)

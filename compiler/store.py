@@ -2,26 +2,32 @@
 
 Takes: `CompiledSystem`. Gives: a file, and the same system back.
 Guarantees: written whole or not at all; a damaged file, or one of another format version, is refused by name;
-every name, row and peer that one part of a model names is there in the other; nothing is unpickled, and no
-library or topology is needed to load.
-Does not: compile, or ask whether the topology has changed since (see `cache`).
+every name, row and peer that one part of a model names is there in the other. A file from anywhere is only
+data: nothing in it is run or unpickled, no library of its is loaded; it is checked in full before anything is
+made of it, and what is made is no larger than what it holds. No topology is needed to load.
+Does not: compile, or ask whether the topology has changed since (see `cache`), or whether a model is true to
+its topology.
 
-The file is a ZIP archive: `model.json` holds the structure, the numbers and the SHA-256 of every other
-member; each CasADi function is a member in CasADi's own serialization, each array one in NumPy's.
+The file is a ZIP archive: `model.json` holds the structure, the numbers, the functions as plain data (see
+`plain`) and the SHA-256 of every other member; each array is a member, its numbers in little-endian order.
+What `apc compile` wrote has a `seal` of the user's (see `seal`) on `model.json`: only then it stands for what
+the topology beside it compiles to.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
-import io
 import json
+import math
 import os
+import re
 import tempfile
 import types
 import typing
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -29,12 +35,14 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.cache import DAMAGE, FORMAT, LARGEST, MEMBER
-from apc.compiler.compiled import CompiledSystem, Graph, Kind
+from apc.compiler.cache import DAMAGE, FORMAT, MEMBER, SEAL, Archive, DamageError, read_archive
+from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.plain import PlainFunction, plain, read_function
+from apc.compiler.seal import seal
 
-# CasADi's reader can crash on text that isn't its own, so every member is checked against its digest first.
 FOREIGN = "it is not what apc compile writes"
+_RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[0-9]{1,4000})?\Z")
 
 
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
@@ -60,16 +68,18 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         raise
 
 
-def save(system: CompiledSystem, path: Path) -> None:
-    """Write a compiled model. Raises ApcError if the file can't be written."""
+def save(system: CompiledSystem, path: Path, *, sealed: bool = False) -> None:
+    """Write a compiled model, `sealed` if it was compiled now. Raises ApcError if it can't be written."""
     members: dict[str, bytes] = {}
     document = _plain(system, members)
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in members.items()}
-    text = json.dumps({"format": FORMAT, "system": document, "members": digests}, indent=1, sort_keys=True)
+    whole = {"format": FORMAT, "system": document, "members": digests}
+    text = json.dumps(whole, separators=(",", ":"), sort_keys=True).encode()
+    mark = {SEAL: seal(text).encode()} if sealed else {}
 
     def write(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in {MEMBER: text.encode(), **members}.items():
+            for name, content in {MEMBER: text, **members, **mark}.items():
                 # A fixed date: the same model gives the same bytes.
                 archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
 
@@ -82,65 +92,93 @@ def load(path: Path) -> CompiledSystem:
         if path.exists() and not path.is_file():  # a named pipe that nobody writes to would block for ever
             kind = "a folder" if path.is_dir() else "no ordinary file"
             raise ApcError(Mistake("E602", Place(str(path)), f"is {kind}, not a compiled model"))
-        with zipfile.ZipFile(path) as archive:
-            if sum(info.file_size for info in archive.infolist()) > LARGEST:
-                raise _damaged(path, f"it unpacks to more than {LARGEST >> 20} MiB")
-            document = json.loads(archive.read(MEMBER))
-            if document["format"] != FORMAT:
-                what = f"has format version {document['format']}, this program reads version {FORMAT}"
-                raise ApcError(Mistake("E603", Place(str(path)), what, hint=f"apc compile {path.stem}.yaml"))
-            members = {}
-            for name, digest in document["members"].items():
-                content = archive.read(name)
-                if hashlib.sha256(content).hexdigest() != digest:
-                    raise _damaged(path, f"its member {name} was changed")
-                members[name] = _member(name, content)
-        system = _typed(CompiledSystem, document["system"], members)
+        return unpacked(read_archive(path), path)
     except FileNotFoundError as error:
         raise ApcError(Mistake("E602", Place(str(path)), "does not exist", hint="apc compile")) from error
     except OSError as error:
         if error.strerror is None:  # a decompressor's
             raise _damaged(path, FOREIGN) from error
         raise ApcError(Mistake("E602", Place(str(path)), f"can't be read: {error.strerror}")) from error
+    except DamageError as error:
+        raise _damaged(path, str(error)) from error
     except DAMAGE as error:
         raise _damaged(path, FOREIGN) from error
+
+
+def unpacked(archive: Archive, path: Path) -> CompiledSystem:
+    """Return the system that an unpacked file holds. Raises ApcError, or one of DAMAGE, if it holds none."""
+    document = archive.document
+    if document["format"] != FORMAT:
+        what = f"has format version {_shown(document['format'])}, this program reads version {FORMAT}"
+        raise ApcError(Mistake("E603", Place(str(path)), what, hint=f"apc compile {path.stem}.yaml"))
+    system = _typed(CompiledSystem, document["system"], archive.members)
     assert isinstance(system, CompiledSystem)
     if not _is_consistent(system):
         raise _damaged(path, FOREIGN)
-    return system
+    # Only now, when its sizes are known to be those of the model, is a function built.
+    return dataclasses.replace(system, kinds=_built(system.kinds))
+
+
+def _shown(number: Any) -> str:
+    return str(number) if isinstance(number, int) and 0 <= number < 10**6 else "unknown"
 
 
 def _is_consistent(system: CompiledSystem) -> bool:
     """Return whether every name and row that one part of a model gives exists in the other."""
-    timings = {timing.name for timing in system.timings}
+    timings = {timing.name: timing.value for timing in system.timings}
     clocks = {clock.name for clock in system.clocks}
     links = {link.name for link in system.links}
     parameters = {parameter.name for parameter in system.parameters}
     groups = {group.name for group in system.groups}
-    named = [timing for clock in system.clocks for timing in (clock.period, clock.phase)]
-    named += [link.delay for link in system.links]
-    named += [pair.delay for link in system.links for pair in link.delays]
+    periods = [clock.period for clock in system.clocks]
+    delays = [clock.phase for clock in system.clocks]
+    delays += [link.delay for link in system.links]
+    delays += [pair.delay for link in system.links for pair in link.delays]
+    delays += [hold.delay for kind in system.kinds for hold in kind.holds]
     channels = [link.channel for link in system.links if link.channel is not None]
-    named += [channel.jitter for channel in channels if channel.jitter is not None]
+    delays += [channel.jitter for channel in channels if channel.jitter is not None]
     losses = [dataclasses.astuple(channel.loss) for channel in channels if channel.loss is not None]
     numbers = [*system.parameters, *(value for group in system.groups for value in group.values)]
+    named = (system.clocks, system.links, system.timings, system.parameters, system.groups)
+    duration = system.experiment.duration
     return (
         bool(system.groups)
-        and timings.issuperset(named)
+        and all(_are_different(one.name for one in listed) for listed in named)
+        and timings.keys() >= {*periods, *delays}
+        and all(timings[name] > 0 for name in periods)
+        and all(timings[name] >= 0 for name in delays)
         and all(parameters.issuperset(loss) for loss in losses)
-        and all(channel.trace is None or channel.trace.size > 0 for channel in channels)
+        and all(channel.trace is None or _is_trace(channel.trace) for channel in channels)
+        and all(channel.distribution in ("uniform", "normal", "pareto") for channel in channels)
+        and all(channel.reorder in ("newest", "all") for channel in channels)
+        and all(channel.on_loss in ("hold", "zero") for channel in channels)
         and all(link.clock in clocks for link in system.links)
         and all({pair.sender, pair.receiver} <= groups for link in system.links for pair in link.delays)
-        and all(0 <= group.kind < len(system.kinds) and group.count > 0 for group in system.groups)
-        and all(len(column.values) == group.count for group in system.groups for column in group.columns)
+        and all(0 <= group.kind < len(system.kinds) for group in system.groups)
+        and all(1 <= group.count <= LARGEST_COUNT for group in system.groups)
+        and all(column.values.shape == (group.count,) for group in system.groups for column in group.columns)
+        and all(np.isfinite(column.values).all() for group in system.groups for column in group.columns)
         and parameters.issuperset(column.name for group in system.groups for column in group.columns)
         and parameters.issuperset(value.name for group in system.groups for value in group.values)
         and all(one.exact is None or float(one.exact) == one.value for one in numbers)
         and all(_is_graph_consistent(link.graph, system.peers) for link in system.links)
-        and all(_is_kind_consistent(kind, timings, clocks, parameters) for kind in system.kinds)
+        and all(_is_kind_consistent(kind, set(timings), clocks, parameters) for kind in system.kinds)
         and links.issuperset(sending.link for kind in system.kinds for sending in kind.sends)
         and all(_is_heard(kind, system) for kind in system.kinds)
+        and (duration is None or duration > 0)
+        and 0 <= system.experiment.seed < 2**63
+        and len(system.region) <= 2
+        and all(axis.low < axis.high for axis in system.region)
     )
+
+
+def _are_different(names: Iterable[str]) -> bool:
+    listed = list(names)
+    return len(set(listed)) == len(listed)
+
+
+def _is_trace(trace: Any) -> bool:
+    return trace.ndim == 1 and trace.size > 0 and bool((trace >= 0).all())
 
 
 def _is_graph_consistent(graph: Graph, peers: int) -> bool:
@@ -150,6 +188,8 @@ def _is_graph_consistent(graph: Graph, peers: int) -> bool:
     return (
         graph.shape in ("complete", "ring", "star", "arcs")
         and (graph.shape == "arcs" or not count)
+        and graph.weights.ndim == 1
+        and bool(np.isfinite(graph.weights).all())
         and len(pairs) == count
         and bool(((pairs >= 0) & (pairs < peers)).all())
     )
@@ -175,7 +215,7 @@ def _is_heard(kind: Kind, system: CompiledSystem) -> bool:
         and 0 <= receive.channel < min(rows[receive.link])
         and (
             receive.edge is None
-            or _sizes(receive.edge)
+            or receive.edge.sizes
             == ([n_x, n_u, len(partition.memories), max(rows[receive.link]), n_p, 1], [1])
         )
         for partition in kind.clocks
@@ -190,6 +230,16 @@ def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], paramet
     parameters_of = set(kind.parameters)  # what starts is looked up among them
     return (
         parameters.issuperset(kind.parameters)
+        and _are_different(kind.parameters)
+        and _are_different(state.name for state in kind.states)
+        and _are_different(partition.clock for partition in kind.clocks)
+        and _are_different(sending.link for sending in kind.sends)
+        and all(len(sending.units) == len(sending.channels) for sending in kind.sends)
+        and all(
+            receive.operator in ("mean", "sum", "max", "min", "count")
+            for partition in kind.clocks
+            for receive in partition.receives
+        )
         and parameters_of.issuperset(state.start for state in kind.states)
         and partitions.keys() <= clocks
         and all(len(partition.units) == len(partition.outputs) for partition in kind.clocks)
@@ -198,29 +248,20 @@ def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], paramet
         and all(
             0 <= memory < len(partition.outputs) for partition in kind.clocks for memory in partition.memories
         )
-        and (
-            kind.ports is None or _sizes(kind.ports.port) == ([n_x, n_u, n_p, 1], [2 * len(kind.ports.parts)])
-        )
+        and (kind.ports is None or kind.ports.port.sizes == ([n_x, n_u, n_p, 1], [2 * len(kind.ports.parts)]))
         and all(hold.delay in timings and hold.clock in partitions for hold in kind.holds)
         and all(0 <= hold.output < len(partitions[hold.clock].outputs) for hold in kind.holds)
-        and _sizes(kind.derivative) == ([n_x, n_u, n_p, 1], [n_x])
+        and kind.derivative.sizes == ([n_x, n_u, n_p, 1], [n_x])
         and all(
-            _sizes(partition.tick)
+            partition.tick.sizes
             == (
                 [n_x, n_u, len(partition.memories), len(partition.receives), n_p, 1],
                 [len(partition.outputs)],
             )
             for partition in kind.clocks
         )
-        and all(
-            _sizes(sending.send) == ([n_x, n_u, n_p, 1], [len(sending.channels)]) for sending in kind.sends
-        )
+        and all(sending.send.sizes == ([n_x, n_u, n_p, 1], [len(sending.channels)]) for sending in kind.sends)
     )
-
-
-def _sizes(function: Any) -> tuple[list[int], list[int]]:
-    inputs = [int(function.numel_in(i)) for i in range(function.n_in())]
-    return inputs, [int(function.numel_out(i)) for i in range(function.n_out())]
 
 
 def _damaged(path: Path, why: str) -> ApcError:
@@ -228,15 +269,8 @@ def _damaged(path: Path, why: str) -> ApcError:
     return ApcError(mistake)
 
 
-def _member(name: str, content: bytes) -> Any:
-    """Return the CasADi function or the array that a member holds."""
-    if name.endswith(".npy"):
-        return np.load(io.BytesIO(content), allow_pickle=False)
-    return casadi.Function.deserialize(content.decode())
-
-
 def _plain(value: Any, members: dict[str, bytes]) -> Any:
-    """Return dataclasses as dictionaries, fractions as texts, functions and arrays as names of members."""
+    """Return dataclasses as dictionaries, fractions as texts, functions as data, arrays by their members."""
     if dataclasses.is_dataclass(value):
         return {f.name: _plain(getattr(value, f.name), members) for f in dataclasses.fields(value)}
     if isinstance(value, tuple):
@@ -244,26 +278,39 @@ def _plain(value: Any, members: dict[str, bytes]) -> Any:
     if isinstance(value, Fraction):
         return str(value)
     if isinstance(value, casadi.Function):
-        name = f"function{len(members)}.casadi"
-        members[name] = value.serialize().encode()
-        return name
+        return plain(value).document()
     if isinstance(value, np.ndarray):
-        name = f"array{len(members)}.npy"
-        buffer = io.BytesIO()
-        np.save(buffer, value, allow_pickle=False)
-        members[name] = buffer.getvalue()
-        return name
+        name = f"array{len(members)}"
+        members[name] = value.astype(value.dtype.newbyteorder("<")).tobytes()
+        return {"member": name, "shape": list(value.shape)}
     return value
 
 
-def _typed(wanted: Any, value: Any, members: dict[str, Any]) -> Any:
-    """Build a value of the wanted type from its plain form."""
+def _built(value: Any) -> Any:
+    """Return a value with its functions built."""
+    if isinstance(value, PlainFunction):
+        return value.build()
+    if isinstance(value, tuple):
+        return tuple(_built(item) for item in value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.replace(
+            value, **{f.name: _built(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        )
+    return value
+
+
+@functools.cache
+def _hints(wanted: type) -> dict[str, Any]:
+    return typing.get_type_hints(wanted)
+
+
+def _typed(wanted: Any, value: Any, members: dict[str, bytes]) -> Any:
+    """Build a value of the wanted type from its plain form; functions stay data."""
     origin = typing.get_origin(wanted)
     if dataclasses.is_dataclass(wanted) and isinstance(wanted, type):
-        hints = typing.get_type_hints(wanted)
-        return wanted(
-            **{f.name: _typed(hints[f.name], value[f.name], members) for f in dataclasses.fields(wanted)}
-        )
+        if not isinstance(value, dict) or value.keys() != _hints(wanted).keys():
+            raise TypeError(f"expected the fields of {wanted}")
+        return wanted(**{name: _typed(hint, value[name], members) for name, hint in _hints(wanted).items()})
     if origin is tuple:
         if not isinstance(value, list):
             raise TypeError(f"expected a list, got {value!r}")
@@ -274,12 +321,37 @@ def _typed(wanted: Any, value: Any, members: dict[str, Any]) -> Any:
     if origin in (typing.Union, types.UnionType):
         inner = [a for a in typing.get_args(wanted) if a is not type(None)]
         return None if value is None else _typed(inner[0], value, members)
-    if wanted is Fraction:
-        return Fraction(value)
-    if wanted is Any or origin is np.ndarray:
-        return members[value]
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, wanted):
+    if origin is np.ndarray:
+        return _array(typing.get_args(typing.get_args(wanted)[1])[0], value, members)
+    if wanted is Any:
+        return read_function(value)
+    if wanted is float and type(value) in (int, float):
+        return _finite(float(value))
+    if type(value) is not (str if wanted is Fraction else wanted):  # True is no whole number
         raise TypeError(f"expected {wanted}, got {value!r}")
+    if wanted is Fraction:
+        return _rational(value)
+    if wanted is str and not value.isprintable():  # it is shown in a terminal
+        raise ValueError("expected a line of text")
     return value
+
+
+def _finite(number: float) -> float:
+    if not math.isfinite(number):
+        raise ValueError("expected a finite number")
+    return number
+
+
+def _rational(text: str) -> Fraction:
+    if not _RATIONAL.match(text) or text.partition("/")[2].strip("0") == "" != text.partition("/")[2]:
+        raise ValueError("expected a rational number")
+    return Fraction(text)
+
+
+def _array(number: type, value: Any, members: dict[str, bytes]) -> Any:
+    """Return the array of a member, of the shape said."""
+    shape = value["shape"]
+    if not (0 < len(shape) <= 2 and all(type(one) is int and 0 <= one < 2**31 for one in shape)):
+        raise ValueError("expected the shape of an array")
+    kind = np.dtype(number)
+    return np.frombuffer(members[value["member"]], kind.newbyteorder("<")).astype(kind).reshape(shape)

@@ -11,6 +11,7 @@ import importlib
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.distribution import install_line
 
 
 def need(module: str, extra: str) -> Any:
@@ -19,4 +20,4 @@ def need(module: str, extra: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         what = f"{module} is not installed"
-        raise ApcError(Mistake("E875", Place("apc"), what, hint=f"pip install 'apc[{extra}]'")) from error
+        raise ApcError(Mistake("E875", Place("apc"), what, hint=install_line(extra))) from error

@@ -1,18 +1,19 @@
 """One thread for the linear algebra of small matrices.
 
-Takes: nothing. Gives: the context manager `single_threaded`; `start_single_threaded`.
-Guarantees: BLAS and OpenMP pools are back as they were on leaving.
-Does not: limit threads of our own, or libraries loaded after its first use.
+Takes: nothing. Gives: the context manager `single_threaded`; `load_pool`; `start_single_threaded`.
+Guarantees: BLAS and OpenMP pools are back as they were on leaving, whenever they were loaded.
+Does not: limit threads of our own.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped] # it ships no types
@@ -32,8 +33,25 @@ def single_threaded() -> Iterator[None]:
     if _pinned():
         yield
         return
-    with _pools().limit(limits=1):
-        yield
+    with ExitStack() as limits:
+        limits.enter_context(_pools(len(sys.modules)).limit(limits=1))
+        _entered.append(limits)
+        try:
+            yield
+        finally:
+            _entered.remove(limits)
+
+
+def load_pool(module: str) -> Any:
+    """Import what brings a pool of its own, as SciPy's linear algebra: `single_threaded` limits it too."""
+    new = module not in sys.modules
+    found = importlib.import_module(module)
+    if new and _entered:  # the outermost keeps the limit until all have left
+        _entered[0].enter_context(_pools(len(sys.modules)).limit(limits=1))
+    return found
+
+
+_entered: list[ExitStack] = []  # what `single_threaded` is in now, outermost first
 
 
 def start_single_threaded() -> None:
@@ -57,10 +75,10 @@ def _pinned() -> bool:
 
 
 @lru_cache(maxsize=1)
-def _pools() -> ThreadpoolController:
-    """Find the loaded pools, once: the search takes longer than a small analysis.
+def _pools(_modules: int) -> ThreadpoolController:
+    """Find the loaded pools, once while the number of modules is the same: it takes longer than an analysis.
 
-    A library loaded after the first call is not seen; every stage imports its own at the top.
+    A pool comes with a module that is imported.
     """
     from threadpoolctl import ThreadpoolController  # not needed where there is one thread already
 

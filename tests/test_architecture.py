@@ -15,7 +15,7 @@ from tests.topologies import AVERAGE, ROOT
 
 # Folder by folder, and in each its modules, earliest first: each may import only those before it.
 HOUSE = (
-    ("apc.compiler", "errors words multiples weights compiled cache"),
+    ("apc.compiler", "errors words multiples weights compiled plain seal cache"),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
         "apc.compiler.language",
@@ -39,7 +39,7 @@ HOUSE = (
     ("apc.compiler.functions", "casadi_writer reached exchange ports functions"),
     ("apc.compiler", "pipeline store"),
     ("apc.compiler.view", "schema listing diagram graphviz marks layers picture svg"),
-    ("apc.runtime", "threads trouble optional given"),
+    ("apc.runtime", "threads trouble distribution suffixes optional given"),
     (
         "apc.runtime.frame",
         """
@@ -258,7 +258,7 @@ def test_the_wheel_brings_one_name_to_site_packages_and_every_model(tmp_path: Pa
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
     tops = {name.split("/")[0] for name in names}
-    assert {top for top in tops if not re.fullmatch(r"apc-[\d.]+\.dist-info", top)} == {"apc"}
+    assert {top for top in tops if not re.fullmatch(r"apc_haptics-[\d.]+\.dist-info", top)} == {"apc"}
     packed = {name.removeprefix("apc/models/") for name in names if name.endswith(".yaml")}
     here = {str(path.relative_to(ROOT / "models")) for path in (ROOT / "models").rglob("*.yaml")}
     assert packed == here

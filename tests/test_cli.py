@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import pytest
 
+import apc
 from apc.__main__ import run
 from tests.topologies import AVERAGE, MESH
 
@@ -230,9 +231,7 @@ def test_help_fits_a_terminal_and_ends_with_a_full_stop(cli: Cli, words: tuple[s
 
 
 def test_version_is_told(cli: Cli) -> None:
-    from importlib.metadata import version
-
-    assert cli("--version") == Ran(0, f"apc {version('apc')}\n", "")
+    assert cli("--version") == Ran(0, f"apc {apc.__version__}\n", "")
 
 
 def test_the_module_runs_like_the_command(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """`expression`: the grammar, its bounds, its messages, the round trip and exact evaluation."""
 
 import math
-import time
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -275,13 +274,13 @@ def _call(name: str, argument: st.SearchStrategy[Expr]) -> st.SearchStrategy[Exp
     return arguments.map(lambda found: Call(name, tuple(found)))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(_numbers())
 def test_printing_and_parsing_give_the_same_tree(tree: Expr) -> None:
     assert parse(format_expression(tree)) == tree
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.one_of(st.text(max_size=30), st.text("ab.1e()+-*/^<=, notif[]_", max_size=40)))
 def test_any_text_is_parsed_or_refused_and_nothing_else(text: str) -> None:
     for parser in (parse_expression, parse_equation):
@@ -362,10 +361,8 @@ def test_what_has_no_value_is_refused_at_its_place(text: str, message: str) -> N
 
 
 @pytest.mark.parametrize("text", ["((9^99)^99)^99", "(((0.1^100)^100)^100)^100", "*".join(["9^100"] * 90)])
-def test_a_tower_of_powers_ends_at_once(text: str) -> None:
-    start = time.perf_counter()
+def test_a_tower_of_powers_ends(text: str) -> None:
     try:
         assert value(text) == 0  # what is too small for a float is zero
     except ApcError as error:
         assert "E331" in str(error)
-    assert time.perf_counter() - start < 0.5

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import casadi
 import pytest
 
+from apc.compiler import seal
 from apc.runtime.simulate import native as module
-from apc.runtime.simulate.native import cache_folder, compiler, native
+from apc.runtime.simulate.native import compiler, native
+from tests.topologies import ROOT
 
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(module, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "cache")
     return tmp_path / "cache"
 
 
@@ -38,10 +45,77 @@ def test_machine_code_gives_the_same_numbers_to_the_last_bit(cache: Path) -> Non
 @needs_compiler
 def test_what_was_compiled_once_is_found_again(cache: Path) -> None:
     native(functions())
-    [library] = cache.iterdir()
-    before = library.stat().st_mtime_ns
+    before = {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in cache.iterdir()}
+    assert sorted(Path(name).suffix for name in before) == ["", ".seal", ".so"]
     native(functions())
-    assert [one.stat().st_mtime_ns for one in cache.iterdir()] == [before]
+    assert before == {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in cache.iterdir()}
+
+
+def results(listed: Sequence[casadi.Function]) -> list[str]:
+    return [str(listed[0].call([[0.1, 0.2], 0.3])), str(listed[1].call([[2, 3]]))]
+
+
+@needs_compiler
+@pytest.mark.parametrize("part", range(20))
+def test_a_library_with_a_bit_turned_is_compiled_again(cache: Path, part: int) -> None:
+    native(functions())
+    [library] = cache.glob("*.so")
+    # Written anew under its name: a library that this process has loaded stays what it is.
+    whole = library.read_bytes()
+    data = bytearray(whole)
+    data[len(data) * part // 20] ^= 1 << part % 8
+    library.unlink()
+    library.write_bytes(data)
+    ran = subprocess.run(
+        [sys.executable, "-c", AGAIN, str(cache)], capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.strip() == str(results(functions()))
+    assert library.read_bytes() == whole
+
+
+AGAIN = """
+import sys
+from pathlib import Path
+from apc.compiler import seal
+from tests.test_native import functions, native, results
+seal._folder = lambda: Path(sys.argv[1])
+built = native(functions())
+assert built[0].class_name() == "External"
+print(results(built))
+"""
+
+
+@needs_compiler
+def test_a_library_that_somebody_else_put_there_is_not_loaded(cache: Path) -> None:
+    native(functions())
+    [library], [mark] = cache.glob("*.so"), cache.glob("*.seal")
+    whole = library.read_bytes()
+    library.unlink()
+    library.write_bytes(b"another library")
+    mark.write_text(hashlib.sha256(b"another library").hexdigest(), encoding="ascii")
+    assert results(native(functions())) == results(functions())
+    assert library.read_bytes() == whole
+
+
+@needs_compiler
+def test_a_folder_of_another_user_is_not_used(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache.mkdir(mode=0o700)
+    mine = os.geteuid()
+    monkeypatch.setattr(os, "geteuid", lambda: mine + 1)
+    listed = functions()
+    assert all(one is two for one, two in zip(native(listed), listed, strict=True))
+    assert list(cache.iterdir()) == []
+
+
+@needs_compiler
+@pytest.mark.parametrize("above", [False, True])
+def test_a_folder_that_others_can_write_to_is_not_used(cache: Path, above: bool) -> None:
+    cache.mkdir(mode=0o700)
+    (cache.parent if above else cache).chmod(0o777)
+    listed = functions()
+    assert all(one is two for one, two in zip(native(listed), listed, strict=True))
+    assert list(cache.iterdir()) == []
 
 
 def test_without_a_compiler_the_functions_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,17 +127,9 @@ def test_without_a_compiler_the_functions_stay_as_they_are(monkeypatch: pytest.M
 @needs_compiler
 def test_a_folder_that_cant_be_written_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
-    monkeypatch.setattr(module, "cache_folder", lambda: tmp_path / "file" / "cache")
+    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "file" / "cache")
     listed = functions()
     assert all(one is two for one, two in zip(native(listed), listed, strict=True))
-
-
-def test_the_cache_is_where_the_system_keeps_such_things(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert cache_folder() == Path("/somewhere/apc")
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert cache_folder() == Path.home() / ".cache" / "apc"
 
 
 @needs_compiler

@@ -37,7 +37,7 @@ def test_a_bar_is_shown_once_the_work_takes_long(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with progress_bar("sweep", "points") as show:
+    with progress_bar("sweep", "points", after=float("inf")) as show:
         show(1, 4)
     assert capsys.readouterr().err == ""
     with progress_bar("sweep", "points", after=0.0) as show:

@@ -157,7 +157,7 @@ def _compare(found: np.ndarray, expected: np.ndarray, drawn: Drawn) -> None:
 QUIET = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large]
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=QUIET)
+@settings(max_examples=25, derandomize=True, suppress_health_check=QUIET)
 @given(scenes())
 def test_any_scene_has_the_spectrum_of_its_peers_stepped_one_by_one(drawn: Drawn) -> None:
     check(drawn)
@@ -168,7 +168,7 @@ def check_scenes(count: int) -> None:
 
     @settings(
         max_examples=count,
-        deadline=None,
+        deadline=None,  # run without pytest too
         database=None,
         suppress_health_check=QUIET,
         phases=[Phase.generate, Phase.shrink],

@@ -142,6 +142,15 @@ def test_the_command_prints_it_and_writes_it(tmp_path: Path, capsys: pytest.Capt
     assert json.loads(path.read_text(encoding="utf-8")) == SCHEMA
 
 
+def test_a_schema_is_written_as_json_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "schema.yaml"
+    assert run(["schema", "--out", str(path)]) == 1
+    assert capsys.readouterr().err == (
+        f"{path}: E878 the suffix of --out wants .json, got .yaml. Write: schema.json\n"
+    )
+    assert not path.exists()
+
+
 def test_the_file_in_the_package_is_current(tmp_path: Path) -> None:
     path = tmp_path / "now.json"
     assert run(["schema", "--out", str(path)]) == 0

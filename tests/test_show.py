@@ -294,6 +294,29 @@ def test_the_file_says_the_format(
     assert out.read_text(encoding="utf-8").startswith(start)
 
 
+@pytest.mark.parametrize(
+    ("words", "name", "wanted"),
+    [
+        ((), "scene.pdf", "one of .txt, .json, .dot, .gv, .svg, got .pdf. Write: scene.txt"),
+        ((), "scene", "one of .txt, .json, .dot, .gv, .svg, got none. Write: scene.txt"),
+        (("--format", "svg"), "scene.png", ".svg, got .png. Write: scene.svg"),
+        (("--format", "dot"), "scene.svg", "one of .dot, .gv, got .svg. Write: scene.dot"),
+    ],
+)
+def test_no_file_is_written_as_what_its_name_does_not_say(
+    words: tuple[str, ...], name: str, wanted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / name
+    assert run(["show", str(AVERAGE_FILE), *words, "--out", str(out)]) == 1
+    assert capsys.readouterr().err == f"{out}: E878 the suffix of --out wants {wanted}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_suffix_in_capitals_is_the_same_suffix(tmp_path: Path) -> None:
+    assert run(["show", str(AVERAGE_FILE), "--out", str(tmp_path / "SCENE.SVG")]) == 0
+    assert (tmp_path / "SCENE.SVG").read_text(encoding="utf-8").startswith("<svg")
+
+
 def test_the_command_prints_what_the_function_returns(capsys: pytest.CaptureFixture[str]) -> None:
     for form in ("text", "json", "dot", "svg"):
         assert run(["show", str(AVERAGE_FILE), "--format", form]) == 0

@@ -22,7 +22,7 @@ from apc.runtime.analysis.analysis import Analysis
 from apc.runtime.sweep import store as sweep_store
 from apc.runtime.sweep.sweep import Sweep, sweep
 from apc.runtime.sweep.work import Work, compute_part, model_bytes
-from tests.sweeping import CHEAP, alive, children, parts, start, wait_for_parts
+from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
 from tests.topologies import AVERAGE, ONE_MASS, compiled, told
 
 MODEL = compiled(CHEAP)
@@ -184,24 +184,22 @@ def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) ->
     before: dict[str, tuple[int, int]] = {}
     for kill in range(3):
         jobs = "1" if kill else "2"  # it may change from run to run
-        running = start(folder, "mass.apc", *MANY, "--out", "r.csv", "--jobs", jobs)
+        running = start_waiting(folder, 3 + kill, "mass.apc", *MANY, "--out", "r.csv", "--jobs", jobs)
         wait_for_parts(running, target, len(before) + 3 + kill)
         workers = children(running.pid)
         running.kill()
         running.communicate()
         now = parts(target)
         assert before.items() <= now.items(), "a finished part was computed or written again"
-        assert 0 < len(now) < 32
+        assert len(now) == len(before) + 3 + kill
         before = now
-        deadline = time.monotonic() + 10
-        while any(alive(pid) for pid in workers):
-            assert time.monotonic() < deadline, "a worker outlives the process that started it"
+        while any(alive(pid) for pid in workers):  # for ever, if one outlives the process that started it
             time.sleep(0.01)
     last = start(folder, "mass.apc", *MANY, "--out", "r.csv", "--jobs", "1")
-    out, err = last.communicate(timeout=60)
+    out, err = last.communicate()
     assert (last.returncode, err) == (0, "")
     assert f"note: {64 * len(before):,} points were there already" in out
-    assert left_alone.communicate(timeout=60)[1] == ""
+    assert left_alone.communicate()[1] == ""
     assert target.read_bytes() == (folder / "alone.csv").read_bytes()
     assert len(target.read_text(encoding="utf-8").splitlines()) == 2001
     assert not (folder / "r.csv.parts").exists()
@@ -209,18 +207,18 @@ def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) ->
 
 def test_an_interrupt_ends_with_what_is_done_and_says_how_to_go_on(folder: Path) -> None:
     target = folder / "r.csv"
-    running = start(folder, "mass.apc", *MANY, "--out", "r.csv", "--jobs", "2")
+    running = start_waiting(folder, 2, "mass.apc", *MANY, "--out", "r.csv", "--jobs", "2")
     wait_for_parts(running, target, 2)
     running.send_signal(signal.SIGINT)
-    out, err = running.communicate(timeout=30)
+    out, err = running.communicate()
     assert (running.returncode, out) == (130, "")
     first, second = (line for line in err.splitlines() if line)
     assert first.endswith(" of 2,000 points are kept in r.csv.parts; the same command takes up from there")
     assert second == "stopped"
     assert not target.exists()
-    assert 2 <= len(parts(target)) < 32
+    assert len(parts(target)) == 2
     other = start(folder, "mass.apc", *MANY[:2], "--out", "r.csv")
-    out, err = other.communicate(timeout=30)
+    out, err = other.communicate()
     assert (other.returncode, out) == (1, "")
     assert "E885 holds unfinished work of another sweep: different are its points, over." in err
 
@@ -236,7 +234,7 @@ def test_a_terminal_sees_progress_and_a_file_does_not(folder: Path) -> None:
     os.close(master)
     assert b"200 of 200 points" in seen
     quiet = start(folder, "wall.apc", *WORDS, "--out", "s.csv", "--jobs", "1", "--json")
-    out, err = quiet.communicate(timeout=30)
+    out, err = quiet.communicate()
     assert err == ""
     document = json.loads(out)
     assert (document["points"], document["out"]) == (200, "s.csv")

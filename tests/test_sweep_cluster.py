@@ -16,10 +16,16 @@ from apc.runtime.sweep.sweep import sweep
 from tests.sweeping import CHEAP, parts
 from tests.topologies import compiled, told
 
-distributed = pytest.importorskip("distributed", reason="Dask's distributed is not installed: apc[cluster]")
+distributed = pytest.importorskip("distributed", reason="Dask's distributed is not installed: '.[cluster]'")
 
 MODEL = compiled(CHEAP)
 OVER = {"it.stiffness": "10 N/m:9000 N/m:100", "it.delay": "0,1,1.5 ms"}
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for those who are there as long as it takes them."""
+    monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 3600)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +104,10 @@ def test_a_transport_nobody_knows_is_told(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 1)
+    def none_comes(*_: object, **__: object) -> None:
+        raise TimeoutError
+
+    monkeypatch.setattr(distributed.Client, "wait_for_workers", none_comes)
     with distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=":0") as empty:
         assert told(lambda: sweep(MODEL, OVER, cluster=empty.scheduler_address)) == [
             f"{empty.scheduler_address}: E888 the cluster there has no workers."
@@ -141,5 +150,5 @@ def test_a_missing_distributed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert told(lambda: sweep(MODEL, OVER, cluster="tcp://host:1")) == [
         "tcp://host:1: E888 a cluster needs Dask's distributed, here and on its workers. "
-        "Write: pip install 'apc[cluster]'"
+        "Write: pip install '.[cluster]'  (in the folder of apc's own pyproject.toml)"
     ]

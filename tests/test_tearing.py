@@ -52,14 +52,16 @@ def values(text: str, unknowns: str, **numbers: float) -> dict[str, float]:
             definitions |= {symbol(name): step for name in step.unknowns}
         else:
             definitions[symbol(step[0])] = step[1]
-    writer = _writer({symbol(name): casadi.MX(value) for name, value in numbers.items()}, definitions)
-    written = casadi.vertcat(*(writer.write(symbol(name)) for name in unknowns.split()))
-    found = np.asarray(casadi.Function("f", [], [written])()["o0"]).ravel()
+    given = casadi.SX.sym("given", len(numbers))
+    writer = _writer({symbol(name): given[place] for place, name in enumerate(numbers)}, definitions)
+    written = writer.column(writer.write(symbol(name)) for name in unknowns.split())
+    function = writer.function("f", {"given": given}, "found", written, loops=True)
+    found = np.asarray(function(list(numbers.values()))).ravel()
     return dict(zip(unknowns.split(), map(float, found), strict=True))
 
 
 def _writer(known: dict[str, Any], definitions: dict[str, Any]) -> Writer:
-    return Writer(casadi.MX, known, definitions, {}, {})
+    return Writer(known, definitions, {}, {})
 
 
 @pytest.mark.parametrize("x", [-20.0, -1.0, 0.0, 0.3, 2.0, 1e6])
@@ -173,9 +175,10 @@ def test_components_come_after_what_they_need() -> None:
 def test_the_derivative_of_a_loop_is_that_of_the_implicit_function() -> None:
     [block], _ = solve("y + y^3 = x", "y")
     assert isinstance(block, ImplicitBlock)
-    x = casadi.MX.sym("x")
-    y = _writer({symbol("x"): x}, {symbol("y"): block}).write(symbol("y"))
-    slope = casadi.Function("slope", [x], [casadi.jacobian(y, x)])
+    given, x = casadi.SX.sym("x"), casadi.MX.sym("x")
+    writer = _writer({symbol("x"): given}, {symbol("y"): block})
+    function = writer.function("f", {"x": given}, "y", writer.write(symbol("y")), loops=True)
+    slope = casadi.Function("slope", [x], [casadi.jacobian(function(x), x)])
     assert float(slope(10.0)) == pytest.approx(1 / (1 + 3 * 4.0), rel=1e-12)
     assert Name(("y",)) == parse_equation("y = 1", PLACE).left
 
@@ -184,16 +187,17 @@ def test_a_kind_with_a_loop_is_linearized_through_it() -> None:
     # dx/dt = -y where y + y³ = x: at x = 10, y = 2, the slope is -1/(1 + 3·4).
     [block], _ = solve("y + y^3 = x", "y")
     assert isinstance(block, ImplicitBlock)
-    x, u, p, t = (casadi.MX.sym(name, size) for name, size in (("x", 1), ("u", 0), ("p", 1), ("t", 1)))
-    y = _writer({symbol("x"): x}, {symbol("y"): block}).write(symbol("y"))
+    inputs = {name: casadi.SX.sym(name, size) for name, size in (("x", 1), ("u", 0), ("p", 1), ("t", 1))}
+    writer = _writer({symbol("x"): inputs["x"]}, {symbol("y"): block})
+    y = writer.write(symbol("y"))
     kind = Kind(
         "loop",
         (State("x", "m", "x"),),
         (),
         ("x",),
-        casadi.Function("derivative", [x, u, p, t], [-y]),
+        writer.function("derivative", inputs, "dx", -y, loops=True),
         (),
-        (SendPartition("lan", ("y",), ("m",), casadi.Function("send", [x, u, p, t], [y])),),
+        (SendPartition("lan", ("y",), ("m",), writer.function("send", inputs, "s", y, loops=True)),),
     )
     built = jacobians(kind)
     site = linearize(built, np.array([10.0]))

@@ -171,7 +171,7 @@ def test_a_dimension_prints_as_the_unit_an_engineer_writes(text: str) -> None:
     assert format_dimension(parse_unit(text, HERE).dimension) == text
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.dictionaries(st.sampled_from(["A", "K", "cd", "kg", "m", "mol", "s"]), st.integers(-9, 9).filter(bool))
 )
@@ -188,13 +188,13 @@ def test_an_si_value_prints_with_its_unit() -> None:
     assert format_si(2.5, DIMENSIONLESS) == "2.5"
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.fractions(-1000, 1000, max_denominator=1000))
 def test_every_rational_survives(value: Fraction) -> None:
     assert parse_quantity(f"{value.numerator}/{value.denominator} N", HERE).value == value
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.one_of(st.text(max_size=20), st.text("0123456789eE.,+-*/^() Nmskg²°%", max_size=30)))
 def test_any_text_is_a_quantity_or_refused_and_nothing_else(text: str) -> None:
     for parser in (parse_quantity, parse_unit):

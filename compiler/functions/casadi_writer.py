@@ -2,7 +2,8 @@
 
 Takes: symbols whose values are known, and what defines the others. Gives: `Writer`, `Definition`.
 Guarantees: written in the order in which things depend on one another; a chain of definitions may be as long
-as it likes; a nonlinear loop is solved by Newton's iteration inside the expression.
+as it likes; what a nonlinear loop finds is a symbol, and a function that needs it solves the loop by
+Newton's iteration first.
 Does not: choose what is written (see `functions`).
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import casadi
@@ -18,11 +20,9 @@ import sympy
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.symbolic import symbol
 from apc.compiler.language.recordings import TimeTable
+from apc.compiler.plain import Loop, composed
 
 Definition: TypeAlias = sympy.Expr | ImplicitBlock
-# CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
-# afterwards and squares the error: the rest is rounding. A bound on the residual would depend on its scale.
-NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100}
 _EXTREMES = {"min": casadi.fmin, "max": casadi.fmax}  # of two values each
 _CASADI: dict[str, Callable[..., Any]] = {
     "abs": casadi.fabs,
@@ -47,39 +47,82 @@ _CASADI: dict[str, Callable[..., Any]] = {
 }
 
 
-class Writer:
-    """Translates SymPy expressions to CasADi, each definition once.
+@dataclass(frozen=True, slots=True)
+class _Torn:
+    """A loop met while writing: its unknowns `z` (n,), where they begin, its residual of z and `q` (m,)."""
 
-    `type_` is casadi.SX, or casadi.MX where a definition is a loop; `starts` gives the start values of the
-    unknowns that have one, where a loop's iteration begins.
+    z: Any
+    begin: Any
+    q: Any
+    residual: Any  # casadi.Function
+
+
+class Writer:
+    """Translates SymPy expressions to CasADi's SX, each definition once.
+
+    `starts` gives the start values of the unknowns that have one, where a loop's iteration begins.
     """
 
     def __init__(
         self,
-        type_: Any,
         known: Mapping[sympy.Symbol, Any],
         definitions: Mapping[sympy.Symbol, Definition],
         tables: Mapping[str, TimeTable],
         starts: Mapping[str, Any],
     ) -> None:
-        self.type_ = type_
         self.known = dict(known)
-        self.definitions = definitions
+        self.definitions = dict(definitions)
         self.tables = tables
         self.starts = starts
+        self.torn: list[_Torn] = []
 
     def column(self, values: Iterable[Any]) -> Any:
         """Return a dense column of scalars, (0, 1) when there are none."""
         listed = list(values)
-        return casadi.densify(casadi.vertcat(*listed)) if listed else self.type_(0, 1)
+        return casadi.densify(casadi.vertcat(*listed)) if listed else casadi.SX(0, 1)
 
     def extended(
         self, known: Mapping[sympy.Symbol, Any], definitions: Mapping[sympy.Symbol, Definition]
     ) -> Writer:
         """Return a writer that knows more."""
-        return Writer(
-            self.type_, {**self.known, **known}, {**self.definitions, **definitions}, self.tables, self.starts
+        more = Writer({**self.known, **known}, {**self.definitions, **definitions}, self.tables, self.starts)
+        more.torn = list(self.torn)
+        return more
+
+    def function(self, name: str, inputs: Mapping[str, Any], output: str, value: Any, *, loops: bool) -> Any:
+        """Return the CasADi function of some columns that gives a value written in them.
+
+        An SX function, unless it is one of a kind with `loops`: then an MX function that calls SX functions,
+        with Newton's iteration for each loop that the value needs.
+        """
+        words, columns = list(inputs), list(inputs.values())
+        if not loops:
+            return casadi.Function(name, columns, [value], words, [output])
+        needed: list[_Torn] = []
+        wanted = value
+        for one in reversed(self.torn):
+            if casadi.depends_on(wanted, one.z):
+                needed.insert(0, one)
+                wanted = casadi.vertcat(wanted, one.begin, one.q)
+        solved = []
+        for place, one in enumerate(needed):
+            found = [before.z for before in needed[:place]]
+            given = casadi.Function(
+                f"given{place}",
+                [*columns, *found],
+                [one.begin, one.q],
+                [*words, *(f"z{k}" for k in range(place))],
+                ["begin", "q"],
+            )
+            solved.append(Loop(given, one.residual))
+        result = casadi.Function(
+            "result",
+            [*columns, *(one.z for one in needed)],
+            [value],
+            [*words, *(f"z{k}" for k in range(len(needed)))],
+            [output],
         )
+        return composed(name, solved, result, words)
 
     def write(self, wanted: sympy.Symbol) -> Any:
         """Return the value of a symbol, writing what it depends on first.
@@ -98,29 +141,32 @@ class Writer:
             else:
                 definition = self.definitions[s]
                 if isinstance(definition, ImplicitBlock):
-                    self.known |= self._solve(definition)
+                    self._tear(definition)
                 else:
                     self.known[s] = self._build(definition)
         return self.known[wanted]
 
-    def _solve(self, loop: ImplicitBlock) -> dict[sympy.Symbol, Any]:
-        """Return the unknowns of a loop: those torn by Newton's iteration, the others from them."""
+    def _tear(self, loop: ImplicitBlock) -> None:
+        """Make known the unknowns of a loop that are torn; the others follow from them."""
         outer = self._needed(loop)
         own = {symbol(name): casadi.SX.sym(name) for name in loop.tearing}
         given = {s: casadi.SX.sym(s.name) for s in outer}
         others = {symbol(name): expression for name, expression in loop.inner}
-        inside = Writer(casadi.SX, {**own, **given}, others, self.tables, {})
+        inside = Writer({**own, **given}, others, self.tables, {})
         z, q = inside.column(own.values()), inside.column(given.values())
         residual = inside.column(inside.translate(expression) for expression in loop.residuals)
-        solver = casadi.rootfinder("loop", "newton", {"x": z, "p": q, "g": residual}, NEWTON)
-        last_step = casadi.solve(casadi.jacobian(residual, z), residual)
-        polish = casadi.Function("polish", [z, q], [z - last_step])
-        rest = casadi.Function("rest", [z, q], [inside.column(inside.write(s) for s in others)])
-        guess = self.column(self.starts.get(name, self.type_(0)) for name in loop.tearing)
-        values = self.column(self.known[s] for s in outer)
-        torn = polish(solver(x0=guess, p=values)["x"], values)
-        found = rest(torn, values)
-        return {s: torn[i] for i, s in enumerate(own)} | {s: found[i] for i, s in enumerate(others)}
+        begin = self.column(self.starts.get(name, casadi.SX(0)) for name in loop.tearing)
+        found = casadi.SX.sym("z", len(own))
+        self.torn.append(
+            _Torn(
+                found,
+                begin,
+                self.column(self.known[s] for s in outer),
+                casadi.Function("residual", [z, q], [residual], ["z", "q"], ["r"]),
+            )
+        )
+        self.known |= {s: found[i] for i, s in enumerate(own)}
+        self.definitions |= others
 
     def translate(self, expression: sympy.Expr) -> Any:
         """Return the value of an expression."""
@@ -135,7 +181,7 @@ class Writer:
         if expression.is_Symbol:
             return self.known[expression]
         if expression.is_number and not expression.args:
-            return self.type_(float(expression))
+            return casadi.SX(float(expression))
         if expression.is_Mul:
             return self._product(expression)
         if expression.func.__name__ == "interpolate":
@@ -159,7 +205,7 @@ class Writer:
         """Return a product, dividing by its factors of negative power: a/b rounds once, a*b**-1 twice."""
         above = [self._build(node) for node in expression.args if not _is_reciprocal(node)]
         below = [self._build(1 / node) for node in expression.args if _is_reciprocal(node)]
-        product = _fold(above, operator.mul) if above else self.type_(1)
+        product = _fold(above, operator.mul) if above else casadi.SX(1)
         return product / _fold(below, operator.mul) if below else product
 
 

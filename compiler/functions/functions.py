@@ -3,7 +3,7 @@
 Takes: `SortedSystem`. Gives: `CompiledSystem`.
 Guarantees: a kind's functions hold only what its states, its samples and what it sends depend on; what the
 scene named but nothing reads is listed in `dropped`. They are SX functions, unless the kind has a nonlinear
-loop: then they are MX functions, with a Newton solver for each loop inside.
+loop: then they are MX functions that call SX functions, with a Newton solver for each loop between them.
 Does not: write files, or put numbers in the place of parameters.
 """
 
@@ -142,12 +142,12 @@ class _KindBuilder:
             tuple(State(name, self._unit(name), name) for name in self.kind.states),
             self._holds(outputs),
             tuple(names),
-            casadi.Function(
+            self._function(
                 "derivative",
-                [inputs.x, inputs.u, inputs.p, inputs.t],
-                [writer.column(writer.write(derivative_symbol(name)) for name in self.kind.states)],
-                ["x", "u", "p", "t"],
-                ["dx"],
+                writer,
+                inputs,
+                "dx",
+                writer.column(writer.write(derivative_symbol(name)) for name in self.kind.states),
             ),
             tuple(
                 self._clock(part.clock, outputs[part.clock], channels, writer, inputs)
@@ -164,17 +164,16 @@ class _KindBuilder:
     def _writer(self, names: Iterable[str]) -> tuple[Writer, _Inputs]:
         """Return a writer of continuous quantities, and the inputs they are written in."""
         reached = self.reached
-        type_: Any = casadi.MX if reached.loops else casadi.SX
-        x = {symbol(name): type_.sym(name) for name in self.kind.states}
-        u = {s: type_.sym(hold.symbol) for s, hold in reached.holds.items()}
-        p = {name: type_.sym(name) for name in names}
-        time = type_.sym("time")
+        x = {symbol(name): casadi.SX.sym(name) for name in self.kind.states}
+        u = {s: casadi.SX.sym(hold.symbol) for s, hold in reached.holds.items()}
+        p = {name: casadi.SX.sym(name) for name in names}
+        time = casadi.SX.sym("time")
         # A start value has the name of its variable; the name itself is what is computed.
         computed = {*reached.continuous, *reached.clocked}
         known = {symbol(name): value for name, value in p.items() if symbol(name) not in computed}
         known |= {symbol(f"initial({name})"): value for name, value in p.items()}
         known |= {**x, **u, symbol("time"): time}
-        writer = Writer(type_, known, {**reached.continuous, **reached.samples}, self.tables, p)
+        writer = Writer(known, {**reached.continuous, **reached.samples}, self.tables, p)
         inputs = _Inputs(
             writer.column(x.values()), writer.column(u.values()), writer.column(p.values()), time
         )
@@ -200,14 +199,22 @@ class _KindBuilder:
         if not found:
             return None
         rows = [port.potential for port in found] + [port.flow for port in found]
-        port = casadi.Function(
-            "port",
-            [inputs.x, inputs.u, inputs.p, inputs.t],
-            [writer.column(writer.translate(row) for row in rows)],
-            ["x", "u", "p", "t"],
-            ["potentials_flows"],
-        )
+        values = writer.column(writer.translate(row) for row in rows)
+        port = self._function("port", writer, inputs, "potentials_flows", values)
         return Ports(tuple(port.part for port in found), port)
+
+    def _function(
+        self,
+        name: str,
+        writer: Writer,
+        inputs: _Inputs,
+        output: str,
+        value: Any,
+        between: dict[str, Any] | None = None,
+    ) -> Any:
+        """Return a function of what all take and, between the held values and the parameters, of more."""
+        columns = {"x": inputs.x, "u": inputs.u, **(between or {}), "p": inputs.p, "t": inputs.t}
+        return writer.function(name, columns, output, value, loops=bool(self.reached.loops))
 
     def _unit(self, name: str) -> str:
         variable = next(v for v in self.kind.clocked.flat.variables if v.name == name)
@@ -231,18 +238,14 @@ class _KindBuilder:
         reached = self.reached
         heard = {s: receive for s, receive in reached.receives.items() if receive.clock == clock}
         remembered = {s: previous for s, previous in reached.previous.items() if previous.clock == clock}
-        r = {s: writer.type_.sym(s.name) for s in heard}
-        m = {s: writer.type_.sym(s.name) for s in remembered}
+        r = {s: casadi.SX.sym(s.name) for s in heard}
+        m = {s: casadi.SX.sym(s.name) for s in remembered}
         own = writer.extended({**r, **m}, reached.clocked)
         alone = writer.extended(m, reached.clocked)  # what one pair of peers knows: nothing that is heard
         remembering = own.column(m.values())
-        tick = casadi.Function(
-            f"tick_{clock}",
-            [inputs.x, inputs.u, remembering, own.column(r.values()), inputs.p, inputs.t],
-            [own.column(own.write(symbol(name)) for name in outputs)],
-            ["x", "u", "m", "r", "p", "t"],
-            ["y"],
-        )
+        heard_now = own.column(r.values())
+        values = own.column(own.write(symbol(name)) for name in outputs)
+        tick = self._function(f"tick_{clock}", own, inputs, "y", values, {"m": remembering, "r": heard_now})
         return ClockPartition(
             clock,
             tuple(outputs),
@@ -270,15 +273,11 @@ class _KindBuilder:
         if expression is None:
             return None
         rows = {name: row for name, (link, row) in channels.items() if link == receive.link}
-        sent = writer.type_.sym("s", 1 + max(rows.values()))
+        sent = casadi.SX.sym("s", 1 + max(rows.values()))
         theirs = {symbol(f"{OTHERS}.{name}"): sent[row] for name, row in rows.items()}
-        return casadi.Function(
-            "edge",
-            [inputs.x, inputs.u, remembering, sent, inputs.p, inputs.t],
-            [writer.extended(theirs, {}).translate(expression)],
-            ["x", "u", "m", "s", "p", "t"],
-            ["value"],
-        )
+        pair = writer.extended(theirs, {})
+        value = pair.translate(expression)
+        return self._function("edge", pair, inputs, "value", value, {"m": remembering, "s": sent})
 
     def _send(self, link: str, channels: _Channels, writer: Writer, inputs: _Inputs) -> SendPartition:
         """Write what the kind sends over one link, a row for each send that travels in its own."""
@@ -288,13 +287,8 @@ class _KindBuilder:
             if its_link == link:
                 first.setdefault(row, name)
         names = [first[row] for row in sorted(first)]
-        send = casadi.Function(
-            f"send_{link}",
-            [inputs.x, inputs.u, inputs.p, inputs.t],
-            [writer.column(writer.translate(sends[name].expression) for name in names)],
-            ["x", "u", "p", "t"],
-            ["s"],
-        )
+        values = writer.column(writer.translate(sends[name].expression) for name in names)
+        send = self._function(f"send_{link}", writer, inputs, "s", values)
         return SendPartition(link, tuple(names), tuple(sends[name].unit for name in names), send)
 
 

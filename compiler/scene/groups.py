@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.compiled import LARGEST_COUNT
 from apc.compiler.components.component import Number, Option, Reference, Settable, Variable
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.tables import Column, Table, read_table
@@ -32,8 +33,6 @@ from apc.compiler.source.reading import (
     read_name,
     read_text,
 )
-
-LARGEST_COUNT = 10**9
 
 # By whole name, one number a peer, in SI.
 Columns = tuple[tuple[str, NDArray[np.float64]], ...]

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+from apc.compiler.compiled import LARGEST_COUNT
 from apc.compiler.components.component import Component, Number, Option, Parameter, Reference
 from apc.compiler.components.library import Library
 from apc.compiler.components.parts import LARGEST_ARRAY
@@ -21,7 +22,6 @@ from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.units import Unit, parse_unit
 from apc.compiler.scene.channels import PROBABILITIES
 from apc.compiler.scene.graphs import SHAPES
-from apc.compiler.scene.groups import LARGEST_COUNT
 from apc.compiler.scene.instances import PART_KEYS
 from apc.compiler.scene.sections import DEFAULT_TYPES, SECTIONS
 from apc.compiler.source.reading import IDENTIFIER

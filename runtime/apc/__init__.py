@@ -122,9 +122,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from importlib.metadata import version
+        from apc.runtime.distribution import program_version
 
-        return version("apc")
+        return program_version()
     if name in _HOMES:
         return getattr(importlib.import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'apc' has no attribute {name!r}")

@@ -79,9 +79,11 @@ def _bug(arguments: list[str]) -> int:
 
 
 def _report(arguments: list[str]) -> str:
-    from importlib.metadata import version
+    from apc.runtime.distribution import program_version
 
-    text = f"apc {version('apc')}, Python {sys.version}\narguments: {arguments}\n\n{traceback.format_exc()}"
+    text = (
+        f"apc {program_version()}, Python {sys.version}\narguments: {arguments}\n\n{traceback.format_exc()}"
+    )
     try:
         handle, name = tempfile.mkstemp(prefix="apc-bug-", suffix=".txt")
         os.close(handle)

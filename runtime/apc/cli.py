@@ -23,6 +23,7 @@ from apc.cli_simulate import simulate_command
 from apc.cli_sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted
+from apc.runtime.suffixes import check_suffix
 from apc.runtime.threads import start_single_threaded
 
 if TYPE_CHECKING:
@@ -37,9 +38,9 @@ CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
 
 def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
+        from apc.runtime.distribution import program_version
 
-        click.echo(f"apc {version('apc')}")
+        click.echo(f"apc {program_version()}")
         context.exit()
 
 
@@ -189,7 +190,7 @@ def _compile(path: Path, target: Path, *, timings: bool) -> None:
     system = cast("CompiledSystem", values[-1])
     difference = check_frame(system)
     lap("self-check")
-    save(system, target)
+    save(system, target, sealed=True)
     lap("save")
     click.echo(compile_report(system, needs(system), target, difference))
     if timings:
@@ -216,8 +217,11 @@ def show(file: str | None, format_: str | None, out: Path | None) -> None:
     from apc.api import show as shown
     from apc.inputs import find_input
 
+    wanted = format_ or "text"
+    if out is not None:
+        check_suffix(out, [suffix for suffix in FORMATS if format_ in (None, FORMATS[suffix])], "--out")
+        wanted = FORMATS[out.suffix.lower()]
     path = Path(file) if file else find_input(compiled_too=False)
-    wanted = format_ or (FORMATS.get(out.suffix, "text") if out else "text")
     _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
 
 
@@ -236,6 +240,8 @@ def schema(out: Path | None) -> None:
     """
     from apc.api import schema as generated
 
+    if out is not None:
+        check_suffix(out, (".json",), "--out")
     _print_or_write(json.dumps(generated(), ensure_ascii=False, indent=1), out)
 
 

@@ -18,6 +18,7 @@ import click
 from apc.compiler.errors import ApcError
 from apc.options import json_option, print_document, print_result, set_option
 from apc.progress import progress_bar
+from apc.runtime.suffixes import check_suffix
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -128,7 +129,7 @@ def simulate_command(
         raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
     chosen = parse_method(method) if method is not None else DEFAULT
     asked = parse_duration(duration) if duration is not None else None
-    _check_pictures(plot, still)
+    _check_files(out, plot, still)
     system = open_scene(file, settings)
     seconds = duration_of(system, asked)
     check_length(system, seconds, runs=runs or 1)
@@ -154,8 +155,12 @@ class _Kept:
     error: bool
 
 
-def _check_pictures(plot: Path | None, still: Path | None) -> None:
-    """Refuse a picture that can't be drawn before anything is computed."""
+def _check_files(out: Path | None, plot: Path | None, still: Path | None) -> None:
+    """Refuse a file that can't be written, or a picture that can't be drawn, before anything is computed."""
+    if out is not None:
+        from apc.runtime.simulate.recording import SUFFIXES
+
+        check_suffix(out, SUFFIXES, "--out")
     for path, option in ((plot, "--plot"), (still, "--still")):
         if path is not None:
             from apc.runtime.simulate.figures import check_format

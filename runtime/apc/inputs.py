@@ -2,7 +2,8 @@
 
 Takes: paths. Gives: the topology or compiled model to work on.
 Guarantees: a compiled model is used only while its topology, every text the topology names and the program
-are those it was made from, by their content; a model that has no topology beside it speaks for itself.
+are those it was made from, by their content; a model that has no topology beside it speaks for itself. What a
+topology says is never taken from a model that somebody else wrote.
 Does not: compile.
 """
 
@@ -13,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.cache import Record, changed, read_record
+from apc.compiler.cache import DAMAGE, Archive, Record, changed, read_archive, record_of
 from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
@@ -93,14 +94,14 @@ def load_or_compile(path: Path) -> CompiledSystem:
     ApcError
         The file is at fault.
     """
-    from apc.compiler.store import load
+    from apc.compiler.store import unpacked
 
     if path.suffix == ".apc":
         return load_fresh(path)
-    if path.is_file() and compiled_already(path):
+    if path.is_file() and (archive := compiled_already(path)) is not None:
         try:
-            return load(path.with_suffix(".apc"))
-        except ApcError:
+            return unpacked(archive, path.with_suffix(".apc"))
+        except (ApcError, *DAMAGE):
             pass  # it is only a saving of time; the topology itself decides
     from apc.compiler.pipeline import compile_topology
     from apc.runtime.analysis.selfcheck import check_frame
@@ -133,7 +134,18 @@ def open_scene(file: str | None, settings: Sequence[str]) -> CompiledSystem:
     return apply(system, [parse_override(system, text) for text in settings])
 
 
-def compiled_already(topology: Path) -> bool:
-    """Return whether the compiled model beside a topology is what compiling it now would give."""
-    record = read_record(topology.with_suffix(".apc"))
-    return record is not None and record.topology == topology.name and not changed(record, topology.parent)
+def compiled_already(topology: Path) -> Archive | None:
+    """Return the compiled model beside a topology if it is what compiling it now would give.
+
+    That it is, only this user's own seal says: anybody can write what a file says of itself.
+    """
+    path = topology.with_suffix(".apc")
+    try:
+        archive = read_archive(path) if path.is_file() else None
+        if archive is None or not archive.sealed:
+            return None
+        record = record_of(archive)
+        fresh = record.topology == topology.name and not changed(record, topology.parent)
+    except (OSError, *DAMAGE):
+        return None
+    return archive if fresh else None

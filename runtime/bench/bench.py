@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from functools import partial
-from importlib.metadata import version
 from os import cpu_count
 from typing import Any
 
@@ -31,6 +30,7 @@ from apc.runtime.analysis.needs import needs
 from apc.runtime.analysis.paper import analyze_paper
 from apc.runtime.bench.reference import PRECISIONS, Truth, exact_course, spectral_truth
 from apc.runtime.bench.timing import spread_of, take_turns, timed
+from apc.runtime.distribution import versions
 from apc.runtime.eigen.balls import precision
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.jacobians import jacobians
@@ -184,7 +184,7 @@ def machine() -> dict[str, str]:
         "processor": _processor(),
         "cores": str(cpu_count()),
         "python": platform.python_version(),
-        **{name: version(name) for name in ("apc", "numpy", "scipy", "casadi", "python-flint")},
+        **dict(versions("numpy", "scipy", "casadi", "python-flint")),
     }
 
 

@@ -19,10 +19,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.pipeline import stages_of
-from apc.compiler.scene.groups import LARGEST_COUNT
 from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import parse_source, read_source
 from apc.compiler.words import counted

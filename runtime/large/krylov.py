@@ -35,6 +35,7 @@ from apc.runtime.large.relative import (
 from apc.runtime.large.sampled_count import argument_of, count_beyond
 from apc.runtime.large.sparse_system import SparseSystem, sparse_system
 from apc.runtime.large.translation import free_motions, may_drift
+from apc.runtime.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -156,23 +157,22 @@ def _largest(
     whole: RelativeMatrix, shifts: Sequence[complex], found: Sequence[_Pair], nearest: int
 ) -> list[_Pair]:
     """Return the largest eigenvalues near some shifts, or found before, each once, conjugates left out."""
-    import scipy.sparse.linalg
-
+    linalg = load_pool("scipy.sparse.linalg")
     n = whole.matrix.shape[0]
     start = np.ones(n) + np.linspace(0.0, 1.0, n)
     values = [np.array([pair.value for pair in found], np.complex128)]
     vectors = [np.stack([pair.right for pair in found], axis=1) if found else np.zeros((n, 0), np.complex128)]
     for shift in shifts:
         factors = whole.factor(shift)
-        inverse = scipy.sparse.linalg.LinearOperator(
+        inverse = linalg.LinearOperator(
             (n, n), lambda right, factors=factors: _solved(factors, right), dtype=np.complex128
         )
         sought = min(nearest, n - 2)
         try:
-            near, right = scipy.sparse.linalg.eigs(
+            near, right = linalg.eigs(
                 inverse, k=sought, v0=start, ncv=min(n, 4 * sought), tol=FOUND, maxiter=RESTARTS
             )
-        except scipy.sparse.linalg.ArpackNoConvergence as partial:
+        except linalg.ArpackNoConvergence as partial:
             near, right = partial.eigenvalues, partial.eigenvectors
         values.append(shift + 1 / near)
         vectors.append(right)

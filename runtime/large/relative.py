@@ -19,6 +19,7 @@ from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.large.sparse_system import SparseSystem
 from apc.runtime.large.translation import FreeMotions
+from apc.runtime.threads import load_pool
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -146,11 +147,11 @@ class RelativeMatrix:
     def factor(self, shift: complex) -> Any:
         """Return LU factors of [M_rr − shift, −W; M_pr, −1]: what solves with these solves with R − shift."""
         import scipy.sparse
-        import scipy.sparse.linalg
 
+        linalg = load_pool("scipy.sparse.linalg")
         own, whole = self.matrix.shape[0], self.bordered.shape[0]
         diagonal = np.concatenate([np.full(own, shift), np.zeros(whole - own)])
-        return scipy.sparse.linalg.splu((self.bordered - scipy.sparse.diags(diagonal)).tocsc())
+        return linalg.splu((self.bordered - scipy.sparse.diags(diagonal)).tocsc())
 
 
 def relative_matrix(system: SparseSystem, rigid: RigidSpace) -> RelativeMatrix:

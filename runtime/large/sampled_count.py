@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from apc.runtime.large.crowds import Crowd
 from apc.runtime.large.sparse_system import SparseSystem, small_matrix
+from apc.runtime.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -116,12 +117,11 @@ def count_beyond(argument: Argument, alone: tuple[Complexes, Floats], known: Com
 
 def argument_of(system: SparseSystem, listed: Sequence[Crowd]) -> Argument:
     """Return the argument of det(I − R/ζ), from a small matrix: see `sparse_system.small_matrix`."""
-    import scipy.sparse.linalg
-
+    linalg = load_pool("scipy.sparse.linalg")
     small = small_matrix(system, listed)
 
     def argument(point: complex) -> float:
-        factors = scipy.sparse.linalg.splu(small(point))
+        factors = linalg.splu(small(point))
         total = float(np.angle(factors.U.diagonal()).sum())
         total += np.pi * (_odd(factors.perm_r) ^ _odd(factors.perm_c))
         for crowd in listed:

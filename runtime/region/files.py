@@ -12,12 +12,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.store import write_atomically
+from apc.runtime.distribution import program_version
 from apc.runtime.optional import need
 from apc.runtime.region.figure import draw_panels
 from apc.runtime.region.panels import Panels
@@ -69,7 +69,7 @@ def write_panels(path: Path, found: Panels) -> None:
         )
         made = {
             "axes": [first.x.to_dict(), first.y.to_dict()],
-            "apc": version("apc"),
+            "apc": program_version(),
             "origin": _origins(found),
         }
         write_table(path, headings(first), [kind for _, kind in COLUMNS], rows, made)

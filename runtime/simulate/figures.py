@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.optional import need
 from apc.runtime.simulate.signals import Signal
 from apc.runtime.simulate.trajectory import Trajectory
+from apc.runtime.suffixes import check_suffix
 
 Floats = NDArray[np.float64]
 
@@ -102,10 +102,7 @@ def write_figure(figure: Any, path: Path) -> None:
 
 def check_format(path: Path, option: str = "--plot") -> None:
     """Refuse a picture that can't be drawn: E878 no such format, E875 matplotlib is not installed."""
-    if path.suffix.lower() not in FORMATS:
-        expected, got = f"one of {', '.join(FORMATS)}", path.suffix or "none"
-        what = f"the suffix of {option}"
-        raise ApcError(Mistake("E878", Place(str(path)), what, expected, got, f"{path.stem}.png"))
+    check_suffix(path, FORMATS, option)
     need("matplotlib", "plot")
 
 

@@ -3,7 +3,8 @@
 Takes: CasADi functions. Gives: `native`, `compiler`.
 Guarantees: the same roundings as CasADi's virtual machine (no contraction, no reordering); what was compiled
 once is found again by a digest of its C text, the compiler and its options; a library is written whole or not
-at all, into a folder of the user's own. Without a compiler, or where it fails, the functions as they were.
+at all, into a folder of the user's own, and is loaded only as it was written (see `seal`): a damaged one is
+compiled again. Without a compiler or such a folder, or where it fails, the functions as they were.
 Does not: decide what is worth compiling.
 """
 
@@ -14,13 +15,14 @@ import hashlib
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import casadi
+
+from apc.compiler.seal import cache_folder, is_sealed, seal
 
 # Contracted products and sums would round differently from the virtual machine.
 OPTIONS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
@@ -70,17 +72,6 @@ def compiler() -> tuple[str, str] | None:
     return None
 
 
-def cache_folder() -> Path:
-    """Return the folder of what was compiled, as the system's custom has it."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA", "")
-        return Path(base) / "apc" if base else Path.home() / "AppData" / "Local" / "apc"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "apc"
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return Path(base) / "apc" if base and Path(base).is_absolute() else Path.home() / ".cache" / "apc"
-
-
 def _is_worth_it(function: Any) -> bool:
     """Say whether a function, with all that it calls, is straight code that is not too long."""
     called = [function, *function.find_functions(-1)]
@@ -103,14 +94,15 @@ def _library(functions: Sequence[Any], found: tuple[str, str]) -> Path | None:
         generator.add(function)
     text = generator.dump()
     digest = hashlib.sha256("\0".join((text, path, version, *OPTIONS)).encode()).hexdigest()
+    folder = cache_folder()
+    if folder is None:
+        return None
     try:
-        folder = cache_folder()
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        library = folder / f"{digest}.so"
-        if library.is_file():
+        library, mark = folder / f"{digest}.so", folder / f"{digest}.seal"
+        if _is_ours(library, mark):
             return library
         with tempfile.TemporaryDirectory(dir=folder) as name:
-            source, built = Path(name) / "kernels.c", Path(name) / "kernels.so"
+            source, built, sealed = (Path(name) / part for part in ("kernels.c", "kernels.so", "seal"))
             source.write_text(text, encoding="utf-8")
             subprocess.run(
                 [path, *OPTIONS, str(source), "-o", str(built), "-lm"],
@@ -118,7 +110,21 @@ def _library(functions: Sequence[Any], found: tuple[str, str]) -> Path | None:
                 timeout=PATIENCE,
                 check=True,
             )
+            sealed.write_text(seal(_sealed(library, built)), encoding="ascii")
             built.replace(library)
+            sealed.replace(mark)
     except (OSError, RuntimeError, subprocess.SubprocessError):
         return None
     return library
+
+
+def _is_ours(library: Path, mark: Path) -> bool:
+    """Say whether a library is there, to the last bit as it was when it was compiled under that name."""
+    try:
+        return is_sealed(_sealed(library, library), mark.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+
+
+def _sealed(library: Path, content: Path) -> bytes:
+    return f"{library.name}\0".encode() + content.read_bytes()

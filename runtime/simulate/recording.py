@@ -21,6 +21,7 @@ from apc.runtime.simulate.blocks import Block
 from apc.runtime.simulate.formats import WRITERS
 from apc.runtime.simulate.simulation import Simulation
 from apc.runtime.simulate.trajectory import provenance_of
+from apc.runtime.suffixes import check_suffix
 
 SUFFIXES = tuple(WRITERS)
 
@@ -131,10 +132,7 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
     ApcError
         E878 no such format, E879 it can't be written, E875 a library it needs is not installed.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        expected = f"one of {', '.join(SUFFIXES)}"
-        what, got = "the suffix of --out", path.suffix or "none"
-        raise ApcError(Mistake("E878", Place(str(path)), what, expected, got, f"{path.stem}.csv"))
+    check_suffix(path, SUFFIXES, "--out")
     return Recording(path, simulation)
 
 

@@ -12,7 +12,6 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from importlib.metadata import version
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.distribution import versions
 from apc.runtime.given import given
 from apc.runtime.optional import need
 from apc.runtime.simulate.accuracy import ErrorEstimate, compare_with, error_text
@@ -235,7 +235,7 @@ def provenance_of(simulation: Simulation) -> Provenance:
         seed=simulation.seed,
         parameters=tuple(parameters),
         timings=tuple((one.name, str(one.value)) for one in system.timings),
-        versions=tuple((name, version(name)) for name in ("apc", "casadi", "numpy")),
+        versions=versions("casadi", "numpy"),
     )
 
 

@@ -16,6 +16,7 @@ from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.distribution import install_line
 from apc.runtime.sweep.local import Workers
 from apc.runtime.sweep.work import Computed, Work, compute_part
 
@@ -48,7 +49,7 @@ def cluster_workers(work: Work, address: str) -> Iterator[Workers]:
         raise ApcError(Mistake("E888", place, "a scheduler's address", "HOST:PORT", address[:80], form))
     if importlib.util.find_spec("distributed") is None:
         what = "a cluster needs Dask's distributed, here and on its workers"
-        raise ApcError(Mistake("E888", place, what, hint="pip install 'apc[cluster]'"))
+        raise ApcError(Mistake("E888", place, what, hint=install_line("cluster")))
     import distributed
 
     # What goes wrong is told once, by us.

@@ -18,6 +18,7 @@ from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.store import write_atomically
+from apc.runtime.distribution import install_line
 from apc.runtime.sweep.quantities import Cell, Row
 
 SUFFIXES = (".csv", ".parquet")
@@ -38,7 +39,7 @@ def check_table_path(path: Path) -> None:
             importlib.import_module("pyarrow.parquet")
         except ImportError:
             what = "is a Parquet file, which needs pyarrow; without it, --out can end in .csv"
-            hint = "pip install 'apc[data]'"
+            hint = install_line("data")
             raise ApcError(Mistake("E887", Place(str(path)), what, hint=hint)) from None
 
 

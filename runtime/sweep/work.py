@@ -14,20 +14,20 @@ import tempfile
 import threading
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from importlib.metadata import version
 from pathlib import Path
 
 from apc.compiler import store
 from apc.compiler.cache import program_digest
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.runtime.distribution import versions
 from apc.runtime.frame.overrides import apply
 from apc.runtime.sweep.grid import Grid
 from apc.runtime.sweep.quantities import Quantity, Row, faulty, find_quantity
 from apc.runtime.threads import single_threaded
 
 # What makes the numbers: with another version of one of them, the last digits may be others.
-LIBRARIES = ("apc", "casadi", "numpy", "python-flint", "scipy")
+LIBRARIES = ("casadi", "numpy", "python-flint", "scipy")
 
 _ONE_AT_A_TIME = threading.Lock()
 
@@ -93,7 +93,7 @@ def program_versions() -> tuple[tuple[str, str], ...]:
     for path in sorted(runtime.rglob("*.py")):
         whole.update(f"\0{path.relative_to(runtime)}\0".encode())
         whole.update(path.read_bytes())
-    return (*((name, version(name)) for name in LIBRARIES), ("program", whole.hexdigest()[:16]))
+    return (*versions(*LIBRARIES), ("program", whole.hexdigest()[:16]))
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,262 @@
+"""CasADi functions as plain data, and back: nothing that a file says is given to CasADi's own reader.
+
+Takes: the functions of a kind, or the JSON of one. Gives: `PlainFunction`, `plain`, `read_function`;
+`Loop`, `composed`.
+Guarantees: a function is arithmetic from a short list of operations on its inputs and constants, and for each
+nonlinear loop Newton's iteration with options of our own; what is read is checked in full before anything is
+built, so that text from anywhere can build no other function, and none larger than the text. What is built
+again from its own data gives the same data.
+Does not: know what a function is for.
+
+CasADi's serialization can hold compilers to call and libraries to load, with options, and CasADi trusts it.
+
+Values are numbered: first the entries of the inputs in order, then the constants, then the operations, each
+of which names the values before it that it takes. With loops, `given[k]` takes the inputs and what the loops
+before the k-th found, and gives where its iteration begins and what it depends on; the result takes the
+inputs and what all the loops found.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+
+_UNARY = {
+    name: getattr(casadi, f"OP_{name.upper()}")
+    for name in (
+        *("neg", "sq", "twice", "inv", "sqrt", "exp", "log", "fabs", "sign", "floor", "ceil", "not"),
+        *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+    )
+}
+_BINARY = {
+    name: getattr(casadi, f"OP_{name.upper()}")
+    for name in (
+        *("add", "sub", "mul", "div", "pow", "constpow", "fmin", "fmax"),
+        *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
+    )
+}
+_NAMES = {code: name for name, code in (_UNARY | _BINARY).items()}
+_WORD = re.compile(r"[a-zA-Z][a-zA-Z0-9]*(_[a-zA-Z0-9]+)*\Z", re.ASCII)  # what CasADi takes as a name
+LONGEST_WORD = 200
+# CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
+# afterwards and squares the error: the rest is rounding. A bound on the residual would depend on its scale.
+NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100}
+
+_Columns = tuple[tuple[str, int], ...]  # of each: its name and how many entries it has
+
+
+@dataclass(frozen=True, slots=True)
+class PlainFunction:
+    """A function of columns to columns.
+
+    `operations` are (name, value) or (name, value, value); `results` the values that make up each output.
+    `loops` are pairs (given, residual), each without loops; with them the constants, operations and results
+    are those of the result, whose further inputs are what the loops find.
+    """
+
+    name: str
+    inputs: _Columns
+    outputs: tuple[str, ...]
+    constants: tuple[float, ...]
+    operations: tuple[tuple[Any, ...], ...]
+    results: tuple[tuple[int, ...], ...]
+    loops: tuple[tuple[PlainFunction, PlainFunction], ...] | None
+
+    @property
+    def sizes(self) -> tuple[list[int], list[int]]:
+        """How many entries each input and each output has."""
+        return [rows for _, rows in self.inputs], [len(values) for values in self.results]
+
+    def document(self) -> dict[str, Any]:
+        """Return it as JSON's data."""
+        loops = self.loops
+        return {
+            "name": self.name,
+            "inputs": [list(one) for one in self.inputs],
+            "outputs": list(self.outputs),
+            "constants": list(self.constants),
+            "operations": [list(one) for one in self.operations],
+            "results": [list(one) for one in self.results],
+            "loops": None if loops is None else [[one.document() for one in loop] for loop in loops],
+        }
+
+    def build(self) -> Any:
+        """Return the CasADi function."""
+        if self.loops is None:
+            return self._straight(self.name, self.inputs)
+        built = [Loop(given.build(), residual.build()) for given, residual in self.loops]
+        found = tuple((f"z{place}", one.residual.numel_in(0)) for place, one in enumerate(built))
+        result = self._straight("result", (*self.inputs, *found))
+        return composed(self.name, built, result, [name for name, _ in self.inputs])
+
+    def _straight(self, name: str, inputs: _Columns) -> Any:
+        columns = [casadi.SX.sym(word, rows) for word, rows in inputs]
+        values = [entry for column in columns if column.numel() for entry in casadi.vertsplit(column)]
+        values += map(casadi.SX, self.constants)
+        unary, binary = casadi.SX.unary, casadi.SX.binary
+        for word, *places in self.operations:
+            if len(places) == 1:
+                values.append(unary(_UNARY[word], values[places[0]]))
+            else:
+                values.append(binary(_BINARY[word], values[places[0]], values[places[1]]))
+        # A structural zero is a zero like another.
+        listed = [[values[place] for place in places] for places in self.results]
+        results = [casadi.densify(casadi.vertcat(*one)) if one else casadi.SX(0, 1) for one in listed]
+        return casadi.Function(name, columns, results, [word for word, _ in inputs], list(self.outputs))
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A nonlinear loop: `given(…) -> (begin (n,), q (m,))`, `residual(z (n,), q (m,)) -> (n,)`, zero at z."""
+
+    given: Any  # casadi.Function
+    residual: Any  # casadi.Function
+
+
+def composed(name: str, loops: Sequence[Loop], result: Any, words: Sequence[str]) -> Any:
+    """Return the function that solves loops one after another and then gives a result.
+
+    Parameters
+    ----------
+    name
+        The function's name.
+    loops, result
+        SX functions of the inputs and of what the loops before have found.
+    words
+        The names of the inputs.
+    """
+    inputs = [casadi.MX.sym(word, result.numel_in(place)) for place, word in enumerate(words)]
+    found: list[Any] = []
+    for place, loop in enumerate(loops):
+        begin, q = loop.given.call([*inputs, *found])
+        z, given = (casadi.SX.sym(word, loop.residual.numel_in(i)) for i, word in enumerate("zq"))
+        residual = loop.residual(z, given)
+        solver = casadi.rootfinder(f"loop{place}", "newton", {"x": z, "p": given, "g": residual}, NEWTON)
+        last_step = casadi.solve(casadi.jacobian(residual, z), residual)
+        polish = casadi.Function("polish", [z, given], [z - last_step])
+        found.append(polish(solver(x0=begin, p=q)["x"], q))
+    outputs = result.call([*inputs, *found])
+    return casadi.Function(name, inputs, outputs, list(words), result.name_out())
+
+
+def plain(function: Any) -> PlainFunction:
+    """Return a function's plain data: an SX function's, or one's that `composed` made."""
+    if function.is_a("SXFunction"):
+        return _straight(function)
+    called = [
+        function.instruction_MX(k).which_function()
+        for k in range(function.n_instructions())
+        if function.instruction_id(k) == casadi.OP_CALL
+    ]
+    by_name = {one.name(): one for one in called}
+    loops = [
+        (_straight(by_name[f"given{k}"]), _straight(by_name[f"loop{k}"].oracle()))
+        for k in range(sum(name.startswith("given") for name in by_name))
+    ]
+    result = _straight(by_name["result"])
+    return PlainFunction(
+        function.name(),
+        tuple((word, function.numel_in(i)) for i, word in enumerate(function.name_in())),
+        result.outputs,
+        result.constants,
+        result.operations,
+        result.results,
+        tuple(loops),
+    )
+
+
+def _straight(function: Any) -> PlainFunction:
+    inputs = tuple((word, int(function.numel_in(i))) for i, word in enumerate(function.name_in()))
+    first = [sum(rows for _, rows in inputs[:i]) for i in range(len(inputs) + 1)]
+    instructions = [
+        (function.instruction_id(k), function.instruction_input(k), function.instruction_output(k), k)
+        for k in range(function.n_instructions())
+    ]
+    numbers = [function.instruction_constant(k) for code, _, _, k in instructions if code == casadi.OP_CONST]
+    constants = {number: first[-1] + place for place, number in enumerate(dict.fromkeys(map(_key, numbers)))}
+    work = [0] * function.sz_w()
+    operations: list[tuple[Any, ...]] = []
+    results = [[0] * function.numel_out(i) for i in range(function.n_out())]
+    for code, taken, given, k in instructions:
+        if code == casadi.OP_INPUT:
+            work[given[0]] = first[taken[0]] + taken[1]
+        elif code == casadi.OP_OUTPUT:
+            results[given[0]][given[1]] = work[taken[0]]
+        elif code == casadi.OP_CONST:
+            work[given[0]] = constants[_key(function.instruction_constant(k))]
+        else:
+            operations.append((_NAMES[code], *(work[place] for place in taken)))
+            work[given[0]] = first[-1] + len(constants) + len(operations) - 1
+    assert all(function.nnz_out(i) == function.numel_out(i) for i in range(function.n_out()))
+    return PlainFunction(
+        function.name(),
+        inputs,
+        tuple(function.name_out()),
+        tuple(float(number) for number in constants),
+        tuple(operations),
+        tuple(tuple(places) for places in results),
+        None,
+    )
+
+
+def _key(number: float) -> str:
+    return repr(float(number))  # zeros of both signs are two constants; NaN is one
+
+
+def read_function(document: Any) -> PlainFunction:
+    """Return the function that data of JSON tells. Raises ValueError, KeyError or TypeError if none."""
+    loops = document["loops"]
+    if loops is None:
+        return _read(document, ())
+    found: list[tuple[str, int]] = []
+    pairs: list[tuple[PlainFunction, PlainFunction]] = []
+    inputs = _columns(document["inputs"])
+    for given, residual in loops:
+        one, other = _read(given, ()), _read(residual, ())
+        _must(one.inputs == (*inputs, *found) and len(other.inputs) == 2 and len(one.results) == 2)
+        n = other.inputs[0][1]
+        _must(n > 0 and one.sizes[1] == [n, other.inputs[1][1]] and other.sizes[1] == [n])
+        found.append((f"z{len(pairs)}", n))
+        pairs.append((one, other))
+    return _read(document, tuple(found), tuple(pairs))
+
+
+def _read(document: Any, found: _Columns, loops: tuple[Any, ...] | None = None) -> PlainFunction:
+    inputs = _columns(document["inputs"])
+    outputs = tuple(map(_word, document["outputs"]))
+    constants = tuple(document["constants"])
+    _must(all(type(one) is float for one in constants))
+    count = sum(rows for _, rows in (*inputs, *found)) + len(constants)
+    operations = tuple(map(tuple, document["operations"]))
+    for word, *places in operations:
+        known = _UNARY if len(places) == 1 else _BINARY
+        _must(len(places) in (1, 2) and word in known)
+        for place in places:
+            _must(type(place) is int and 0 <= place < count)
+        count += 1
+    results = tuple(map(tuple, document["results"]))
+    _must(all(type(place) is int and 0 <= place < count for places in results for place in places))
+    names = [*outputs, *(name for name, _ in (*inputs, *found))]
+    _must(len(outputs) == len(results) and len(set(names)) == len(names))
+    _must(loops is not None or document["loops"] is None)
+    return PlainFunction(_word(document["name"]), inputs, outputs, constants, operations, results, loops)
+
+
+def _columns(listed: Any) -> _Columns:
+    columns = tuple((_word(name), rows) for name, rows in listed)
+    _must(all(type(rows) is int and rows >= 0 for _, rows in columns))
+    return columns
+
+
+def _word(word: Any) -> str:
+    _must(isinstance(word, str) and len(word) <= LONGEST_WORD and bool(_WORD.match(word)))
+    return str(word)
+
+
+def _must(holds: bool) -> None:
+    if not holds:
+        raise ValueError("no function of plain data")
