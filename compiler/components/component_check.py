@@ -99,7 +99,7 @@ class ComponentNames:
             name: (equation.right, equation.text, equation.place) for name, equation in equations.items()
         }
         self.dimensions |= dict.fromkeys(open_)
-        settled = True
+        settled = list(open_)
         while settled:
             found = {name: self._dimension(*one, Mistakes()) for name, one in open_.items()}
             settled = [name for name, dimension in found.items() if dimension is not None]
