@@ -14,6 +14,7 @@ from apc.compiler.language import unit_names
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import NO_UNIT, parse_quantity, parse_unit, quantity
+from apc.compiler.language.values import is_quantity
 
 HERE = Place("a.yaml", 1, 1)
 LENGTH, TIME = Dimension((("m", 1),)), Dimension((("s", 1),))
@@ -217,3 +218,27 @@ def test_pint_is_imported_only_when_a_rare_unit_is_read() -> None:
 @pytest.mark.parametrize("name", sorted(unit_names._OF_HAPTICS))
 def test_a_unit_known_without_pint_is_what_pint_says(name: str) -> None:
     assert unit_names._scaled(name) == unit_names._OF_HAPTICS[name]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("5 1/s", Fraction(5)),
+        ("0 1/s", Fraction(0)),
+        ("-3 1/min", Fraction(-1, 20)),
+        ("1/90 1/s", Fraction(1, 90)),
+        ("2e3 1/m^2", Fraction(2000)),
+        ("2 1/(N*s)", Fraction(2)),
+        ("4 1·1/ms", Fraction(4000)),
+        ("3 (N*s)/m", Fraction(3)),
+        ("3(kN)", Fraction(3000)),
+    ],
+)
+def test_a_unit_may_start_with_a_one_or_a_parenthesis(text: str, value: Fraction) -> None:
+    assert is_quantity(text)
+    assert parse_quantity(text, Place("scene.yaml")).value == value
+
+
+@pytest.mark.parametrize("text", ["5 1", "5*1/s", "1/peers", "5/rate", "2 - 1/s", "1/(peers - 1)", "kt 1/s"])
+def test_an_operator_behind_a_number_makes_an_expression(text: str) -> None:
+    assert not is_quantity(text)

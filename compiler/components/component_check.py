@@ -13,7 +13,9 @@ scene give the rest.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
+from itertools import count
 
 from apc.compiler.components.component import (
     OTHERS,
@@ -54,17 +56,18 @@ class ComponentNames:
 
     def __init__(self, component: Component) -> None:
         self.component = component
-        self.dimensions: dict[tuple[str, ...], Dimension | None] = {PEERS: DIMENSIONLESS, ("time",): SECOND}
-        self.dimensions.update(dict(_visible_names(component)))
-        for parameter in component.numbers:
-            self.dimensions[(parameter.name,)] = parameter.unit.dimension
-            for word, _ in parameter.words:
-                self.dimensions.setdefault((word,), parameter.unit.dimension)
+        self.dimensions: dict[tuple[str, ...], Dimension | None] = dict(_visible_names(component))
         passed = {connector for connector, _, _ in component.passed}
         for name, connector in component.connectors:
             if name not in passed:
                 for flow in connector.flows:
                     self.dimensions[(name, flow.name)] = flow.unit.dimension
+        self.variables = frozenset(self.dimensions)
+        self.dimensions |= {PEERS: DIMENSIONLESS, ("time",): SECOND}
+        for parameter in component.numbers:
+            self.dimensions[(parameter.name,)] = parameter.unit.dimension
+            for word, _ in parameter.words:
+                self.dimensions.setdefault((word,), parameter.unit.dimension)
         self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
         for send in component.sends:
             self.dimensions[(OTHERS, send.name)] = send.dimension
@@ -80,21 +83,34 @@ class ComponentNames:
         )
 
     def infer_locals(self, sends: Sends) -> tuple[tuple[str, Dimension], ...]:
-        """Return the undeclared names that stand alone on the left of an equation."""
-        for name, expression, text, place in sends:
-            self.dimensions[(OTHERS, name)] = self._dimension(expression, text, place, Mistakes())
-        found: list[tuple[str, Dimension]] = []
-        for equation in self.component.equations:
-            left = equation.left
-            if isinstance(left, Name) and len(left.parts) == 1 and left.parts not in self.dimensions:
-                # An unknown name on the right is reported once, by `check`; a local may still be undecided.
-                dimension = self._dimension(equation.right, equation.text, equation.place, Mistakes())
-                self.dimensions[left.parts] = dimension
-                found.append((left.parts[0], _known(dimension)))
-        return tuple(found)
+        """Return the undeclared names that stand alone on the left of an equation.
+
+        What one is may hang on another, on itself, or on what is sent: each round settles some.
+        """
+        equations = {
+            equation.left.parts: equation
+            for equation in reversed(self.component.equations)
+            if isinstance(equation.left, Name)
+            and len(equation.left.parts) == 1
+            and equation.left.parts not in self.dimensions
+        }
+        # An unknown name on the right is reported once, by `check`.
+        open_ = {(OTHERS, name): (expression, text, place) for name, expression, text, place in sends} | {
+            name: (equation.right, equation.text, equation.place) for name, equation in equations.items()
+        }
+        self.dimensions |= dict.fromkeys(open_)
+        settled = list(open_)
+        while settled:
+            found = {name: self._dimension(*one, Mistakes()) for name, one in open_.items()}
+            settled = [name for name, dimension in found.items() if dimension is not None]
+            self.dimensions |= {name: found[name] for name in settled}
+            open_ = {name: one for name, one in open_.items() if name not in settled}
+        return tuple((name[0], _known(self.dimensions[name])) for name in reversed(equations))
 
     def check(self, component: Component, mistakes: Mistakes) -> None:
-        """Check the names, then the units, of every equation."""
+        """Check the names, then the units, of every equation, and that what is sent is no reduction."""
+        for send in component.sends:
+            self._check_sent(send, mistakes)
         for equation in component.equations:
             unknown = False
             left, right = self._decided(equation.left), self._decided(equation.right)
@@ -128,13 +144,36 @@ class ComponentNames:
             mistakes.add("E506", where, what, expected=expected, got=got, hint=hint)
         return wrong
 
-    def _decided(self, expression: Expr) -> Expr:
-        """Return the expression with each test of an option replaced by a true statement.
+    def _check_sent(self, send: Send, mistakes: Mistakes) -> None:
+        """Record a send of what is heard: that is known at ticks of the clock, not of the link."""
+        heard = next((n for n in walk(send.expression) if isinstance(n, Name) and n.parts[0] == OTHERS), None)
+        if heard is None:
+            return
+        name = next(one for n in count(1) if (one := f"sent{n}",) not in self.dimensions)
+        shown = format_expression(heard)
+        what = f"{send.name} is sent at ticks of the link, and {shown} is heard at those of the clock"
+        hint = f"{name} = {send.text} among the equations, and sends: {{{send.name}: sample(hold({name}))}}"
+        mistakes.add("E505", place_in(send.place, send.text, heard.start), what, hint=hint)
 
-        Both branches of such a test are checked; the words of an option have no dimension.
+    def _decided(self, expression: Expr) -> Expr:
+        """Return the expression without what has no dimension: words of options, and clocks to sample at.
+
+        Each test of an option becomes a true statement: both branches are checked.
         """
         options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
-        return transform(expression, lambda node: _TRUE if option_test(node, options) else None)
+
+        def decided(node: Expr) -> Expr | None:
+            if isinstance(node, Call) and node.function == "sample" and len(node.arguments) == 2:
+                return replace(node, arguments=(transform(node.arguments[0], decided),))
+            return _TRUE if option_test(node, options) else None
+
+        return transform(expression, decided)
+
+    def dimension_of_held(self, expression: Expr, text: str, place: Place) -> Dimension | None:
+        """Return the dimension of a checked expression, or None if it is a variable, which has its own."""
+        if isinstance(expression, Name) and expression.parts in self.variables:
+            return None
+        return _known(self._dimension(expression, text, place, Mistakes()))
 
     def _dimension(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> Dimension | None:
         expression = self._decided(expression)

@@ -16,12 +16,22 @@ import sympy
 
 from apc.compiler.equations.elimination import ZeroTests, eliminate
 from apc.compiler.equations.matching import match_columns, strong_components
-from apc.compiler.equations.residuals import MOST_LISTED, Residual, listed, report_singular
-from apc.compiler.equations.solution import Assignment, Step
-from apc.compiler.equations.symbolic import linear_form, symbol
+from apc.compiler.equations.residuals import MOST_LISTED, Residual, listed, report_no_number, report_singular
+from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step
+from apc.compiler.equations.symbolic import (
+    NoDerivativeError,
+    differential,
+    is_no_number,
+    linear_form,
+    smooth_pieces,
+    symbol,
+)
 from apc.compiler.equations.tearing import tear
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
 from apc.compiler.errors import Mistakes
+
+# A loop of more guesses, or with more pieces between its corners, is not asked whether it has one solution.
+MOST_GUESSES, MOST_PIECES = 3, 64
 
 
 def solve_blocks(
@@ -67,7 +77,7 @@ def solve_blocks(
     for block in strong_components(needs):
         rows = sorted(block)
         own = [unknowns[column] for column in sorted(computes[row] for row in rows)]
-        steps += solver.solve([residuals[row] for row in rows], own)
+        steps += solver.checked([residuals[row] for row in rows], own)
     return tuple(steps)
 
 
@@ -78,6 +88,23 @@ class _Solver:
         self.where = where
         self.mistakes = mistakes
         self.tests = tests
+
+    def checked(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
+        """Solve one block; its expressions must be numbers: what was divided may cancel."""
+        steps = self.solve(block, unknowns)
+        expressions = (
+            expression
+            for step in steps
+            for expression in (
+                (*step.residuals, *(value for _, value in step.inner))
+                if isinstance(step, ImplicitBlock)
+                else (step[1],)
+            )
+        )
+        if any(is_no_number(expression) for expression in expressions):
+            report_no_number([residual.shown for residual in block], block[0].equation.place, self.mistakes)
+            return []
+        return steps
 
     def solve(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
         """Return what gives the unknowns of one block, explicit where it is linear in them."""
@@ -101,14 +128,41 @@ class _Solver:
     def _loop(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
         """Tear a nonlinear block; every residual of it must be one that the guesses can make zero."""
         made = tear(block, unknowns, self.tests.is_zero)
-        if all(_moves(residual, made.inner) for residual in made.residuals):
-            return [made]
-        what = (
-            f"{self.where} hold a loop without an unknown left to solve for: {made.chain}, "
-            f"by {listed(made.equations)}"
-        )
+        residuals = [_put_in(residual, made.inner) for residual in made.residuals]
+        if not all(residual.free_symbols for residual in residuals):
+            self._report_loop(block, made, "hold a loop without an unknown left to solve for")
+            return []
+        if self._is_open(residuals, [symbol(name) for name in made.tearing]):
+            self._report_loop(block, made, "hold a loop that many values solve, or none")
+            return []
+        return [made]
+
+    def _is_open(self, residuals: Sequence[sympy.Expr], guesses: Sequence[sympy.Symbol]) -> bool:
+        """Return whether between corners the residuals don't depend on the guesses, or only on some."""
+        if len(guesses) > MOST_GUESSES:
+            return False
+        pieces = smooth_pieces(sympy.Tuple(*residuals), MOST_PIECES)
+        for piece in pieces or ():
+            try:
+                slopes = sympy.Matrix(
+                    [
+                        [
+                            differential(one, lambda s, guess=guess: sympy.Integer(s == guess))
+                            for guess in guesses
+                        ]
+                        for one in piece
+                    ]
+                )
+            except NoDerivativeError:
+                continue
+            determinant = slopes.det(method="berkowitz")
+            if self.tests.is_zero(determinant) or self.tests.vanishes(determinant):
+                return True
+        return False
+
+    def _report_loop(self, block: Sequence[Residual], made: ImplicitBlock, fault: str) -> None:
+        what = f"{self.where} {fault}: {made.chain}, by {listed(made.equations)}"
         self.mistakes.add("E503", block[0].equation.place, what)
-        return []
 
     def _report_dependent(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> None:
         what = (
@@ -118,9 +172,9 @@ class _Solver:
         self.mistakes.add("E511", block[0].equation.place, what)
 
 
-def _moves(residual: sympy.Expr, inner: Sequence[Assignment]) -> bool:
-    """Return whether a residual still holds a guess after the inner values are put in (when they are few)."""
+def _put_in(residual: sympy.Expr, inner: Sequence[Assignment]) -> sympy.Expr:
+    """Return a residual with the inner values put in, when they are few."""
     if len(inner) <= MOST_LISTED:
         for name, expression in reversed(inner):
             residual = residual.xreplace({symbol(name): expression})
-    return bool(residual.free_symbols)
+    return residual

@@ -32,11 +32,19 @@ class ClockInference:
         self.mistakes = mistakes
         self._parents: dict[str, str] = {}
         self._clock_of_set: dict[str, str] = {}
+        self._hearing: dict[str, FlatEquation] = {}  # by what hears
 
     def visit(self, name: str, equation: FlatEquation) -> None:
         """Join what stands in an equation, which goes by this name."""
         for side in (equation.left, equation.right):
             self._visit(side, name, equation)
+
+    def finish(self) -> None:
+        """Record what hears the other peers at no clock, once every equation is read."""
+        for name, equation in self._hearing.items():
+            if self.of(name) == CONTINUOUS:
+                what = f"{equation.origin} hears the other peers but has no parameter that names one clock"
+                self.mistakes.add("E504", equation.place, what, hint="parameters: {clock: clock}")
 
     def _find(self, name: str) -> str:
         root = name
@@ -116,10 +124,8 @@ class ClockInference:
         elif hears_others(call):
             for argument in call.arguments:
                 self._visit(argument, domain, equation, heard=True)
-            if equation.clock is None:
-                what = f"{equation.origin} hears the other peers but has no parameter that names one clock"
-                self.mistakes.add("E504", equation.place, what, hint="parameters: {clock: clock}")
-            else:
+            self._hearing.setdefault(domain, equation)
+            if equation.clock is not None:
                 self._pin(domain, equation.clock, text, equation)
         else:
             if call.function == "previous" and equation.clock is not None:

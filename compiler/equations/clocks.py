@@ -24,7 +24,7 @@ from fractions import Fraction
 
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clock_inference import CONTINUOUS, ClockInference, domain
-from apc.compiler.equations.flatten import FlatEquation, FlatKind, FlatSend, FlatSystem
+from apc.compiler.equations.flatten import FlatEquation, FlatKind, FlatSend, FlatSystem, is_made
 from apc.compiler.equations.reductions import affine_in_others, count_of, hears_others
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.expression import (
@@ -123,7 +123,7 @@ def partition(flat: FlatSystem) -> ClockedSystem:
 
 
 class _Partitioner:
-    """One kind: its holds get variables of their own, then clocks are inferred, then crossings are named."""
+    """One kind: clocks are inferred, then crossings are named."""
 
     def __init__(self, kind: FlatKind, mistakes: Mistakes) -> None:
         self.kind = kind
@@ -131,22 +131,23 @@ class _Partitioner:
         self.variables = {variable.name: None for variable in kind.variables}  # a dict keeps their order
         self.starts = {variable.name for variable in kind.variables if variable.start}
         self.clocks = ClockInference(self.variables, mistakes)
-        self.extra: list[FlatEquation] = []
         self.samples: dict[str, SampleCrossing] = {}
         self.holds: dict[str, HoldCrossing] = {}
         self.previous: dict[str, PreviousCrossing] = {}
         self.receives: dict[str, ReceiveCrossing] = {}
+        self.named = {  # what the made variables are
+            format_expression(one.left): format_expression(one.right)
+            for one in kind.equations
+            if isinstance(one.left, Name) and is_made(one.left.parts[-1])
+        }
         self.links = {send.name: send.link for send in kind.sends}
 
     def run(self) -> ClockedKind:
-        equations = [self._lift_holds(equation) for equation in self.kind.equations]
-        lifted = [
-            replace(send, expression=self._lift_hold(send.expression, send)) for send in self.kind.sends
-        ]
-        equations += self.extra
+        equations = self.kind.equations
         for index, equation in enumerate(equations):
             self.clocks.visit(f"equation {index}", equation)
-        sends = tuple(self._sent(send) for send in lifted)
+        self.clocks.finish()
+        sends = tuple(self._sent(send) for send in self.kind.sends)
         if self.mistakes:
             return ClockedKind(self.kind, (), (), (), (), (), ())
         by_clock: dict[str, list[FlatEquation]] = {CONTINUOUS: []}
@@ -171,32 +172,6 @@ class _Partitioner:
 
     # ---- crossings ----
 
-    def _lift_holds(self, equation: FlatEquation) -> FlatEquation:
-        return replace(
-            equation,
-            left=self._lift_hold(equation.left, equation),
-            right=self._lift_hold(equation.right, equation),
-        )
-
-    def _lift_hold(self, expression: Expr, where: FlatEquation | FlatSend) -> Expr:
-        """Give an expression that is held a clocked variable of its own."""
-        origin = where.origin if isinstance(where, FlatEquation) else where.name.rpartition(".")[0]
-        clock = where.clock if isinstance(where, FlatEquation) else None
-
-        def replacement(node: Expr) -> Expr | None:
-            if not (isinstance(node, Call) and node.function == "hold"):
-                return None
-            delay = node.arguments[1] if len(node.arguments) == 2 else Number(Fraction(0))
-            argument = node.arguments[0]
-            if isinstance(argument, Name) and ".".join(argument.parts) in self.variables:
-                return Call("hold", (argument, delay))
-            name = Name((*origin.split("."), f"held{len(self.extra) + 1}"))
-            self.variables[".".join(name.parts)] = None
-            self.extra.append(FlatEquation(name, argument, origin, clock, where.place))
-            return Call("hold", (name, delay))
-
-        return transform(expression, replacement)
-
     def _crossed(self, equation: FlatEquation, clock: str) -> FlatEquation:
         """Return the equation with a symbol in the place of each crossing."""
         return replace(
@@ -218,12 +193,16 @@ class _Partitioner:
             self.samples.setdefault(symbol, SampleCrossing(symbol, clock, inside))
             return Name((symbol,))
         if call.function == "hold":
+            delay = call.arguments[1] if len(call.arguments) == 2 else Number(Fraction(0))
+            symbol = format_expression(Call("hold", (call.arguments[0], delay)))
             variable = format_expression(call.arguments[0])
             source = self.clocks.of(variable)
             if source == CONTINUOUS:
-                what = f"{symbol} holds {variable}, which is continuous already"
-                self.mistakes.add("E505", where.place, what, hint=variable)
-            self.holds.setdefault(symbol, HoldCrossing(symbol, variable, source, call.arguments[1]))
+                shown = self.named.get(variable, variable)
+                told = format_expression(Call("hold", (Name((shown,)), delay)))
+                what = f"{told} holds {shown}, which is continuous already"
+                self.mistakes.add("E505", where.place, what, hint=shown)
+            self.holds.setdefault(symbol, HoldCrossing(symbol, variable, source, delay))
             return Name((symbol,))
         if call.function == "previous":
             return self._previous(call, symbol, clock, where)

@@ -9,10 +9,13 @@ Does not: put a number in the place of a parameter, or look at clocks beyond nam
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import count
 
 from apc.compiler.components.component import OTHERS, Component, Option, Reference, Send, option_test
 from apc.compiler.components.component import Number as NumberParameter
+from apc.compiler.components.component_check import ComponentNames
 from apc.compiler.equations.connections import connection_equations
 from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.language.dimensions import Dimension
@@ -35,6 +38,11 @@ from apc.compiler.scene.instances import Part
 from apc.compiler.scene.scene import Scene, SceneGroup
 
 PEERS = Name(("peers",))
+
+# The functions whose value hangs on those of their arguments at the same moment, and on nothing else.
+_HELD = "held"  # with a number behind it, the name of an expression that is held
+
+POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "exp", "log", "sin", "cos", "tanh", "floor"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +105,11 @@ class FlatSystem:
     kinds: tuple[FlatKind, ...]
 
 
+def is_made(name: str) -> bool:
+    """Return whether a name is of the form of those given to expressions that are held."""
+    return name.startswith(_HELD) and name.removeprefix(_HELD).isdecimal()
+
+
 def flatten(scene: Scene) -> FlatSystem:
     """Write out the equations of every kind. Raises ApcError with every mistake found on the way."""
     mistakes = Mistakes()
@@ -151,6 +164,8 @@ def _flatten_kind(scene: Scene, groups: list[SceneGroup], delays: set[str], mist
         variables += instance.variables()
         equations += instance.equations()
         sends += instance.sends()
+        variables += instance.held_variables
+        equations += instance.held_equations
     equations += [
         FlatEquation(left, right, "connection", None, place)
         for left, right, place in connection_equations(parts, mistakes)
@@ -201,6 +216,9 @@ class _Instance:
         self.divided = {
             p.name for p in self.component.parameters if isinstance(p, NumberParameter) and p.divided
         }
+        self.names = ComponentNames(self.component)
+        self.held_variables: list[FlatVariable] = []
+        self.held_equations: list[FlatEquation] = []
 
     def _only(self, wanted: str, roles: dict[str, str]) -> str | None:
         """Return the clock or link that is named, when there is exactly one."""
@@ -243,25 +261,76 @@ class _Instance:
         return ".".join((self.part.name, *parts))
 
     def _qualified(self, expression: Expr, where: Equation | Send, clock: str | None) -> Expr:
-        def replace(node: Expr) -> Expr | None:
-            if isinstance(node, Conditional):
-                return self._decided(node, where, clock)
+        def whole(node: Expr) -> Expr | None:
+            if isinstance(node, Conditional) and (branch := self._branch(node)) is not None:
+                return self._qualified(branch, where, clock)
             if isinstance(node, Call) and node.function == "sample":
                 return self._sample(node, where, clock)
+            if isinstance(node, Call) and node.function == "hold":
+                return self._hold(node, where, clock)
+            if isinstance(node, Call) and node.function in ("previous", "initial"):
+                return self._before(node, node.arguments[0], where)
             if isinstance(node, Name):
                 return self._name(node)
             return None
 
-        return transform(expression, replace)
+        return transform(expression, whole)
 
-    def _decided(self, node: Conditional, where: Equation | Send, clock: str | None) -> Expr | None:
+    def _branch(self, node: Conditional) -> Expr | None:
+        """Return the branch that an option decides for, None if the condition is no test of an option."""
         test = option_test(node.condition, self.options)
         if test is None:
             return None
         option, word = test
         equal = self.chosen[option.name] == word
         holds = equal == (getattr(node.condition, "operator", "==") == "==")
-        return self._qualified(node.then if holds else node.otherwise, where, clock)
+        return node.then if holds else node.otherwise
+
+    def _before(self, call: Call, expression: Expr, where: Equation | Send) -> Expr:
+        """Return an expression of what its variables were before, or at the start, as the call says."""
+
+        def before(node: Expr) -> Expr | None:
+            if isinstance(node, Conditional) and (branch := self._branch(node)) is not None:
+                return self._before(call, branch, where)
+            if isinstance(node, Name):
+                if node.parts in self.names.variables:
+                    return Call(call.function, (self._name(node),))
+                if node.parts[0] not in ("time", OTHERS):
+                    return self._name(node)  # a parameter, the same at all times
+            elif not isinstance(node, Call) or node.function in POINTWISE:
+                return None
+            name = next(one for n in count(1) if (one := f"y{n}",) not in self.names.dimensions)
+            shown, place = format_expression(node), place_in(where.place, where.text, node.start)
+            hint = f"{name} = {shown}, and {name}: {{unit: …, start: 0}} among the variables"
+            what = f"{shown} inside {call.function}"
+            self.mistakes.add("E505", place, what, expected="a variable", hint=hint)
+            return Number(Fraction(0))
+
+        return transform(expression, before)
+
+    def _hold(self, node: Call, where: Equation | Send, clock: str | None) -> Expr:
+        """Give an expression that is held a variable of its own, which a clock of this part computes."""
+        own = self.clock if isinstance(where, Send) else clock
+        held, *delay = node.arguments
+        dimension = self.names.dimension_of_held(held, where.text, where.place)
+        qualified = self._qualified(held, where, own)
+        if dimension is not None:
+            taken = {name for (name, *_) in self.names.variables} | {
+                variable.name.rpartition(".")[2] for variable in self.held_variables
+            }
+            name = next(one for n in count(1) if (one := f"{_HELD}{n}") not in taken)
+            whole = self._whole(name)
+            self.held_variables.append(FlatVariable(whole, dimension, False))
+            symbol = Name((*self.part.name.split("."), name))
+            self.held_equations.append(FlatEquation(symbol, qualified, self.part.name, own, where.place))
+            qualified = symbol
+        for moving in (name for one in delay for name in names(one)):
+            if moving.parts in self.names.variables or moving.parts[0] in ("time", OTHERS):
+                place = place_in(where.place, where.text, moving.start)
+                what, got = "the delay of a hold", format_expression(moving)
+                self.mistakes.add("E505", place, what, expected="parameters only", got=got)
+        later = [self._qualified(one, where, own) for one in delay]
+        return replace(node, arguments=(qualified, *later))
 
     def _sample(self, node: Call, where: Equation | Send, clock: str | None) -> Expr:
         argument = self._qualified(node.arguments[0], where, clock)
@@ -280,7 +349,11 @@ class _Instance:
         if clock is None:
             what = f"{self.component.name} samples but has no parameter that names one clock"
             place = place_in(where.place, where.text, node.start)
-            self.mistakes.add("E504", place, what, hint="parameters: {clock: clock}")
+            hint = "parameters: {clock: clock}"
+            if self.clocks:
+                what = f"{self.component.name} samples, and has clocks {', '.join(sorted(self.clocks))}"
+                hint = format_expression(Call("sample", (node.arguments[0], Name((min(self.clocks),)))))
+            self.mistakes.add("E504", place, what, hint=hint)
             clock = "?"
         return Call("sample", (argument, Name((clock,))))
 

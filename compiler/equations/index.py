@@ -131,6 +131,9 @@ class _System:
             row = start
             while (stuck := self._augment(row, computed_by, computes)) is not None:
                 rows, names = stuck
+                if empty := [one for one in rows if not self.held[one]]:
+                    self._report_empty(empty[0], mistakes)
+                    return False
                 for name in names:
                     self.order[name] += 1
                     if self.order[name] > HIGHEST_ORDER:
@@ -181,6 +184,15 @@ class _System:
         self.residuals.append(made)
         self._hold(made)
         return True
+
+    def _report_empty(self, row: int, mistakes: Mistakes) -> None:
+        """Say that what an equation holds cancels, in itself or in its derivative."""
+        residual = self.residuals[row]
+        what = (
+            f"{residual.shown} holds no unknown once what the connections and other equations say is put in: "
+            "it says what they say already, or contradicts them"
+        )
+        mistakes.add("E502", residual.equation.place, what)
 
     def _report_endless(self, rows: Iterable[int], mistakes: Mistakes) -> None:
         roots = list(dict.fromkeys(self.residuals[row].equation for row in rows))

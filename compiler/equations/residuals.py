@@ -33,6 +33,12 @@ class Residual:
         return f"`{self.equation.text}` ({self.equation.origin})"
 
 
+def report_no_number(texts: Sequence[str], place: Place, mistakes: Mistakes) -> None:
+    """Add the mistake E512: equations in which a constant is none, maybe after others are put in."""
+    what = f"{listed(texts)} hold{'s' if len(texts) == 1 else ''} a constant that is no number"
+    mistakes.add("E512", place, f"{what}, such as 1/0 or sqrt(-1)")
+
+
 def report_singular(
     residuals: Sequence[Residual],
     unknowns: Sequence[str],

@@ -31,7 +31,7 @@ from apc.compiler.equations.clocks import (
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.index import reduce_index, report_no_derivative
 from apc.compiler.equations.jets import Jets
-from apc.compiler.equations.residuals import Residual
+from apc.compiler.equations.residuals import Residual, report_no_number
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
 from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, symbol, to_sympy
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Given, Vanishing
@@ -215,6 +215,10 @@ def _sort_continuous(
     aliases = Aliases(jets, partition.variables, started)
     residuals = aliases.remove(residuals)
     read_values = [aliases.substitute(value) for value in values if value is not None]
+    put_in = [Residual(value, read) for value, read in zip(read_values, reads, strict=True)]
+    if none := [one for one in (*residuals, *put_in) if is_no_number(one.expression)]:
+        report_no_number([one.shown for one in none], none[0].equation.place, mistakes)
+        return _Continuous()
     jets = jets.renamed(aliases.kept, aliases.velocities)
     probes = _probes(reads, read_values, jets)
     reduced = reduce_index(
@@ -268,8 +272,7 @@ def _value(
         report_no_derivative(Residual(sympy.S.Zero, equation), missing, mistakes)
         return None
     if is_no_number(value):
-        what = f"`{equation.text}` ({equation.origin}) holds a constant that is no number"
-        mistakes.add("E512", equation.place, f"{what}, such as 1/0 or sqrt(-1)")
+        report_no_number([Residual(value, equation).shown], equation.place, mistakes)
         return None
     return value
 

@@ -177,6 +177,35 @@ def differential(expression: sympy.Expr, rate: Callable[[sympy.Symbol], sympy.Ex
     return go(expression)
 
 
+def smooth_pieces(expression: sympy.Expr, most: int) -> list[sympy.Expr] | None:
+    """Return what an expression may be between its corners and jumps, None if that is more than `most`.
+
+    Each min and max is one of its arguments, each `if` one of its branches, abs(x) is x or −x; sign and floor
+    are constant.
+    """
+    pieces = [expression]
+    while True:
+        bent = next((node for node in sympy.preorder_traversal(sympy.Tuple(*pieces)) if _is_bent(node)), None)
+        if bent is None:
+            return pieces
+        match bent.func.__name__:
+            case "if":
+                choices = bent.args[1:]
+            case "min" | "max":
+                choices = bent.args
+            case "abs" | "Abs":
+                choices = (bent.args[0], -bent.args[0])
+            case _:
+                choices = (sympy.Dummy(real=True),)
+        pieces = list(dict.fromkeys(one.xreplace({bent: choice}) for one in pieces for choice in choices))
+        if len(pieces) > most:
+            return None
+
+
+def _is_bent(node: sympy.Basic) -> bool:
+    return node.func.__name__ in ("if", "min", "max", "abs", "Abs", "sign", "floor")
+
+
 def _choice(condition: sympy.Expr, then: sympy.Expr, otherwise: sympy.Expr) -> sympy.Expr:
     return then if then == otherwise else head("if")(condition, then, otherwise)
 

@@ -34,7 +34,6 @@ _CASADI: dict[str, Callable[..., Any]] = {
     "sin": casadi.sin,
     "cos": casadi.cos,
     "tanh": casadi.tanh,
-    "if": casadi.if_else,
     "and": casadi.logic_and,
     "or": casadi.logic_or,
     "not": casadi.logic_not,
@@ -177,22 +176,40 @@ class Writer:
     def _needed(self, expression: Definition) -> list[sympy.Symbol]:
         return sorted((s for s in expression.free_symbols if s.name not in self.tables), key=str)
 
-    def _build(self, expression: sympy.Expr) -> Any:
+    def _build(self, expression: sympy.Expr, taken: Any = None) -> Any:
+        """Return the value of an expression whose symbols are known.
+
+        `taken` is the condition of the branch it stands in. CasADi computes every branch, and the slopes of
+        one that isn't taken times 0, which is no number where they are infinite. What is singular somewhere
+        gets the argument 1 there, where the branch isn't taken.
+        """
         if expression.is_Symbol:
             return self.known[expression]
         if expression.is_number and not expression.args:
             return casadi.SX(float(expression))
         if expression.is_Mul:
-            return self._product(expression)
-        if expression.func.__name__ == "interpolate":
+            return self._product(expression, taken)
+        name = expression.func.__name__
+        if name == "interpolate":
             return self._interpolated(*expression.args)
-        arguments = [self._build(argument) for argument in expression.args]
+        if name == "if":
+            return self._chosen(*expression.args, taken)
+        arguments = [self._build(argument, taken) for argument in expression.args]
         if expression.is_Add:
             return _fold(arguments, operator.add)
+        if taken is not None and _is_singular(expression):
+            arguments[0] = casadi.if_else(taken, arguments[0], 1)
         if expression.is_Pow:
             return _power(arguments[0], expression.exp, arguments[1])
-        name = expression.func.__name__
         return _fold(arguments, _EXTREMES[name]) if name in _EXTREMES else _CASADI[name](*arguments)
+
+    def _chosen(self, condition: sympy.Expr, then: sympy.Expr, otherwise: sympy.Expr, taken: Any) -> Any:
+        """Return the value of a conditional in a branch."""
+        holds = self._build(condition, taken)
+        first, second = holds, casadi.logic_not(holds)
+        if taken is not None:
+            first, second = casadi.logic_and(taken, first), casadi.logic_and(taken, second)
+        return casadi.if_else(holds, self._build(then, first), self._build(otherwise, second))
 
     def _interpolated(self, table: sympy.Symbol, time: sympy.Expr) -> Any:
         """Return a table's value, linear between its rows and constant beyond its ends."""
@@ -201,12 +218,16 @@ class Writer:
         inside = casadi.fmin(casadi.fmax(self._build(time), start), end)
         return casadi.pw_lin(inside, found.times.tolist(), found.numbers.tolist())
 
-    def _product(self, expression: sympy.Expr) -> Any:
+    def _product(self, expression: sympy.Expr, taken: Any) -> Any:
         """Return a product, dividing by its factors of negative power: a/b rounds once, a*b**-1 twice."""
-        above = [self._build(node) for node in expression.args if not _is_reciprocal(node)]
-        below = [self._build(1 / node) for node in expression.args if _is_reciprocal(node)]
+        above = [self._build(node, taken) for node in expression.args if not _is_reciprocal(node)]
+        below = [self._build(1 / node, taken) for node in expression.args if _is_reciprocal(node)]
         product = _fold(above, operator.mul) if above else casadi.SX(1)
-        return product / _fold(below, operator.mul) if below else product
+        if not below:
+            return product
+        divisor = _fold(below, operator.mul)
+        moving = any(node.free_symbols for node in expression.args if _is_reciprocal(node))
+        return product / (casadi.if_else(taken, divisor, 1) if taken is not None and moving else divisor)
 
 
 def _fold(values: Sequence[Any], join: Callable[[Any, Any], Any]) -> Any:
@@ -214,6 +235,13 @@ def _fold(values: Sequence[Any], join: Callable[[Any, Any], Any]) -> Any:
     for value in values[1:]:
         total = join(total, value)
     return total
+
+
+def _is_singular(node: sympy.Expr) -> bool:
+    """Return whether a function, or its slope, is infinite or no number for some argument."""
+    if node.is_Pow:
+        return not (node.exp.is_Integer and node.exp.is_positive)
+    return node.func.__name__ in ("log", "exp")
 
 
 def _is_reciprocal(node: sympy.Expr) -> bool:

@@ -26,10 +26,12 @@ from apc.compiler.source.reading import add_unknown, brief, read_text
 
 PEERS = ("peers",)
 
-# A quantity starts with a number; what follows is nothing, a unit, or a ratio such as 1/90 s. An operator
-# behind the number makes it an expression.
+# A quantity starts with a number or a ratio such as 1/90; what follows is nothing or a unit, which may start
+# with a parenthesis or, behind a space, as 1/s does. An operator behind the number makes it an expression.
 _QUANTITY = re.compile(
-    r"[+-]?\s*(\d|\.\d)[\d.]*([eE][+-]?\d+)?(\s*/\s*\d[\d.]*)?\s*([^\W\d_].*|[°%µΩ].*)?\Z", re.DOTALL
+    r"[+-]?\s*(\d|\.\d)[\d.]*([eE][+-]?\d+)?(\s*/\s*\d[\d.]*)?"
+    r"(\s*([^\W\d_]|[°%µΩ(]).*|\s+1\s*[*·⋅/].*|\s*)\Z",
+    re.DOTALL,
 )
 _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 

@@ -2,7 +2,8 @@
 
 Takes: a `CompiledSystem`. Gives: `check_frame`, `skipped`.
 Guarantees: uses neither the Jacobians nor the exponentials of `linearize` and `lift`; start values and
-constant forces are seen to cancel.
+constant forces cancel. Steps in rationals and balls, so that the lifted map alone is rounded: the two may
+differ by the bound that comes with it, and by nothing else.
 Does not: check a site whose equations are not affine, as its lifted map holds near one point only, or one
 that hears by an edge function (see `skipped`).
 """
@@ -10,6 +11,7 @@ that hears by an edge function (see `skipped`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,12 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.batch_lift import exponential_rows
-from apc.runtime.frame.discretize import TOO_LARGE, UNIT
+from apc.runtime.frame.discretize import PRECISIONS, TOO_LARGE, UNIT
+from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.lift import lift
-from apc.runtime.frame.linearize import linearize
-from apc.runtime.frame.parameters import Numbers, resolve
+from apc.runtime.frame.linearize import linearize, linearize_exact
+from apc.runtime.frame.parameters import Numbers, exact_numbers, resolve
 from apc.runtime.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.threads import single_threaded
@@ -36,9 +38,11 @@ SEED = 20_090_616
 # Sites of one kind that are checked: they differ in numbers only, which the functions take as they come.
 MOST_CHECKED = 3
 
-# How much more than the proven rounding of the lifted map the two may differ: stepping rounds as well, in
-# another order, and its exponentials lose log₂‖A T‖ bits that the lifted map's keep.
-MARGIN = 1e2
+# The exponential is a Taylor series of X = A T/2^k with norms below 2^−16 and so many terms, then squared k
+# times: what is left out of every mode is below 2^−(16·25)/25! of it, less than 2^−480.
+SMALL, TERMS = 2.0**-16, 24
+
+TINY = float(np.finfo(np.float64).tiny)
 
 
 def check_frame(system: CompiledSystem) -> float:
@@ -56,47 +60,32 @@ def check_frame(system: CompiledSystem) -> float:
     largest = 0.0
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         for site, schedule, parameters in _checked(system, numbers, sites, schedules):
-            lifted = lift(linearize(site, parameters), schedule)
+            lifted = lift(linearize(site, parameters), schedule, exact=linearize_exact(site, parameters))
             z = generator.standard_normal(len(lifted.z_names))
             r = generator.standard_normal(len(schedule.heard))
-            moved, sent = _frame(site.kind, schedule, parameters, z, r)
-            still, sent_still = _frame(site.kind, schedule, parameters, 0 * z, 0 * r)
-            stepped = np.concatenate([moved - still, sent - sent_still])
             mapped = np.concatenate([lifted.p @ z + lifted.q @ r, lifted.s @ z + lifted.d @ r])
             # Forces and displacements differ by the stiffness: each row is measured by its own terms.
-            size = np.concatenate(
-                [
-                    np.abs(lifted.p) @ np.abs(z)
-                    + np.abs(lifted.q) @ np.abs(r)
-                    + np.abs(moved)
-                    + np.abs(still),
-                    np.abs(lifted.s) @ np.abs(z)
-                    + np.abs(lifted.d) @ np.abs(r)
-                    + np.abs(sent)
-                    + np.abs(sent_still),
-                ]
-            )
-            proven = np.concatenate(
-                [
-                    lifted.p_error @ np.abs(z) + lifted.q_error @ np.abs(r),
-                    lifted.s_error @ np.abs(z) + lifted.d_error @ np.abs(r),
-                ]
-            )
+            size = _terms(lifted.p, lifted.q, lifted.s, lifted.d, z, r)
+            proven = _terms(lifted.p_error, lifted.q_error, lifted.s_error, lifted.d_error, z, r)
             if not (np.isfinite(size).all() and np.isfinite(proven).all()):
                 raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
-            stiffness = 1.0 + _largest_rate(site, parameters) * float(schedule.frame_s)
+            stepped = _precisely_stepped(site.kind, schedule, parameters, z, r, UNIT * size + TINY)
             apart = np.abs(stepped - mapped)
-            different = float(np.max(apart[size > 0] / size[size > 0], initial=0.0))
-            assert (apart <= MARGIN * (proven + stiffness * UNIT * size)).all(), (
+            # What has died out to below the error of a step is measured by that error.
+            different = float(np.max(apart / (size + proven / UNIT + TINY), initial=0.0))
+            # Beside the map's own error, the products with z and r that are added up here.
+            allowed = proven + (len(z) + len(r) + 2) * (UNIT * size + TINY)
+            assert (apart <= allowed).all(), (
                 f"one frame of {site.kind.name}, stepped and lifted, differ by {different:.1e}"
             )
             largest = max(largest, different)
     return largest
 
 
-def _largest_rate(site: SiteJacobians, parameters: Floats) -> float:
-    """Return the norm of A, in 1/s."""
-    return float(np.abs(linearize(site, parameters).a).sum(axis=0).max(initial=0.0))
+def _terms(p: Floats, q: Floats, s: Floats, d: Floats, z: Floats, r: Floats) -> Floats:
+    """Return the magnitudes that each row of z⁺ and s adds up."""
+    both = np.abs(np.concatenate([z, r]))
+    return np.asarray(np.abs(np.vstack([np.hstack([p, q]), np.hstack([s, d])])) @ both)
 
 
 def skipped(system: CompiledSystem) -> tuple[str, ...]:
@@ -124,49 +113,121 @@ def _checked(
                 yield site, schedule, parameters
 
 
-def _frame(kind: Kind, schedule: Schedule, p: Floats, z: Floats, r: Floats) -> tuple[Floats, Floats]:
-    """Step a site through one frame, from z and with r heard; return z⁺ and s."""
-    n_x = len(kind.states)
-    x = z[:n_x].copy()
-    value = dict(zip(schedule.carried, z[n_x:], strict=True))
-    u = np.array([value.get(one, 0.0) if one is not None else 0.0 for one in schedule.acting])
-    sent = np.zeros(len(schedule.sent))
+def _precisely_stepped(
+    kind: Kind, schedule: Schedule, parameters: Floats, z: Floats, r: Floats, asked: Floats
+) -> Floats:
+    """Return z⁺ and s of one frame, each to the error asked for.
+
+    Raises
+    ------
+    ApcError
+        E806 no precision tried is enough.
+    """
+    import flint
+
+    before = flint.ctx.prec
+    try:
+        for bits in PRECISIONS:
+            flint.ctx.prec = bits
+            balls = _stepped(_Stepped(kind, parameters), schedule, z, r)
+            radius = np.array([float(ball.rad()) for ball in balls])
+            if (radius <= asked).all():
+                return np.array([float(ball.mid()) for ball in balls])
+    finally:
+        flint.ctx.prec = before
+    raise ApcError(Mistake("E806", Place("the scene"), TOO_LARGE))
+
+
+def _stepped(site: _Stepped, schedule: Schedule, z: Floats, r: Floats) -> list[Any]:
+    """Step a site through one frame, from z and with r heard; return z⁺ and s in balls."""
+    import flint
+
+    n = len(site.kind.states)
+    zero = flint.arb(0)
+    start, heard = [flint.arb(one) for one in z.tolist()], [flint.arb(one) for one in r.tolist()]
+    x, value = start[:n], dict(zip(schedule.carried, start[n:], strict=True))
+    u = [value.get(one, zero) if one is not None else zero for one in schedule.acting]
+    sent = [zero] * len(schedule.sent)
     for event in schedule.events:
         match event:
             case Propagate(duration):
-                x = _propagate(kind, x, u, p, float(duration * schedule.quantum))
+                x = site.propagated(x, u, duration * schedule.quantum)
             case Act(hold, one):
-                u[hold] = value.get(one, 0.0)
+                u[hold] = value.get(one, zero)
             case Send(partition, rows):
-                everything = _vector(kind.sends[partition].send(x, u, p, 0.0))
+                everything = _times(site.sends[partition], [*x, *u])
                 for channel, row in rows:
                     sent[row] = everything[channel]
             case Tick(partition, index, rows_heard):
-                computing = kind.clocks[partition]
-                m = np.array([value.get(Value(partition, o, index - 1), 0.0) for o in computing.memories])
-                received = np.array([r[list(rows)].sum() for rows in rows_heard])
-                outputs = _vector(computing.tick(x, u, m, received, p, 0.0))
+                memories = site.kind.clocks[partition].memories
+                m = [value.get(Value(partition, o, index - 1), zero) for o in memories]
+                received = [sum((heard[row] for row in rows), zero) for rows in rows_heard]
+                outputs = _times(site.ticks[partition], [*x, *u, *m, *received])
                 value |= {Value(partition, o, index): number for o, number in enumerate(outputs)}
     after = [
         value[Value(one.partition, one.output, one.index + schedule.ticks[one.partition])]
         for one in schedule.carried
     ]
-    return np.concatenate([x, after]), sent
+    return [*x, *after, *sent]
 
 
-def _propagate(kind: Kind, x: Floats, u: Floats, p: Floats, duration: float) -> Floats:
-    """Return x after `duration` seconds with u constant: dx/dt = A x + c, exactly, A column by column."""
-    n = len(x)
-    constant = _vector(kind.derivative(np.zeros(n), u, p, 0.0))
-    # At rest without forces: beside large ones the rates of small displacements would be lost to rounding.
-    at_rest = _vector(kind.derivative(np.zeros(n), 0 * u, p, 0.0))
-    columns = [_vector(kind.derivative(unit, 0 * u, p, 0.0)) - at_rest for unit in np.eye(n)]
-    a = np.reshape(columns, (n, n)).T
-    # By scaling and squaring in floats, where `lift` exponentiates in balls; SciPy's takes 100 ms to import.
-    step, _, _ = exponential_rows(a[None], constant[None, :, None], duration)
-    return np.asarray(step[0] @ np.append(x, 1.0))
+class _Stepped:
+    """A site's functions less their values at zero, exactly, for steps in balls."""
+
+    def __init__(self, kind: Kind, parameters: Floats) -> None:
+        self.kind = kind
+        p = exact_numbers(kind, parameters)
+        self.rates = _columns(kind.derivative, 2, p)
+        self.ticks = [_columns(clock.tick, 4, p) for clock in kind.clocks]
+        self.sends = [_columns(send.send, 2, p) for send in kind.sends]
+
+    def propagated(self, x: list[Any], u: list[Any], duration: Fraction) -> list[Any]:
+        """Return x after `duration` seconds: dx/dt = A x + B u with u constant, by exp([A Bu; 0 0] T)."""
+        import flint
+
+        n = len(x)
+        constant = _times(self.rates, [flint.arb(0)] * n + u)
+        seconds = flint.arb(flint.fmpq(duration.numerator, duration.denominator))
+        entries = [
+            entry
+            for row, rate in zip(self.rates.tolist(), constant, strict=True)
+            for entry in (*row[:n], rate)
+        ]
+        whole = flint.arb_mat(n + 1, n + 1, entries + [0] * (n + 1)) * seconds
+        norm = max((sum(abs(float(one)) for one in row[:n]) for row in whole.tolist()[:n]), default=0.0)
+        squarings = max(0, int(np.ceil(np.log2(norm / SMALL)))) if 0 < norm < np.inf else 0
+        whole = whole / 2**squarings
+        unit = flint.arb_mat(n + 1, n + 1, [int(i == j) for i in range(n + 1) for j in range(n + 1)])
+        step = unit
+        for term in range(TERMS, 0, -1):
+            step = unit + whole * step / term
+        for _ in range(squarings):
+            step = step * step
+        return _times(step, [*x, flint.arb(1)])[:n]
 
 
-def _vector(result: Any) -> Floats:
-    """Return a CasADi column as a vector."""
-    return np.asarray(result, dtype=np.float64).reshape(-1)
+def _columns(function: Any, inputs: int, p: list[Fraction]) -> Any:
+    """Return what an affine function of its first inputs, parameters and time multiplies them by."""
+    import flint
+
+    sizes = [function.numel_in(place) for place in range(inputs)]
+
+    def values(*, at: int | None) -> list[Fraction]:
+        arguments, first = [], 0
+        for size in sizes:
+            arguments.append([Fraction(first + i == at) for i in range(size)])
+            first += size
+        return evaluate_exact(function, [*arguments, p, [Fraction(0)]])[0]
+
+    still = values(at=None)
+    columns = [[a - b for a, b in zip(values(at=j), still, strict=True)] for j in range(sum(sizes))]
+    entries = [columns[j][i] for i in range(len(still)) for j in range(len(columns))]
+    return flint.arb_mat(
+        len(still), len(columns), [flint.arb(flint.fmpq(one.numerator, one.denominator)) for one in entries]
+    )
+
+
+def _times(matrix: Any, vector: list[Any]) -> list[Any]:
+    import flint
+
+    return list((matrix * flint.arb_mat(len(vector), 1, vector)).entries())

@@ -483,6 +483,6 @@ def _columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
     """Return exact vectors as the columns of a float matrix (n, len(vectors))."""
     return (
         np.array([[float(entry) for entry in vector] for vector in vectors], dtype=np.float64)
-        .reshape(-1, n)
+        .reshape(len(vectors), n)
         .T
     )

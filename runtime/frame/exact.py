@@ -37,7 +37,6 @@ _BINARY: dict[int, Callable[[Any, Any], Any]] = {
     casadi.OP_ADD: operator.add,
     casadi.OP_SUB: operator.sub,
     casadi.OP_MUL: operator.mul,
-    casadi.OP_DIV: operator.truediv,
     casadi.OP_FMIN: min,
     casadi.OP_FMAX: max,
     casadi.OP_LT: lambda a, b: int(a < b),
@@ -115,6 +114,8 @@ def evaluate_exact(
             work[outputs[0]] = number(constant)
         elif code in own:
             work[outputs[0]] = own[code](*(work[place] for place in inputs))
+        elif code == casadi.OP_DIV:
+            work[outputs[0]] = _quotient(work[inputs[0]], work[inputs[1]])
         elif code in (casadi.OP_POW, casadi.OP_CONSTPOW):
             work[outputs[0]] = _power(work[inputs[0]], work[inputs[1]], number)
         elif code in _UNARY:
@@ -159,8 +160,15 @@ def _instructions(function: Any) -> tuple[tuple[int, list[int], list[int], float
     return tuple(listed)
 
 
+def _quotient(above: Any, below: Any) -> Any:
+    """Return a quotient; that of two conditions, which are whole numbers, is a rational too."""
+    return Fraction(above, below) if isinstance(above, int) and isinstance(below, int) else above / below
+
+
 def _power(base: Any, exponent: Any, number: Callable[[float], Any]) -> Any:
     """Return base**exponent, exactly when the exponent is whole."""
     if exponent == int(exponent):
         return base ** int(exponent)
+    if base < 0:
+        raise ValueError("math domain error")  # as of math.sqrt; Python's own power is complex
     return number(float(base) ** float(exponent))

@@ -70,7 +70,7 @@ def times_in_use(
     Raises
     ------
     ApcError
-        E805 too many ticks in a frame.
+        E805 too many ticks in a frame, E809 a delay below zero.
     """
     clock_of = {clock.name: clock for clock in system.clocks}
     link_of = {link.name: link for link in system.links}
@@ -87,6 +87,10 @@ def times_in_use(
         clock = link_of[way.link].clock
         clocks[clock] = clock_of[clock]
         delays[way.delay] = timings[way.delay]
+    for name, delay in delays.items():
+        if delay < 0:
+            got = f"{float(delay):g} s"
+            raise ApcError(Mistake("E809", Place(system.name), name, "0 s or more", got))
     if not clocks:  # nothing is sampled: any frame will do
         clocks = dict(clock_of) or {"": Clock("", "", "")}
     period = {name: timings[clock.period] if name else Fraction(1) for name, clock in clocks.items()}

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.parameters import exact_numbers
@@ -46,9 +47,7 @@ def linearize(
         return assemble(
             site.kind, site.affine, [one.astype(np.float64) for one in matrices_of(exact)], _channels_of(site)
         )
-    arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
-    flat = np.asarray(site.function(*arguments), dtype=np.float64).ravel()
-    return site_of_row(site, flat)
+    return site_of_row(site, _finite_slopes(site, parameters, listening))
 
 
 def linearize_exact(
@@ -63,6 +62,7 @@ def linearize_exact(
     """
     assert listening is not None or not site.edges, "who is heard decides what an edge function does"
     assert site.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
+    _finite_slopes(site, parameters, listening)
     arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
     flat = np.array(evaluate_exact(site.function, arguments)[0], dtype=object)
     exact = assemble(site.kind, site.affine, cut(flat, site.shapes), _channels_of(site))
@@ -74,6 +74,51 @@ def linearize_exact(
         for partition in site.kind.clocks
     ]
     return with_own_parts(exact, own, np.add, np.multiply.outer)
+
+
+def _finite_slopes(
+    site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None
+) -> NDArray[np.float64]:
+    """Return the site's function at the start, in floats.
+
+    Raises
+    ------
+    ApcError
+        E808 a value of the site, or a slope of one, that is not finite.
+    """
+    x, u, m, r, p, t = start_arguments(site, [float(value) for value in parameters], float, listening)
+    kind = site.kind
+    if not site.affine:  # else the start is anywhere
+        values = [("der({})", [state.name for state in kind.states], kind.derivative(x, u, p, t))]
+        memories, heard = iter(m), iter(r)
+        for clock in kind.clocks:
+            own = [next(memories) for _ in clock.memories], [next(heard) for _ in clock.receives]
+            values.append(("{}", list(clock.outputs), clock.tick(x, u, *own, p, t)))
+        values += [("{}", list(send.channels), send.send(x, u, p, t)) for send in kind.sends]
+        for form, rows, column in values:
+            _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", kind.name)
+    flat = np.asarray(site.function(x, u, m, r, p, t), dtype=np.float64).ravel()
+    if not np.isfinite(flat).all():
+        matrices = iter(cut(flat, site.shapes))
+        rates = [f"der({state.name})" for state in kind.states]
+        blocks = [(rates, 2), *((clock.outputs, 4) for clock in kind.clocks)]
+        for rows, count in [*blocks, *((send.channels, 2) for send in kind.sends)]:
+            for _ in range(count):
+                _check_finite(rows, next(matrices).sum(axis=1), "the slope of ", kind.name)
+    return flat
+
+
+def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, where: str) -> None:
+    """Refuse what is not finite, by name."""
+    for row, value in zip(rows, values, strict=True):
+        if not np.isfinite(value):
+            told = (
+                f"{what}{row} is {value:g} at the start values: a division by zero, a root or logarithm of "
+            )
+            hint = "start values at which every equation has a finite value and slope"
+            raise ApcError(
+                Mistake("E808", Place(where), f"{told}a number below zero, or the like", hint=hint)
+            )
 
 
 def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
