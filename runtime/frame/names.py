@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from apc.compiler.compiled import PEERS, CompiledSystem, Parameter
+from apc.compiler.compiled import PEERS, CompiledSystem, Parameter, counts_peers
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 
 # The sections of a topology, which a name may start with.
@@ -54,12 +54,11 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     if group is not None and name in {timing.name for timing in system.timings}:
         what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
         raise ApcError(Mistake("E622", place, what, hint=name))
-    if name == PEERS:
-        raise ApcError(
-            Mistake("E623", place, "peers is the number of peers: change a count and compile again")
-        )
+    if counts_peers(name):
+        what = f"{written} is the number of peers" if name == PEERS else f"{written} is how many peers are heard"
+        raise ApcError(Mistake("E623", place, f"{what}: change a count and compile again"))
     if name not in known:
-        near = nearest(name, sorted(known - {PEERS}))
+        near = nearest(name, sorted(one for one in known if not counts_peers(one)))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
     return name, group
 

@@ -53,9 +53,11 @@ Matrices = NDArray[Any]  # float64 or complex128
 # The complex step: its square vanishes beside 1, whatever the parameter's size.
 STEP = 1e-60
 
-# Where it is looked whether a free parameter moves an entry: at a value of no meaning, a derivative that
-# vanishes does so everywhere.
+# Where it is looked whether a free parameter moves an entry: at values of no meaning, each another, a
+# derivative along as meaningless a direction that vanishes does so everywhere. (At one value for all, along a
+# direction that moves all alike, a ratio such as k/m stays.)
 GENERIC_POINT = 0.7390851332151607
+GENERIC_RATIO = 0.6180339887498949
 
 # A step shorter than this share of the delays it is the difference of is none.
 VANISHING = 1e-14
@@ -283,8 +285,8 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
     """Return the wirings, those marked whose rigid directions are not the same at another point."""
     if not any(wiring.rigid.names for wiring in evaluator.wirings):
         return evaluator.wirings
-    base = [parameter_of(evaluator.system, one).value for one in evaluator.free]
-    lifted = evaluator.lifted(np.array([[value * (1 + GENERIC_POINT) + 1e-3 for value in base]]))
+    base = np.array([[parameter_of(evaluator.system, one).value for one in evaluator.free]])
+    lifted = evaluator.lifted(base * (1 + _generic(len(evaluator.free))[0]) + 1e-3)
     found = []
     for wiring in evaluator.wirings:
         matrix = closed_loop(wiring, lifted)
@@ -293,16 +295,24 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
     return tuple(found)
 
 
+def _generic(count: int) -> tuple[Floats, Floats]:
+    """Return a point (1, count) and a direction that mean nothing, their ratios all different."""
+    places = np.arange(count)
+    point = 0.5 + (GENERIC_POINT * (1 + places)) % 1.0
+    along = 0.5 + (GENERIC_RATIO * (1 + places)) % 1.0
+    return point[None], along[None]
+
+
 def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Matrices]]:
     """Return the exponentials of the groups whose A and B no free parameter moves, at a meaningless point."""
     if evaluator.timed:
         return {}
     found: dict[tuple[int, int], Mapping[int, Matrices]] = {}
-    point = np.full((1, len(evaluator.free)), GENERIC_POINT)
+    point, along = _generic(len(evaluator.free))
     for group in evaluator.groups:
         if site_key(group) in found:
             continue
-        vectors = evaluator.vectors(group, point + (STEP * 1j) * np.ones_like(point))
+        vectors = evaluator.vectors(group, point + (STEP * 1j) * along)
         site = sites_of_rows(group.jacobians, evaluator.rows(group.jacobians, vectors))
         if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
             found[site_key(group)] = evaluator.steps(site, point)

@@ -15,7 +15,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import PEERS, CompiledSystem, Parameter
+from apc.compiler.compiled import CompiledSystem, Group, Parameter, counts_peers
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.runtime.eigen.closing import ClosedSystem
@@ -23,6 +23,7 @@ from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.frame.rows import free_rows
 from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
 
 Floats = NDArray[np.float64]
@@ -194,16 +195,38 @@ def _unbounded(parameter: Parameter) -> Parameter:
 
 
 def free_parameters(system: CompiledSystem) -> list[Free]:
-    """Return the parameters that follow from no other and set no time: everybody's, then the groups' own.
+    """Return the parameters that follow from no other, set no time and count nobody, each as it can be set.
 
-    Everybody's value reaches the groups that have none of their own. What is given peer by peer, or to a
-    group as an expression, has no one value and is left out.
+    A parameter is everybody's where no group has a value of its own; else it is that of each group it reaches,
+    as everybody's would set the groups' own as well. What is given to a group peer by peer, or as an
+    expression, has no one value there and is left out.
     """
-    several = {column.name for group in system.groups for column in group.columns}
-    several |= {one.name for group in system.groups for one in group.values if one.expression}
-    listed = [Free(one.name) for one in system.parameters if one.expression is None and one.name != PEERS]
-    listed += [Free(one.name, group.name) for group in system.groups for one in group.values]
-    return [one for one in listed if one.name not in several and not reaches_time(system, one)]
+    listed = []
+    for one in system.parameters:
+        if one.expression is not None or counts_peers(one.name) or reaches_time(system, Free(one.name)):
+            continue
+        several = {
+            group.name: any(column.name == one.name for column in group.columns)
+            or any(own.name == one.name and own.expression for own in group.values)
+            for group in system.groups
+        }
+        own = any(own.name == one.name for group in system.groups for own in group.values)
+        if not own and not any(several.values()):
+            listed.append(Free(one.name))
+            continue
+        listed += [
+            Free(one.name, group.name)
+            for group in system.groups
+            if not several[group.name] and _reaches(system, group, one.name)
+        ]
+    return listed
+
+
+def _reaches(system: CompiledSystem, group: Group, name: str) -> bool:
+    """Say whether a parameter's value in a group enters the group's equations."""
+    values = {Free(name, group.name): np.array([float(GENERIC), float(2 * GENERIC)])}
+    with np.errstate(all="ignore"):
+        return len(free_rows(system, group, 0, values)) > 1
 
 
 def reaches_time(system: CompiledSystem, free: Free) -> bool:
