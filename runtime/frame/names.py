@@ -55,8 +55,9 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
         what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
         raise ApcError(Mistake("E622", place, what, hint=name))
     if counts_peers(name):
-        what = f"{written} is the number of peers" if name == PEERS else f"{written} is how many peers are heard"
-        raise ApcError(Mistake("E623", place, f"{what}: change a count and compile again"))
+        what = "the number of peers" if name == PEERS else "how many peers are heard"
+        message = f"{written} is {what}: change a count and compile again"
+        raise ApcError(Mistake("E623", place, message))
     if name not in known:
         near = nearest(name, sorted(one for one in known if not counts_peers(one)))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))

@@ -297,10 +297,8 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
 
 def _generic(count: int) -> tuple[Floats, Floats]:
     """Return a point (1, count) and a direction that mean nothing, their ratios all different."""
-    places = np.arange(count)
-    point = 0.5 + (GENERIC_POINT * (1 + places)) % 1.0
-    along = 0.5 + (GENERIC_RATIO * (1 + places)) % 1.0
-    return point[None], along[None]
+    places = 1.0 + np.arange(count)
+    return 0.5 + np.mod(GENERIC_POINT * places, 1.0)[None], 0.5 + np.mod(GENERIC_RATIO * places, 1.0)[None]
 
 
 def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Matrices]]:
@@ -399,9 +397,7 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
     found = []
     errors, plain = matrix_errors(evaluator, values), evaluator.lifted(complex_values)
     for wiring, error in zip(evaluator.wirings, errors, strict=True):
-        whole = replace(
-            wiring, now=tuple(map(np.abs, wiring.now)), before=tuple(map(np.abs, wiring.before))
-        )
+        whole = replace(wiring, now=tuple(map(np.abs, wiring.now)), before=tuple(map(np.abs, wiring.before)))
         terms = charge + sum(now.shape[0] + now.shape[1] for now in wiring.now)
         off = (2 * terms * UNIT) * closed_loop(whole, large).imag / STEP
         rest, held = wiring.rest, wiring.held
@@ -424,7 +420,7 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
 
 def _sized(matrix: Matrices) -> Matrices:
     """Return the magnitudes of values and slopes as numbers with a complex step."""
-    return np.abs(matrix.real) + 1j * np.abs(matrix.imag)
+    return np.asarray(np.abs(matrix.real) + 1j * np.abs(matrix.imag))
 
 
 def _large_step(site: LinearSite, seconds: float) -> tuple[Matrices, float]:

@@ -111,10 +111,10 @@ class PointEvaluator:
         return split(*lifted_groups(apply(self.system, overrides), prepared=self.prepared)).systems
 
     def differences(self, value: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the matrix (n, n) at a point (m,), its derivatives (m, n, n), and bounds on the errors of both.
+        """Return the matrix (n, n) at a point (m,) and its error, its derivatives (m, n, n) and theirs.
 
-        A difference of two steps and one of twice that cancel what each cuts off; what they differ by, and the
-        matrices' own errors over a step, bound what is left. A derivative is NaN where there is none.
+        A difference of two steps and one of twice that cancel what each cuts off; what they differ by, and
+        the matrices' own errors over a step, bound what is left. A derivative is NaN where there is none.
         """
         here = self._bounded(value)
         matrix, error = (one[0] for one in _filled_up_pairs([here]))
@@ -197,7 +197,8 @@ def _reduced(system: ClosedSystem, free: RigidModes) -> tuple[Floats, Floats]:
 
 def _filled_up_pairs(pairs: Sequence[Sequence[tuple[Floats, Floats]]]) -> tuple[Floats, Floats]:
     """Return the matrices of each point as one (k, n, n), and their errors."""
-    return _filled_up([[m for m, _ in one] for one in pairs]), _filled_up([[e for _, e in one] for one in pairs])
+    matrices, errors = ([[pair[place] for pair in one] for one in pairs] for place in (0, 1))
+    return _filled_up(matrices), _filled_up(errors)
 
 
 def _shapes(blocks: Sequence[tuple[Floats, Floats]]) -> list[int]:
@@ -257,9 +258,9 @@ def _unbounded(parameter: Parameter) -> Parameter:
 def free_parameters(system: CompiledSystem) -> list[Free]:
     """Return the parameters that follow from no other, set no time and count nobody, each as it can be set.
 
-    A parameter is everybody's where no group has a value of its own; else it is that of each group it reaches,
-    as everybody's would set the groups' own as well. What is given to a group peer by peer, or as an
-    expression, has no one value there and is left out.
+    A parameter is everybody's where no group has a value of its own; else it is that of each group it
+    reaches, as everybody's would set the groups' own as well. What is given to a group peer by peer, or as
+    an expression, has no one value there and is left out.
     """
     listed = []
     for one in system.parameters:

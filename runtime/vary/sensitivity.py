@@ -205,7 +205,9 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
     if not clusters:
         return Sensitivities(0.0, (), (), "nothing moves: there is no eigenvalue")
     radius = max(float(np.abs(one.values).max()) for one in clusters)
-    leading = [one for one in clusters if np.abs(one.values).max() > radius - SHARED - np.ptp(np.abs(one.values))]
+    leading = [
+        one for one in clusters if np.abs(one.values).max() > radius - SHARED - np.ptp(np.abs(one.values))
+    ]
     leading.sort(key=lambda one: -float(np.abs(one.values).max()))
     rows: list[Sensitivity] = []
     active: list[tuple[complex, str]] = []
@@ -289,7 +291,9 @@ def _clusters(moved: _Moved) -> list[_Cluster]:
         rows, columns = left[:, partners].T, right[:, near]
         product = rows @ columns
         least = float(np.linalg.svd(product, compute_uv=False)[-1])
-        condition = float(np.linalg.norm(rows, 2) * np.linalg.norm(columns, 2) / least) if least > 0 else np.inf
+        condition = (
+            float(np.linalg.norm(rows, 2) * np.linalg.norm(columns, 2) / least) if least > 0 else np.inf
+        )
         rows = np.linalg.solve(product, rows) if condition < WORST else rows
         whole, covector = np.zeros((2, len(moved.matrix), len(near)), np.complex128)
         whole[rest], covector[rest], covector[held] = columns, rows.T, -(rows @ weights).T
@@ -297,9 +301,7 @@ def _clusters(moved: _Moved) -> list[_Cluster]:
     return clusters
 
 
-def _resolved(
-    values: Complexes, right: Complexes, found: Complexes, left: Complexes, size: Floats
-) -> bool:
+def _resolved(values: Complexes, right: Complexes, found: Complexes, left: Complexes, size: Floats) -> bool:
     """Say whether eigenvalues near to one another differ by more than the errors of all of them."""
     rows = left[:, [int(np.argmin(np.abs(found - value))) for value in values]].T
     scale = np.abs(np.einsum("ij,ji->i", rows, right))
@@ -322,7 +324,7 @@ def _rates(one: _Cluster) -> Iterator[tuple[Floats | None, float]]:
     n, c = x.shape
     if not len(moved.slopes):
         return
-    known = np.isfinite(moved.slopes).all(axis=(1, 2))
+    known = np.array([bool(np.isfinite(slope).all()) for slope in moved.slopes])
     slopes = np.where(known[:, None, None], moved.slopes, 0.0)
     off = np.where(known[:, None, None], moved.slope_errors, 0.0)
     rates = w @ slopes @ x  # (m, c, c)

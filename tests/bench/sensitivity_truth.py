@@ -10,6 +10,7 @@ a value, frequencies from following each mode through a frame.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import random
 from collections.abc import Iterator, Sequence
@@ -31,7 +32,7 @@ from apc.runtime.bench.reference import (
     classes_of,
 )
 from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.names import find, parameter_of, Free
+from apc.runtime.frame.names import Free, find, parameter_of
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.sensitivity import Sensitivities, sensitivities
 from tests.bench.judge import Judge
@@ -78,7 +79,10 @@ def scene(generator: random.Random) -> str:
         own = f"contact.stiffness: {number(1, 3)} N/m, device.mass: {number(-1.5, 0)} kg"
         groups = f"a: {{count: {generator.randint(1, 2)}}}\n  b: {{count: {generator.randint(1, 2)}, set: {{{own}}}}}"
     if kind == "star":
-        groups, graph = f"hub: {{count: 1, set: {{device.mass: {number(-1, 0)} kg}}}}\n  tip: {{count: 2}}", ", graph: star"
+        groups, graph = (
+            f"hub: {{count: 1, set: {{device.mass: {number(-1, 0)} kg}}}}\n  tip: {{count: 2}}",
+            ", graph: star",
+        )
     if kind == "arcs":
         groups = "user: {count: 3}"
         arcs = ", ".join(f"[{i}, {j}, {pick([0.5, 1, 2])}]" for i, j in ((1, 2), (2, 1), (2, 3), (3, 1)))
@@ -87,7 +91,12 @@ def scene(generator: random.Random) -> str:
     if kind == "contact":  # a wall that pushes: linear where it is touched or left
         contact = f"{{type: OneSidedContact, a: device, b: cube, half_width: 1 mm, stiffness: {number(1, 3)} N/m, damping: {number(-2, 0)} N*s/m, clock: haptic, delay: {delay}}}"
     coupling = pick(["AveragePosition", "FullMesh"])
-    more = pick(["", f"  arm: {{type: SpringDamperArm, flange: device, stiffness: {number(0, 2)} N/m, damping: 1 N*s/m}}\n"])
+    more = pick(
+        [
+            "",
+            f"  arm: {{type: SpringDamperArm, flange: device, stiffness: {number(0, 2)} N/m, damping: 1 N*s/m}}\n",
+        ]
+    )
     arm = f"hands:\n{more}" if more else ""
     fast = f"  link: {{type: SpringDamper, a: device, b: cube, stiffness: {number(2, 5)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
     fast = fast if generator.random() < 0.3 else ""
@@ -151,7 +160,10 @@ def _matrices(system: CompiledSystem) -> list[Any]:
 
 
 def _values(matrix: Any) -> list[Any]:
-    return [v.mid() for v in flint.acb_mat(matrix.mid()).eig(algorithm="approx", maxiter=flint.ctx.prec * matrix.nrows())]
+    return [
+        v.mid()
+        for v in flint.acb_mat(matrix.mid()).eig(algorithm="approx", maxiter=flint.ctx.prec * matrix.nrows())
+    ]
 
 
 def _is_rigid(value: Any) -> bool:
@@ -210,7 +222,10 @@ def _slopes(system: CompiledSystem, here: Sequence[Any], name: str) -> list[Any]
 
     if value:
         low, high = value * (1 - STEP), value * (1 + STEP)
-        return [(b - a) * (flint.acb(1) / (flint.acb(high) - flint.acb(low))) for a, b in zip(at(low), at(high), strict=True)]
+        return [
+            (b - a) * (flint.acb(1) / (flint.acb(high) - flint.acb(low)))
+            for a, b in zip(at(low), at(high), strict=True)
+        ]
     still = [flint.acb_mat(matrix.mid()) for matrix in here]
     near, far = at(STEP**2), at(2 * STEP**2)
     one = flint.acb(1) / flint.acb(2 * STEP**2)
@@ -222,9 +237,10 @@ def _rates(top: tuple[int, list[Any], Any, Any], slopes: Sequence[Any]) -> list[
     place, own, w, v = top
     rate = w * slopes[place] * v
     c = len(own)
-    moves = [rate[0, 0]] if c == 1 else [one.mid() for one in flint.acb_mat(rate.mid()).eig(algorithm="approx")]
-    found = [float(((value.conjugate() * move) / abs(value)).real.mid()) for value in own for move in moves]
-    return found
+    moves = (
+        [rate[0, 0]] if c == 1 else [one.mid() for one in flint.acb_mat(rate.mid()).eig(algorithm="approx")]
+    )
+    return [float(((value.conjugate() * move) / abs(value)).real.mid()) for value in own for move in moves]
 
 
 def check_frequencies(system: CompiledSystem, found: Analysis) -> str:
@@ -245,11 +261,17 @@ def check_frequencies(system: CompiledSystem, found: Analysis) -> str:
         maps = [_whole_map(scene, frame) for scene in scenes]
         values = [_values(one) for one in maps]
         for mode in found.modes:
-            if not math.isfinite(mode.frequency_hz) or mode.magnitude < FADED or mode.magnitude <= 2 * mode.error:
+            if (
+                not math.isfinite(mode.frequency_hz)
+                or mode.magnitude < FADED
+                or mode.magnitude <= 2 * mode.error
+            ):
                 continue
             truths = []
             for scene, matrix, listed in zip(scenes, maps, values, strict=True):
-                near = [one for one in listed if abs(complex(one) - mode.eigenvalue) <= max(2 * mode.error, 1e-12)]
+                near = [
+                    one for one in listed if abs(complex(one) - mode.eigenvalue) <= max(2 * mode.error, 1e-12)
+                ]
                 if near:
                     _, right = _vectors(flint.acb_mat(matrix.mid()), near[:1])
                     turns = _turns(scene, frame, [right[i, 0] for i in range(right.nrows())])
@@ -290,13 +312,21 @@ def _turns(scene: Happening, frame: Fraction, state: Sequence[Any]) -> list[floa
     def note() -> None:
         rows.append([complex(*map(float, np.broadcast_to(one, 2))) for x in play.x for one in x])
 
-    fastest = max((math.sqrt(max(float(abs(e)) for e in site.rate.entries()) if site.rate.nrows() else 0.0) for site in scene.sites), default=0.0)
+    fastest = max(
+        (
+            math.sqrt(max(float(abs(e)) for e in site.rate.entries()) if site.rate.nrows() else 0.0)
+            for site in scene.sites
+        ),
+        default=0.0,
+    )
     note()
     instants = scene.instants(Fraction(0), frame)
-    for start, end in zip(instants, instants[1:], strict=False):
+    for start, end in itertools.pairwise(instants):
         count = min(max(POINTS, 8 * math.ceil(float(end - start) * fastest)), 20_000)
         for place in range(count):
-            scene.play(play, start + (end - start) * place / count, start + (end - start) * (place + 1) / count)
+            scene.play(
+                play, start + (end - start) * place / count, start + (end - start) * (place + 1) / count
+            )
             note()
     course = np.array(rows)
     largest = np.abs(course).max(axis=0)
@@ -316,7 +346,9 @@ def run(points: int, *, seed: int = 0) -> list[str]:
         system = compiled(text)
         found = analyze(system)
         wrong += [
-            f"{one}\n{text}" for one in (check_sensitivities(system, found), check_frequencies(system, found)) if one
+            f"{one}\n{text}"
+            for one in (check_sensitivities(system, found), check_frequencies(system, found))
+            if one
         ]
     return wrong
 
