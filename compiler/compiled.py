@@ -1,7 +1,7 @@
 """The compiled model: CasADi functions of one site per kind, and the exchange between sites as structure.
 
 Takes: nothing (these are the data types the stage `functions` fills and the runtime reads).
-Gives: `CompiledSystem` and its parts.
+Gives: `CompiledSystem` and its parts; `PEERS`, `count_of`, `counts_peers`.
 Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
 Does not: evaluate anything, or read or write files (see `store`).
 
@@ -26,6 +26,17 @@ from numpy.typing import NDArray
 
 PEERS = "peers"  # the parameter that holds the number of peers
 LARGEST_COUNT = 10**9  # of peers in one group
+COUNT = "count("  # how those begin that hold how many peers are heard over a link, see `count_of`
+
+
+def count_of(link: str) -> str:
+    """Return the name of the parameter that counts, with their weights, the peers heard over a link."""
+    return f"{COUNT}{link})"
+
+
+def counts_peers(parameter: str) -> bool:
+    """Say whether a parameter is a number of peers: it follows from who is there and can't be set."""
+    return parameter == PEERS or parameter.startswith(COUNT)
 
 
 @dataclass(frozen=True, slots=True)

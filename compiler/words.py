@@ -1,6 +1,6 @@
 """The words of messages and reports: numbers with their nouns and units, and lines that fit a terminal.
 
-Takes: numbers and texts. Gives: `WIDTH`, `cut`, `counted`, `with_unit`, `wrapped`.
+Takes: numbers and texts. Gives: `WIDTH`, `cut`, `counted`, `with_unit`, `in_hertz`, `wrapped`.
 Guarantees: a line is at most `WIDTH` columns wide, but for a word that has no place to break it at.
 Does not: know what is told, or print.
 """
@@ -27,6 +27,11 @@ def counted(number: int, noun: str, form: str = "d") -> str:
 def with_unit(number: str, unit: str) -> str:
     """Return a number with its unit, alone where that is "1"."""
     return number if unit == "1" else f"{number} {unit}"
+
+
+def in_hertz(frequency: float) -> str:
+    """Return a frequency to four digits with its unit, `–` for one that can't be told (NaN)."""
+    return f"{frequency:.4g} Hz" if frequency == frequency else "–"
 
 
 def wrapped(text: str, first: str = "", later: str = "") -> list[str]:

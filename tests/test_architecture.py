@@ -47,7 +47,7 @@ HOUSE = (
         discretize exchange
         guards site jacobians start linearize
         schedule liveness hearing hyperperiod scheduling
-        lift batch_lift residues
+        lift batch_lift course residues
         """,
     ),
     ("apc.runtime.network", "channel_law packets listener timetable weights gathering"),

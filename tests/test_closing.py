@@ -22,9 +22,11 @@ def test_a_common_state_of_equal_peers_moves_as_each_of_them_does() -> None:
     np.testing.assert_allclose(
         whole.matrix @ np.tile(state, 3), np.tile(common.matrix @ state, 3), rtol=1e-12
     )
-    # And so do the positions at every tick of the frame.
-    inside = (whole.inside @ np.tile(state, 3)).reshape(len(whole.inside), 3, 4)
-    np.testing.assert_allclose(inside[:, 1], common.inside @ state, rtol=1e-11, atol=1e-13)
+    # And so does what they hear.
+    for heard in whole.heard:
+        np.testing.assert_allclose(
+            heard @ np.tile(state, 3), common.heard[0] @ state, rtol=1e-11, atol=1e-13
+        )
 
 
 def test_a_packet_on_its_way_grows_older_frame_by_frame() -> None:

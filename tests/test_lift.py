@@ -61,13 +61,6 @@ def test_what_is_heard_and_sent_on_in_one_frame_is_nilpotent() -> None:
     assert not np.linalg.matrix_power(feedback, len(feedback)).any()
 
 
-def test_the_end_of_the_inside_is_the_continuous_part_of_the_map() -> None:
-    lifted = _lifted()
-    np.testing.assert_array_equal(lifted.inside[-1], np.hstack([lifted.p, lifted.q])[:4])
-    np.testing.assert_array_equal(lifted.inside[0], np.eye(4, 8))
-    assert len(lifted.inside) == 9
-
-
 @pytest.mark.parametrize("damping", [0.0, 1e-6, 5.0, 500.0])
 def test_no_digit_is_lost_as_the_damping_goes_to_zero(damping: float) -> None:
     """(1 − e^(−bT/m)) m/b as expm1 has it; the plain formula loses every digit."""

@@ -17,7 +17,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.runtime.analysis.analysis import Analysis, analyze
 from apc.runtime.eigen.enclosure import enclose_eigenvalues
 from apc.runtime.eigen.rigid import independent_places
-from apc.runtime.eigen.spectrum import _relative, oscillation, turned_along
+from apc.runtime.eigen.spectrum import _relative, oscillation
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS, RADII
 from tests.sites import MS, grouped, paper
@@ -373,20 +373,6 @@ def test_the_dense_system_gives_the_same_answer() -> None:
         assert split.spectral_radius == pytest.approx(whole.spectral_radius, abs=1e-12)
         assert (split.verdict, split.rigid_modes) == (whole.verdict, whole.rigid_modes)
         assert sum(mode.multiplicity for mode in split.modes) == len(whole.modes)
-
-
-def test_a_change_of_sign_at_every_mark_is_half_a_turn_each_whatever_the_zeros_sign() -> None:
-    course = np.array([complex(1.0, 0.0), complex(-1.5, -0.0), complex(1.2, 0.0), complex(-1.8, -0.0)])
-    course = np.append(course, complex(2.3, 0.0))
-    for one in (course, course.conj(), -course, course * np.exp(1j)):
-        assert turned_along(one, complex(2.3)) == pytest.approx(4 * math.pi, rel=1e-12)
-
-
-def test_a_course_over_the_whole_range_of_floats_still_has_its_angle() -> None:
-    """A quarter turn a mark for six marks, from 1e-250 to 1e250 and back: one and a half turns."""
-    sizes = np.array([1e-250, 1e250, 1e-250, 1e250, 1e-250, 1e250, 1e-250])
-    course = sizes * np.exp(0.5j * np.pi * np.arange(7))
-    assert turned_along(course, -1.0 + 0j) == pytest.approx(3 * np.pi)
 
 
 def test_an_angle_below_a_rounding_is_none() -> None:

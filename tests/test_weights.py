@@ -115,7 +115,7 @@ def test_many_peers_of_different_weights_keep_their_translation() -> None:
 
 
 def test_a_count_is_no_parameter_to_set() -> None:
-    with pytest.raises(ApcError, match=r"E623 count\(lan\) follows from who hears whom"):
+    with pytest.raises(ApcError, match=r"E623 count\(lan\) is how many peers are heard"):
         find(compiled(MESH), "count(lan)")
 
 

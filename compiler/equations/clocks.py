@@ -22,10 +22,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
+from apc.compiler.compiled import count_of
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clock_inference import CONTINUOUS, ClockInference, domain
 from apc.compiler.equations.flatten import FlatEquation, FlatKind, FlatSend, FlatSystem, is_made
-from apc.compiler.equations.reductions import affine_in_others, count_of, hears_others
+from apc.compiler.equations.reductions import affine_in_others, hears_others
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.expression import (
     Binary,

@@ -1,6 +1,6 @@
 """What a peer hears of the others: reductions, and linear ones taken apart.
 
-Takes: expressions that read `others`. Gives: `REDUCTIONS`, `hears_others`, `affine_in_others`, `count_of`.
+Takes: expressions that read `others`. Gives: `REDUCTIONS`, `hears_others`, `affine_in_others`.
 Guarantees: c₀ + Σ cₖ·others.k has the value of the expression it was taken from.
 Does not: know clocks or links.
 
@@ -23,11 +23,6 @@ from apc.compiler.language.expression import (
 )
 
 REDUCTIONS = ("mean", "sum", "max", "min", "count")
-
-
-def count_of(link: str) -> str:
-    """Return the name of the parameter that counts, with their weights, the peers heard over a link."""
-    return f"count({link})"
 
 
 def hears_others(call: Call) -> bool:

@@ -26,11 +26,11 @@ from apc.compiler.compiled import (
     PairDelay,
     Parameter,
     Timing,
+    count_of,
 )
 from apc.compiler.components.component import Number as NumberParameter
 from apc.compiler.equations.clocks import HoldCrossing
 from apc.compiler.equations.flatten import FlatKind
-from apc.compiler.equations.reductions import count_of
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import Expr, Name, Number, format_expression, transform

@@ -23,7 +23,7 @@ from apc.runtime.eigen.closing import close_loop
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.peer_group import PeerGroup, states_of
 from apc.runtime.eigen.peers import peer_groups
-from apc.runtime.eigen.spectrum import Mode, Spectrum, solve_spectrum
+from apc.runtime.eigen.spectrum import Mode, Spectrum, finite, solve_spectrum
 from apc.runtime.frame.discretize import TOO_LARGE
 from apc.runtime.frame.exchange import Exchange, build_exchange
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
@@ -97,8 +97,8 @@ class Analysis:
                     "eigenvalue": [mode.eigenvalue.real, mode.eigenvalue.imag],
                     "magnitude": mode.magnitude,
                     "multiplicity": mode.multiplicity,
-                    "frequency_hz": mode.frequency_hz,
-                    "damping_ratio": mode.damping_ratio,
+                    "frequency_hz": finite(mode.frequency_hz),
+                    "damping_ratio": finite(mode.damping_ratio),
                     "shape": mode.shape,
                     "participation": dict(mode.participation),
                     "error": mode.error,

@@ -20,10 +20,10 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.words import wrapped
+from apc.compiler.words import in_hertz, wrapped
 from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
-from apc.runtime.eigen.spectrum import UNSTABLE
+from apc.runtime.eigen.spectrum import UNSTABLE, finite
 from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.linearize import linearize
 from apc.runtime.frame.parameters import resolve
@@ -107,7 +107,7 @@ class ContactModes:
                 lines += [f"{head}  not analysed:", *wrapped(mode.refusal, "    ", "    ")]
                 continue
             radius = f"{mode.spectral_radius:.9f} ± {mode.spectral_radius_error:.0e}"
-            frequency = f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–"
+            frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
             verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
             lines.append(f"{head}  {radius:<19}  {frequency:>9}  {verdict}{'*' if mode.linearized else ''}")
         if any(mode.linearized for mode in self.modes):
@@ -128,7 +128,7 @@ class ContactModes:
                     "stable": mode.stable,
                     "spectral_radius": mode.spectral_radius if mode.verdict else None,
                     "spectral_radius_error": mode.spectral_radius_error if mode.verdict else None,
-                    "frequency_hz": mode.frequency_hz if mode.verdict else None,
+                    "frequency_hz": finite(mode.frequency_hz) if mode.verdict else None,
                     "linearized": mode.linearized,
                     "refusal": mode.refusal,
                 }

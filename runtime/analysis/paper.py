@@ -144,7 +144,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
         loop = open_loop(system, whole)
         rigid = find_rigid_modes(whole)
         closed, dead = _without_rigid(loop, whole, rigid)
-        spectrum = _with_rigid(solve_spectrum([closed]), rigid)
+        spectrum = _with_rigid(_with_turns(solve_spectrum([closed]), solve_spectrum([whole])), rigid)
     size = dead + len(closed.names) + rigid.basis.shape[1]
     return Analysis(
         topology=system.name,
@@ -354,9 +354,7 @@ def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tu
     # A path through a frame passes at most so many sums and coefficients (see `lift.lift`).
     roundings = (3 * ratio + 4) * (lifted.terms + 2 + COEFFICIENT_ROUNDINGS)
     charge = roundings * UNIT / (1 - roundings * UNIT)
-    course = np.vstack([np.eye(n, len(closed), dead), closed[: ratio * n]])  # x at ticks 0 … R
     matrix, size = closed[dead:, dead:], size[dead:, dead:]
-    inside = course[:, dead:].reshape(ratio + 1, n, -1)
     names = (*loop.states, *_waiting_names(loop))
     error = charge * size
     rest = np.arange(len(matrix))
@@ -380,7 +378,6 @@ def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tu
             + UNIT * size[np.ix_(rest, rest)]
         )
         matrix = matrix[np.ix_(rest, rest)] - weights @ matrix[np.ix_(held, rest)]
-        inside = inside[:, moving][:, :, rest] - weights[: len(moving)] @ inside[:, held][:, :, rest]
     system = ClosedSystem(
         name=METHOD,
         multiplicity=1,
@@ -392,7 +389,7 @@ def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tu
         packets=(),
         matrix=matrix,
         error=error,
-        inside=inside,
+        heard=(),
         motion=tuple(range(len(moving))),
     )
     return system, dead
@@ -440,6 +437,22 @@ def _rigid_basis(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tupl
         ]
     )
     return basis, doubt
+
+
+def _with_turns(spectrum: Spectrum, whole: Spectrum) -> Spectrum:
+    """Return a spectrum with the frequencies of another of the same eigenvalues.
+
+    The lifted matrices know a frame's ticks and nothing in between: whole turns there are counted elsewhere.
+    """
+    values = np.array([mode.eigenvalue for mode in whole.modes])
+    modes = []
+    for mode in spectrum.modes:
+        near = int(np.argmin(np.abs(values - mode.eigenvalue))) if np.isnan(mode.frequency_hz) else -1
+        same = whole.modes[near] if near >= 0 else mode
+        if same is mode or abs(same.eigenvalue - mode.eigenvalue) <= same.error + mode.error:
+            mode = replace(mode, frequency_hz=same.frequency_hz, damping_ratio=same.damping_ratio)
+        modes.append(mode)
+    return replace(spectrum, modes=tuple(modes))
 
 
 def _with_rigid(spectrum: Spectrum, rigid: RigidModes) -> Spectrum:

@@ -10,10 +10,11 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.words import WIDTH, counted, wrapped
+from apc.compiler.words import WIDTH, counted, in_hertz, wrapped
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -165,8 +166,8 @@ def _cells(mode: Mode) -> tuple[str, ...]:
         f"{mode.magnitude:.6f}" if mode.magnitude < LARGE else f"{mode.magnitude:.6e}",
         mode.shape,
         str(mode.multiplicity),
-        f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "–",
-        f"{mode.damping_ratio:.3g}",
+        in_hertz(mode.frequency_hz) if mode.frequency_hz else "–",
+        "–" if isnan(mode.damping_ratio) else f"{mode.damping_ratio:.3g}",
         _leading(mode),
     )
 

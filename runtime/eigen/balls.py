@@ -154,7 +154,7 @@ def compose(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[S
                 while (spoken := next(course))[0] >= 0:
                     sent[g, spoken[0]] = spoken[1]
             except StopIteration as end_of_frame:
-                state, _ = end_of_frame.value
+                state = end_of_frame.value
                 matrix[system.offsets[g] : system.offsets[g] + len(state)] = state
                 del courses[g]
         assert (len(courses), len(sent)) != known, "a packet is heard before it is sent"

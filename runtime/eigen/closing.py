@@ -32,10 +32,10 @@ class ClosedSystem:
 
     The state holds, site by site, z and then the packets on their way; `names` names it, `offsets` says
     where each site's part starts, `packets` lists the packets in order of state (site by site). `error`
-    bounds the rounding error of the matrix entry by entry. `inside` holds all continuous states (site by
-    site) at the ticks of the fastest clock as rows over the state; `motion` says where these are in the
-    state. `doubts` say by how much each weight of a way may be off; `surds`, of a system of one site, what
-    its weights are in closed form.
+    bounds the rounding error of the matrix entry by entry. `heard` is what each site hears in a frame, over
+    the state; `motion` says where the continuous states are in the state (site by site). `doubts` say by how
+    much each weight of a way may be off; `surds`, of a system of one site, what its weights are in closed
+    form.
     """
 
     name: str
@@ -48,7 +48,7 @@ class ClosedSystem:
     packets: tuple[Packet, ...]
     matrix: Floats  # (n, n)
     error: Floats  # (n, n)
-    inside: Floats  # (marks, n_x of all sites, n)
+    heard: tuple[Floats, ...]  # (n_r, n), one a site
     motion: tuple[int, ...]
     doubts: Mapping[Way, float] = field(default_factory=dict)
     surds: Mapping[Way, Surd] = field(default_factory=dict)
@@ -66,15 +66,11 @@ def close_loop(loop: Loop) -> ClosedSystem:
     layout = lay_out(loop)
     exact = [(site.p, site.q, site.s, site.d) for site in lifted]
     matrix, heard = _closed(exact, _links(loop, layout, lambda weight, _: float(weight)), layout)
-    marks = min(len(site.inside) for site in lifted)
-    inside = np.zeros((marks, sum(site.continuous for site in lifted), len(layout.names)))
-    motion: list[int] = []
-    for site, offset, r in zip(lifted, layout.offsets, heard, strict=True):
-        n_z = len(site.z_names)
-        rows = slice(len(motion), len(motion) + site.continuous)
-        inside[:, rows, offset : offset + n_z] = site.inside[:, :, :n_z]
-        inside[:, rows] += site.inside[:, :, n_z:] @ r
-        motion += range(offset, offset + site.continuous)
+    motion = [
+        offset + place
+        for site, offset in zip(lifted, layout.offsets, strict=True)
+        for place in range(site.continuous)
+    ]
     return ClosedSystem(
         name=loop.name,
         multiplicity=loop.multiplicity,
@@ -86,7 +82,7 @@ def close_loop(loop: Loop) -> ClosedSystem:
         packets=layout.packets,
         matrix=matrix,
         error=_closing_errors(loop, layout, exact),
-        inside=inside,
+        heard=tuple(heard),
         motion=tuple(motion),
         doubts=loop.doubts,
         surds=loop.surds,

@@ -1,7 +1,7 @@
 """Eigenvalues with error bounds, and the verdict.
 
 Takes: the `ClosedSystem`s that make up a whole.
-Gives: `Mode`, `Spectrum`, `solve_spectrum`.
+Gives: `Mode`, `Spectrum`, `solve_spectrum`; `whole_vectors`, `angles_in_frame`, `oscillation`, `finite`.
 Guarantees: rigid modes are removed before any eigenvalue is computed; every reported error bounds what
 rounding did since the site's coefficients. What floats leave open is proved in balls where that can be (see
 `certify`), or else says that it is open.
@@ -24,7 +24,9 @@ from apc.runtime.eigen.components import components
 from apc.runtime.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
 from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, independent_places, relative_places
+from apc.runtime.frame.course import turns
 from apc.runtime.frame.discretize import UNIT
+from apc.runtime.frame.schedule import Propagate
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -42,9 +44,8 @@ DEADBEAT = 1e-12
 # An angle that no eigenvalue kept as two floats has unless it is real: their unit roundoff.
 STRAIGHT = 2.0**-53
 
-# Angles up to here are half a turn the other way, which rounding or the sign of a zero made of a change
-# of sign.
-HALF_TURN_BACK = -np.pi * (1 - 2.0**-40)
+# A mode of which no continuous state has a larger share moves nothing: what moves is rounding.
+LEAST_SHARE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +53,9 @@ class Mode:
     """One eigenvalue of the whole system's frame map, held `multiplicity` times.
 
     `magnitude` is per frame; `error` bounds |eigenvalue − truth|. `frequency_hz` and `damping_ratio` belong
-    to s = log(eigenvalue)/frame on the branch the motion takes inside the frame. `shape` is the system the
-    mode belongs to. `participation` shares the mode out among the states (the shares add up to 1).
+    to s = log(eigenvalue)/frame on the branch the motion takes inside the frame; both are NaN where that
+    can't be told. `shape` is the system the mode belongs to. `participation` shares the mode out among the
+    states (the shares add up to 1).
     """
 
     eigenvalue: complex
@@ -261,27 +263,81 @@ def _modes(
     errors: Floats,
 ) -> list[Mode]:
     """Describe eigenvalues of the relative coordinates, their vectors as columns and rows."""
-    n = len(system.names)
-    count = free.basis.shape[1]
-    matrix = system.matrix
+    vectors, shares = whole_vectors(system, free, values, right, left)
+    magnitudes = np.abs(values)
+    gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(errors, SMALL))
+    angles = np.zeros(len(values))
+    angles[~gone] = angles_in_frame(system, values[~gone], vectors[:, ~gone], shares[:, ~gone])
+    # What ends in finite time has no frequency; but what is never computed anew can't end.
+    angles[gone] = 0.0 if _ticks(system) else np.nan
+    modes = []
+    for place, (value, angle, bound) in enumerate(zip(values, angles, errors, strict=True)):
+        magnitude = abs(complex(value))
+        frequency, damping = 0.0, 1.0
+        if not gone[place] or np.isnan(angle):
+            frequency, damping = oscillation(magnitude, float(angle), system.frame_s)
+        modes.append(
+            Mode(
+                eigenvalue=complex(value),
+                magnitude=magnitude,
+                multiplicity=system.multiplicity,
+                frequency_hz=frequency,
+                damping_ratio=damping,
+                shape=system.name,
+                participation=tuple(zip(system.names, shares[:, place].tolist(), strict=True)),
+                error=float(bound),
+            )
+        )
+    return modes
+
+
+def _ticks(system: ClosedSystem) -> bool:
+    """Say whether anything but the exact exponential makes the frame's map, as far as that is known."""
+    return not system.sites or any(
+        not isinstance(event, Propagate) for group in system.sites for event in group.schedule.events
+    )
+
+
+def whole_vectors(
+    system: ClosedSystem,
+    free: RigidModes,
+    values: Complexes,
+    right: Complexes,
+    left: Complexes,
+    *,
+    aside: float = 0.0,
+) -> tuple[Complexes, Floats]:
+    """Return the vectors (n, k) over the whole state, and how much each state takes part (n, k), shares of 1.
+
+    Parameters
+    ----------
+    system, free
+        The closed system and its rigid motions.
+    values, right, left
+        Eigenvalues (k,) of the relative coordinates, with their vectors as columns and as rows.
+    aside
+        By how much larger, relatively, each eigenvalue is taken: one of 1 leaves open how far the peers stand
+        aside together.
+    """
+    count, matrix = free.basis.shape[1], system.matrix
     held, rest = relative_places(free.basis)
     weights, _ = _relative(free.basis[held], free.basis[rest])
     # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
     corner = matrix[np.ix_(held, held)] + matrix[np.ix_(held, rest)] @ weights
-    modes = []
-    for value, x, y, bound in zip(values, right.T, left, errors, strict=True):
-        vector, covector = np.zeros(n, dtype=np.complex128), np.zeros(n, dtype=np.complex128)
-        vector[rest], covector[rest] = x, y
-        if count:
-            driven = matrix[np.ix_(held, rest)] @ x
-            vector[held] = np.linalg.lstsq(value * np.eye(count) - corner, driven, rcond=None)[0]
-            vector[rest] += weights @ vector[held]
-            covector[held] = -(y @ weights)
-        shares = np.abs(vector * covector)
-        total = shares.sum()
-        shares = shares / total if total > 0 else np.abs(vector) / np.abs(vector).sum()
-        modes.append(_mode(system, complex(value), vector, shares, float(bound)))
-    return modes
+    vectors, covectors = np.zeros((2, len(system.names), len(values)), dtype=np.complex128)
+    vectors[rest], covectors[rest] = right, left.T
+    if count:
+        driven = matrix[np.ix_(held, rest)] @ right
+        for place, value in enumerate(values):
+            shifted = value * (1 + aside) * np.eye(count) - corner
+            vectors[held, place] = np.linalg.lstsq(shifted, driven[:, place], rcond=None)[0]
+        vectors[rest] += weights @ vectors[held]
+        covectors[held] = -(left @ weights).T
+    shares = np.abs(vectors * covectors)
+    total = shares.sum(axis=0)
+    sizes = np.abs(vectors)
+    shares = np.where(total > 0, shares / total, sizes / sizes.sum(axis=0))
+    return vectors, shares
 
 
 def _relative(held: Floats, rest: Floats) -> tuple[Floats, Floats]:
@@ -302,64 +358,53 @@ def _relative(held: Floats, rest: Floats) -> tuple[Floats, Floats]:
     return weights, left @ size
 
 
-def _mode(system: ClosedSystem, value: complex, vector: Complexes, shares: Floats, error: float) -> Mode:
-    """Describe one eigenvalue by its vector over the state and its states' shares."""
-    magnitude = abs(value)
-    if magnitude <= max(DEADBEAT * len(system.names), min(error, SMALL)):
-        frequency, damping = 0.0, 1.0
-    else:
-        angle = angle_in_frame(system, value, vector, shares)
-        frequency, damping = oscillation(magnitude, angle, system.frame_s)
-    return Mode(
-        eigenvalue=value,
-        magnitude=magnitude,
-        multiplicity=system.multiplicity,
-        frequency_hz=float(frequency),
-        damping_ratio=float(damping),
-        shape=system.name,
-        participation=tuple(zip(system.names, (float(share) for share in shares), strict=True)),
-        error=error,
-    )
-
-
 def oscillation(magnitude: float, angle: float, frame_s: float) -> tuple[float, float]:
-    """Return the frequency in Hz and the damping ratio of what shrinks and turns so much in a frame."""
+    """Return the frequency in Hz and the damping ratio of what shrinks and turns so much in a frame.
+
+    Both are NaN for an angle that is.
+    """
+    if np.isnan(angle):
+        return np.nan, np.nan
     turn = angle if abs(angle) > STRAIGHT else 0.0  # a real eigenvalue's, in more digits than a float has
     rate = complex(np.log(magnitude), turn) / frame_s
-    return abs(rate.imag) / (2 * np.pi), -rate.real / abs(rate) if rate else 1.0
+    return abs(rate.imag) / (2 * np.pi), float(-rate.real / abs(rate)) if rate else 1.0
 
 
-def angle_in_frame(system: ClosedSystem, value: complex, vector: Complexes, shares: Floats) -> float:
-    """Return by how much the mode turns in a frame, in radians, whole turns counted.
+def finite(value: float) -> float | None:
+    """Return a number for JSON and tables, None for one that can't be told or is beyond measure."""
+    return float(value) if np.isfinite(value) else None
+
+
+def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes, shares: Floats) -> Floats:
+    """Return by how much modes turn in a frame (k,), in radians, with whole turns; NaN if it can't be told.
 
     The eigenvalue knows the angle up to whole turns; these are counted on the continuous state that takes
-    most part, from tick to tick of the fastest clock. A real vector has no angle but its sign: each change
-    of sign is half a turn.
+    most part. Where none does, as in what only packets carry, the angle is the eigenvalue's.
 
     Parameters
     ----------
     system
         The closed system.
-    value, vector
-        An eigenvalue and its vector (n,) over the state.
+    values, vectors
+        Eigenvalues (k,) and their vectors (n, k) over the state.
     shares
-        How much each state takes part (n,).
+        How much each state takes part (n, k).
     """
-    if not system.motion:
-        return float(np.angle(value))
-    dominant = int(np.argmax(shares[list(system.motion)]))
-    return turned_along(system.inside[:, dominant] @ vector, value)
-
-
-def turned_along(course: Complexes, value: complex) -> float:
-    """Return the angle of an eigenvalue, in radians, with the whole turns of a state at a frame's marks.
-
-    A change of sign is half a turn forwards, whatever the sign of the zero beside it.
-    """
-    principal = float(np.angle(value))
-    if not np.all(np.abs(course) > 0):
-        return principal
-    phases = course / np.abs(course)  # the courses themselves can grow or shrink out of the range of floats
-    turns = np.angle(phases[1:] / phases[:-1])
-    turned = float(np.sum(np.where(turns <= HALF_TURN_BACK, turns + 2 * np.pi, turns)))
-    return principal + 2 * np.pi * round((turned - principal) / (2 * np.pi))
+    angles: Floats = np.angle(values)
+    if not system.motion or not len(values):
+        return angles
+    motion = np.array(system.motion)
+    dominant = motion[np.argmax(shares[motion], axis=0)]
+    moving = shares[dominant, np.arange(len(values))] > LEAST_SHARE
+    if not system.sites:
+        return np.where(moving, np.nan, angles)
+    site_of = np.searchsorted(system.offsets, dominant, side="right") - 1
+    for g, (group, offset, heard) in enumerate(zip(system.sites, system.offsets, system.heard, strict=True)):
+        own = np.flatnonzero(moving & (site_of == g))
+        if len(own):
+            start = vectors[offset : offset + len(group.lifted.z_names), own]
+            received = heard @ vectors[:, own]
+            angles[own] = turns(
+                group.site, group.schedule, start, received, dominant[own] - offset, values[own]
+            )
+    return angles

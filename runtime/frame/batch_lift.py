@@ -1,7 +1,7 @@
 """One frame of many sites of one kind as linear maps, all at once.
 
 Takes: the Jacobians of a kind, a `Schedule`, and the matrices of many sites as rows (see `linearize_rows`).
-Gives: `LiftedRows`, `lift_rows`; `compose_rows`, `exponential_rows`.
+Gives: `LiftedRows`, `lift_rows`; `compose_rows`, `exponential_rows`, `roundings_of`.
 Guarantees: the maps are those of `lift`, to rounding; every matrix comes with a bound on its error, entry by
 entry, wider than that of `lift`, as no ball arithmetic is done.
 Does not: decide which sites are alike (see `peers`), or close a loop (see `crowds`).
@@ -90,7 +90,7 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
             )
         z, s = compose_rows(many, schedule, steps)
         z_large, s_large = compose_rows(magnitudes(many), schedule, sizes)
-        roundings = _roundings(many, schedule, charges)
+        roundings = roundings_of(many, schedule, charges)
         gamma = roundings * UNIT / (1 - roundings * UNIT)
         errors = gamma * z_large, gamma * s_large
         if not all(float(one.max(initial=0.0)) <= HOPELESS for one in errors):
@@ -144,7 +144,7 @@ def _perturbed(
     return errors[0], errors[1]
 
 
-def _roundings(site: LinearSite, schedule: Schedule, charges: Mapping[int, float]) -> float:
+def roundings_of(site: LinearSite, schedule: Schedule, charges: Mapping[int, float]) -> float:
     """Return the roundings of all events of a frame, in units of UNIT."""
     size = sum(site.b.shape[-2:])
     width = size + max((tick.m.shape[-1] + tick.r.shape[-1] for tick in site.ticks), default=0)

@@ -36,10 +36,7 @@ COEFFICIENT_ROUNDINGS = 8
 
 @dataclass(frozen=True, slots=True)
 class LiftedSite:
-    """The one-frame map of a site. `*_error` bounds the rounding error of the matrix, entry by entry.
-
-    `inside` holds the continuous states at every mark of the schedule as rows over the columns (z, r).
-    """
+    """The one-frame map of a site. `*_error` bounds the rounding error of the matrix, entry by entry."""
 
     z_names: tuple[str, ...]
     continuous: int  # the first so many entries of z are continuous states
@@ -52,7 +49,6 @@ class LiftedSite:
     q_error: Floats
     s_error: Floats
     d_error: Floats
-    inside: Floats  # (marks, n_x, n_z + n_r)
 
 
 def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = None) -> LiftedSite:
@@ -94,8 +90,8 @@ def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = Non
     gamma = roundings * UNIT / (1 - roundings * UNIT)
 
     n_z = len(site.kind.states) + len(schedule.carried)
-    z, s, inside = frame
-    z_large, s_large, _ = large
+    z, s = frame
+    z_large, s_large = large
     return LiftedSite(
         z_names=(*(state.name for state in site.kind.states), *schedule.value_names),
         continuous=len(site.kind.states),
@@ -108,14 +104,11 @@ def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = Non
         q_error=gamma * z_large[:, n_z:],
         s_error=gamma * s_large[:, :n_z],
         d_error=gamma * s_large[:, n_z:],
-        inside=inside,
     )
 
 
-def _compose(
-    site: LinearSite, schedule: Schedule, steps: Mapping[int, Floats]
-) -> tuple[Floats, Floats, Floats]:
-    """Follow z and r through one frame; return (z⁺, s, inside), every row over the columns (z, r)."""
+def _compose(site: LinearSite, schedule: Schedule, steps: Mapping[int, Floats]) -> tuple[Floats, Floats]:
+    """Follow z and r through one frame; return (z⁺, s), every row over the columns (z, r)."""
     n_z = len(site.kind.states) + len(schedule.carried)
     unit = np.eye(n_z + len(schedule.heard))
     sent = np.zeros((len(schedule.sent), len(unit)))
@@ -124,8 +117,7 @@ def _compose(
         try:
             row, packet = next(course)
         except StopIteration as end:
-            z, inside = end.value
-            return z, sent, inside
+            return end.value, sent
         sent[row] = packet
 
 
@@ -137,7 +129,8 @@ def follow(
     hear: Callable[[int], Matrix | None],
     *,
     multiply: Callable[[Matrix, Matrix], Matrix] = np.matmul,
-) -> Generator[tuple[int, Matrix], None, tuple[Matrix, Matrix]]:
+    watch: Callable[[int, Matrix], None] | None = None,
+) -> Generator[tuple[int, Matrix], None, Matrix]:
     """Follow a site through one frame, event by event, over numbers of any kind.
 
     Every quantity is a row over columns of the caller's choice.
@@ -156,6 +149,9 @@ def follow(
         Gives the row (columns,) of an entry of r, or None while it isn't sent yet: it is asked again.
     multiply
         The product of a site's matrix and rows.
+    watch
+        Is shown each step before it is made: its duration in quanta, and the continuous states above what the
+        holds put out (n_x + n_u, columns).
 
     Yields
     ------
@@ -163,7 +159,7 @@ def follow(
 
     Returns
     -------
-    z⁺ (n_z, columns), and the continuous states at the schedule's marks (marks, n_x, columns).
+    z⁺ (n_z, columns).
     """
     n_x = len(site.kind.states)
     nothing = np.zeros(start.shape[1], dtype=start.dtype)
@@ -173,16 +169,12 @@ def follow(
     moving = np.vstack([start[:n_x], *acting])
     sends = [np.hstack([send.x, send.u]) for send in site.sends]
     ticks = [np.hstack([tick.x, tick.u, tick.m, tick.r]) for tick in site.ticks]
-    inside = np.zeros((len(schedule.marks), n_x, start.shape[1]), dtype=start.dtype)
-    now, mark = 0, 0
     for event in schedule.events:
-        if mark < len(schedule.marks) and schedule.marks[mark] == now:
-            inside[mark] = moving[:n_x]
-            mark += 1
         match event:
             case Propagate(duration):
+                if watch is not None:
+                    watch(duration, moving)
                 moving[:n_x] = multiply(steps[duration][:n_x], moving)
-                now += duration
             case Act(hold, one):
                 moving[n_x + hold] = value.get(one, nothing)
             case Send(partition, rows):
@@ -196,9 +188,8 @@ def follow(
                 inputs = np.vstack([moving, *before, *received])
                 for output, row_of in enumerate(multiply(ticks[partition], inputs)):
                     value[Value(partition, output, index)] = row_of
-    inside[-1] = moving[:n_x]
     later = [replace(one, index=one.index + schedule.ticks[one.partition]) for one in schedule.carried]
-    return np.vstack([moving[:n_x], *(value[one] for one in later)]), inside
+    return np.vstack([moving[:n_x], *(value[one] for one in later)])
 
 
 def _received(

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from apc.compiler.compiled import PEERS, CompiledSystem, Parameter
-from apc.compiler.equations.reductions import count_of
+from apc.compiler.compiled import PEERS, CompiledSystem, Parameter, counts_peers
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 
 # The sections of a topology, which a name may start with.
@@ -55,16 +54,14 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     if group is not None and name in {timing.name for timing in system.timings}:
         what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
         raise ApcError(Mistake("E622", place, what, hint=name))
-    if name == PEERS:
-        raise ApcError(
-            Mistake("E623", place, "peers is the number of peers: change a count and compile again")
-        )
-    counts = {count_of(link.name) for link in system.links}
-    if name in counts:
-        what = f"{name} follows from who hears whom: change the link's graph and compile again"
-        raise ApcError(Mistake("E623", place, what))
+    if counts_peers(name):
+        what = "the number of peers: change a count"
+        if name != PEERS:
+            what = "how many peers are heard, by their weights: change a count or the link's graph"
+        message = f"{written} is {what} and compile again"
+        raise ApcError(Mistake("E623", place, message))
     if name not in known:
-        near = nearest(name, sorted(known - {PEERS} - counts))
+        near = nearest(name, sorted(one for one in known if not counts_peers(one)))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
     return name, group
 

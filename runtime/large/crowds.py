@@ -1,7 +1,7 @@
 """Peers by the thousand, all different: the matrices of every one, without an object for each.
 
 Takes: a `CompiledSystem`, its numbers, Jacobians and schedules.
-Gives: `Crowd`, `crowds`, `some_rows`, `lift_one`; `hear_themselves`, `hear_roughly`.
+Gives: `Crowd`, `crowds`, `some_rows`, `site_one`; `hear_themselves`, `hear_roughly`.
 Guarantees: a crowd costs what its different peers cost in one array operation each, not in one Python call
 each; equal peers of a crowd are counted.
 Does not: merge equal peers of different groups (see `peers`), or take sites that are not affine.
@@ -19,10 +19,11 @@ from apc.compiler.compiled import CompiledSystem
 from apc.runtime.frame.batch_lift import CHUNK, LiftedRows, lift_rows
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.lift import LiftedSite, lift
+from apc.runtime.frame.lift import LiftedSite
 from apc.runtime.frame.linearize import linearize_rows, site_of_row
 from apc.runtime.frame.parameters import Numbers
 from apc.runtime.frame.schedule import Schedule
+from apc.runtime.frame.site import LinearSite
 from apc.runtime.large.transfer import StateSpace
 
 Floats = NDArray[np.float64]
@@ -108,11 +109,9 @@ def rows_of(lifted: LiftedSite, count: int) -> LiftedRows:
     )
 
 
-def lift_one(crowd: Crowd, row: int) -> LiftedSite:
-    """Lift one of the different peers by itself, with what happens inside of the frame."""
-    vector = crowd.parameters[row]
-    site = site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, vector[None])[0])
-    return lift(site, crowd.schedule)
+def site_one(crowd: Crowd, row: int) -> LinearSite:
+    """Return the matrices of one of the different peers by itself."""
+    return site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, crowd.parameters[[row]])[0])
 
 
 def hear_themselves(lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats) -> StateSpace:

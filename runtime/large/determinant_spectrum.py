@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.rigid import find_rigid_modes
-from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation, turned_along
+from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation
+from apc.runtime.frame.course import turns
 from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.lift import LiftedSite
+from apc.runtime.frame.schedule import Schedule
+from apc.runtime.frame.site import LinearSite
 from apc.runtime.large.characteristic import Characteristic, null_vectors, weights_at
-from apc.runtime.large.crowds import Crowd, hear_roughly, lift_one, lines_of, some_rows
+from apc.runtime.large.crowds import Crowd, hear_roughly, lines_of, site_one, some_rows
 from apc.runtime.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
 from apc.runtime.large.response import differentiate
 from apc.runtime.large.transfer import CHUNK
@@ -195,9 +197,9 @@ def _loop_mode(function: Characteristic, loop: Loop, zero: Zero) -> Mode:
             shares[prefix + name] = shares.get(prefix + name, 0.0) + share
             place += 1
     dominant = max(range(len(motions)), key=lambda g: float(np.abs(motions[g].w * motions[g].z).max()))
-    lifted = loop.sites[dominant].lifted
-    state = np.concatenate([motions[dominant].z[0], motions[dominant].r[0]])
-    return _mode(zero, lifted, state, motions[dominant].w[0], shares, loop.name, loop.multiplicity)
+    motion, own = motions[dominant], loop.sites[dominant]
+    turned = _turned(own.site, own.schedule, zero.value, motion.z[0], motion.r[0], motion.w[0])
+    return _mode(zero, turned, shares, loop.name, loop.multiplicity)
 
 
 def _nearly_free(function: Characteristic, loop: Loop, value: complex) -> tuple[list[_Motion], Complexes]:
@@ -269,10 +271,9 @@ def _crowd_mode(function: Characteristic, places: Places, listed: Sequence[Crowd
         if float(own[peer].sum()) > most:
             most, dominant = float(own[peer].sum()), (g, peer)
     g, peer = dominant
-    lifted = lift_one(listed[g], peer)
-    n_z = len(lifted.z_names)
-    state = np.concatenate([motions[g].z[peer, :n_z], motions[g].r[peer]])
-    return _mode(zero, lifted, state, motions[g].w[peer], shares, "different peers", zero.multiplicity)
+    motion, site = motions[g], site_one(listed[g], peer)
+    turned = _turned(site, listed[g].schedule, zero.value, motion.z[peer], motion.r[peer], motion.w[peer])
+    return _mode(zero, turned, shares, "different peers", zero.multiplicity)
 
 
 def _own_mode(crowd: Crowd, places: Places, zero: Zero, site: tuple[int, int]) -> Mode:
@@ -293,9 +294,8 @@ def _own_mode(crowd: Crowd, places: Places, zero: Zero, site: tuple[int, int]) -
     shares: dict[str, float] = {}
     for name, share in zip(names, np.abs(w * z).tolist(), strict=True):
         shares[name] = shares.get(name, 0.0) + share
-    lifted = lift_one(crowd, row)
-    state = np.concatenate([z[:n_z], received])
-    return _mode(zero, lifted, state, w, shares, f"{crowd.name} by itself", zero.multiplicity)
+    turned = _turned(site_one(crowd, row), crowd.schedule, zero.value, z, received, w)
+    return _mode(zero, turned, shares, f"{crowd.name} by itself", zero.multiplicity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,29 +358,31 @@ def _waiting(function: Characteristic, value: complex, felt: Complexes, depth: i
     return found
 
 
+def _turned(
+    site: LinearSite, schedule: Schedule, value: complex, z: Complexes, heard: Complexes, covector: Complexes
+) -> tuple[float, float]:
+    """Return frequency and damping, whole turns counted on the continuous state that takes most part."""
+    count = len(site.kind.states)
+    if not count:
+        return 0.0, 1.0
+    state = np.array([int(np.argmax(np.abs(covector[:count] * z[:count])))])
+    start = z[: count + len(schedule.carried), None].astype(np.complex128)
+    angle = turns(site, schedule, start, heard[:, None].astype(np.complex128), state, np.array([value]))
+    return oscillation(abs(value), float(angle[0]), float(schedule.frame_s))
+
+
 def _mode(
-    zero: Zero,
-    lifted: LiftedSite,
-    state: Complexes,
-    covector: Complexes,
-    shares: dict[str, float],
-    shape: str,
-    multiplicity: int,
+    zero: Zero, turned: tuple[float, float], shares: dict[str, float], shape: str, multiplicity: int
 ) -> Mode:
-    """Put a mode together; its frequency counts whole turns on the continuous state that takes most part."""
-    frequency, damping = 0.0, 1.0
-    moving = lifted.continuous
-    if moving:
-        dominant = int(np.argmax(np.abs(covector[:moving] * state[:moving])))
-        angle = turned_along(lifted.inside[:, dominant] @ state, zero.value)
-        frequency, damping = oscillation(abs(zero.value), angle, lifted.frame_s)
+    """Put a mode together."""
+    frequency, damping = turned
     total = sum(shares.values()) or 1.0
     return Mode(
         eigenvalue=zero.value,
         magnitude=abs(zero.value),
         multiplicity=multiplicity,
-        frequency_hz=float(frequency),
-        damping_ratio=float(damping),
+        frequency_hz=frequency,
+        damping_ratio=damping,
         shape=shape,
         participation=tuple((name, share / total) for name, share in shares.items()),
         error=zero.error,

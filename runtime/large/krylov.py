@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation, turned_along
+from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation
+from apc.runtime.frame.course import turns
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
-from apc.runtime.large.crowds import Crowd, hear_roughly, lift_one, some_rows
+from apc.runtime.large.crowds import Crowd, hear_roughly, site_one, some_rows
 from apc.runtime.large.relative import (
     RelativeMatrix,
     RigidSpace,
@@ -268,14 +269,15 @@ def _frequency(
     value: complex,
 ) -> tuple[float, float]:
     """Return frequency and damping, whole turns counted on the state of a peer that takes most part."""
-    crowd = listed[system.crowd_of[peer]]
-    lifted = lift_one(crowd, int(system.row_of[peer]))
-    n_z = len(lifted.z_names)
+    crowd, row = listed[system.crowd_of[peer]], int(system.row_of[peer])
+    n_z, count = crowd.lifted.p.shape[-1], len(crowd.jacobians.kind.states)
     own = slice(int(system.starts[peer]), int(system.starts[peer]) + n_z)
-    if not lifted.continuous:
+    if not count:
         return 0.0, 1.0
-    moving = np.abs(vector[own] * covector[own])[: lifted.continuous]
+    state = np.array([int(np.argmax(np.abs(vector[own] * covector[own])[:count]))])
     # What the peer hears is what its memory of it says: P z + Q r = ζ z.
-    heard = np.linalg.lstsq(lifted.q, value * vector[own] - lifted.p @ vector[own], rcond=None)[0]
-    course = lifted.inside[:, int(np.argmax(moving))] @ np.concatenate([vector[own], heard])
-    return oscillation(abs(value), turned_along(course, value), lifted.frame_s)
+    left = value * vector[own] - crowd.lifted.p[row] @ vector[own]
+    heard = np.linalg.lstsq(crowd.lifted.q[row], left, rcond=None)[0]
+    start, one = vector[own, None], np.array([value])
+    angle = turns(site_one(crowd, row), crowd.schedule, start, heard[:, None], state, one)
+    return oscillation(abs(value), float(angle[0]), crowd.lifted.frame_s)

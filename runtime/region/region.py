@@ -22,6 +22,7 @@ from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.words import counted
 from apc.runtime.analysis.analysis import Prepared, analyze, prepare
 from apc.runtime.analysis.ranges import Range
+from apc.runtime.eigen.spectrum import finite
 from apc.runtime.frame.names import Free
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.region.area import stable_area
@@ -87,7 +88,10 @@ class Curve:
 
     @property
     def frequency_hz(self) -> tuple[float, float]:
-        """The least and the largest frequency, along the curve, of the motion that neither grows nor dies."""
+        """The least and the largest frequency, along the curve, of the motion that neither grows nor dies.
+
+        Both are NaN where it can't be told.
+        """
         angles = np.abs(np.angle(self.eigenvalues))
         middle = len(self.knots) // 2
         places = {middle} if self.smooth else set(range(len(self.knots)))
@@ -96,6 +100,8 @@ class Curve:
         found: list[float] = []
         for place in sorted(places):
             _, turn, frame = _identify(self.source, self.knots[place], complex(self.eigenvalues[place]))
+            if np.isnan(turn):
+                return np.nan, np.nan
             # turn = 2πm ± angle, and so is it along the curve.
             candidates = [
                 2 * np.pi * round((turn - sign * float(angles[place])) / (2 * np.pi)) + sign * angles
@@ -113,7 +119,7 @@ class Curve:
             "tangents": self.tangents.tolist(),
             "error": self.error,
             "mode": self.mode,
-            "frequency_hz": list(self.frequency_hz),
+            "frequency_hz": [finite(one) for one in self.frequency_hz],
             "closed": self.closed,
             "smooth": self.smooth,
             "stable_side": "left",

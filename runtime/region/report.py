@@ -6,6 +6,8 @@ Guarantees: says what was not looked for. Does not: compute.
 
 from __future__ import annotations
 
+from math import isnan
+
 from apc.compiler.words import with_unit
 from apc.runtime.region.panels import Panels, panel_letter
 from apc.runtime.region.region import Curve, Region
@@ -68,7 +70,9 @@ def _words(found: Region) -> str:
 
 def _row(curve: Curve) -> str:
     low, high = curve.frequency_hz
-    span = f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
+    span = (
+        "–" if isnan(low) else f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
+    )
     start = "({:.6g}, {:.6g})".format(*curve.points[0])
     end = "closed" if curve.closed else "({:.6g}, {:.6g})".format(*curve.points[-1])
     return f"  {curve.mode:<11.11}  {span:<15}  {start:<18}  {end:<18}  {curve.error:.0e}"

@@ -9,7 +9,6 @@ Does not: choose points, or hold results.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -17,6 +16,7 @@ from typing import Literal
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.runtime.analysis.analysis import analyze, prepare
+from apc.runtime.eigen.spectrum import finite
 from apc.runtime.frame.names import find, unit_of
 
 PLACE = Place("sweep")
@@ -106,19 +106,15 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
         leading = found.modes[0] if found.modes else None
         return (
             found.verdict,
-            _finite(found.spectral_radius),
-            _finite(found.spectral_radius_error),
+            finite(found.spectral_radius),
+            finite(found.spectral_radius_error),
             found.rigid_modes,
-            _finite(leading.frequency_hz) if leading else None,
-            _finite(leading.damping_ratio) if leading else None,
+            finite(leading.frequency_hz) if leading else None,
+            finite(leading.damping_ratio) if leading else None,
             "",
         )
 
     return Quantity(columns, evaluate)
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _critical(system: CompiledSystem, argument: str) -> Quantity:
@@ -146,7 +142,7 @@ def _critical(system: CompiledSystem, argument: str) -> Quantity:
             return (found.verdict, None, None, 0, None, "")
         verdict = f"stable {found.stable_side} the value"
         proof = next(one.proof for one in found.crossings if one.value == found.value)
-        return (verdict, _finite(found.value), _finite(found.error), len(found.crossings), proof, "")
+        return (verdict, finite(found.value), finite(found.error), len(found.crossings), proof, "")
 
     return Quantity(columns, evaluate)
 

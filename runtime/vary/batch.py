@@ -1,7 +1,7 @@
 """The frame matrices of a system for many values of its parameters at once, with their derivatives.
 
 Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
-Gives: `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`.
+Gives: `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`, `slope_errors`.
 Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
 derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
 its neighbours, comes out as NaN, never as a wrong number.
@@ -26,7 +26,7 @@ from apc.runtime.eigen.closing import ClosedSystem, close_loop
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows
+from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows, roundings_of
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.jacobians import SiteJacobians
@@ -35,7 +35,7 @@ from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.frame.rows import free_rows
 from apc.runtime.frame.schedule import Propagate
-from apc.runtime.frame.site import LinearSite
+from apc.runtime.frame.site import LinearSite, every_matrix
 from apc.runtime.vary.wiring import (
     Lifted,
     Wiring,
@@ -53,9 +53,11 @@ Matrices = NDArray[Any]  # float64 or complex128
 # The complex step: its square vanishes beside 1, whatever the parameter's size.
 STEP = 1e-60
 
-# Where it is looked whether a free parameter moves an entry: at a value of no meaning, a derivative that
-# vanishes does so everywhere.
+# Where it is looked whether a free parameter moves an entry: at values of no meaning, each another, a
+# derivative along as meaningless a direction that vanishes does so everywhere. (At one value for all, along a
+# direction that moves all alike, a ratio such as k/m stays.)
 GENERIC_POINT = 0.7390851332151607
+GENERIC_RATIO = 0.6180339887498949
 
 # A step shorter than this share of the delays it is the difference of is none.
 VANISHING = 1e-14
@@ -283,8 +285,8 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
     """Return the wirings, those marked whose rigid directions are not the same at another point."""
     if not any(wiring.rigid.names for wiring in evaluator.wirings):
         return evaluator.wirings
-    base = [parameter_of(evaluator.system, one).value for one in evaluator.free]
-    lifted = evaluator.lifted(np.array([[value * (1 + GENERIC_POINT) + 1e-3 for value in base]]))
+    base = np.array([[parameter_of(evaluator.system, one).value for one in evaluator.free]])
+    lifted = evaluator.lifted(base * (1 + _generic(len(evaluator.free))[0]) + 1e-3)
     found = []
     for wiring in evaluator.wirings:
         matrix = closed_loop(wiring, lifted)
@@ -293,16 +295,22 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
     return tuple(found)
 
 
+def _generic(count: int) -> tuple[Floats, Floats]:
+    """Return a point (1, count) and a direction that mean nothing, their ratios all different."""
+    places = 1.0 + np.arange(count)
+    return 0.5 + np.mod(GENERIC_POINT * places, 1.0)[None], 0.5 + np.mod(GENERIC_RATIO * places, 1.0)[None]
+
+
 def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Matrices]]:
     """Return the exponentials of the groups whose A and B no free parameter moves, at a meaningless point."""
     if evaluator.timed:
         return {}
     found: dict[tuple[int, int], Mapping[int, Matrices]] = {}
-    point = np.full((1, len(evaluator.free)), GENERIC_POINT)
+    point, along = _generic(len(evaluator.free))
     for group in evaluator.groups:
         if site_key(group) in found:
             continue
-        vectors = evaluator.vectors(group, point + (STEP * 1j) * np.ones_like(point))
+        vectors = evaluator.vectors(group, point + (STEP * 1j) * along)
         site = sites_of_rows(group.jacobians, evaluator.rows(group.jacobians, vectors))
         if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
             found[site_key(group)] = evaluator.steps(site, point)
@@ -354,6 +362,81 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
             own = own + np.abs(weights) @ (below + 8 * (len(held) + 2) * UNIT * wide_below) + off @ wide_below
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
+
+
+def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tuple[Floats, ...]:
+    """Return bounds (k, n, n), to first order, on the rounding errors of each system's reduced slopes.
+
+    Parameters
+    ----------
+    evaluator
+        The evaluator; no time varies in it.
+    values, along
+        The points and directions (k, m), as for `BatchEvaluator.slopes`.
+
+    Notes
+    -----
+    A complex step whose every number is replaced by its magnitudes, of value and of slope, comes out as the
+    magnitudes of all that was added up on either way: both are off by the roundings of a frame times that.
+    """
+    assert not evaluator.timed, "the errors of a step belong to its time"
+    complex_values = values + (STEP * 1j) * along
+    large: dict[tuple[int, int], Lifted] = {}
+    charge = 0.0
+    for group in evaluator.groups:
+        built, schedule = group.jacobians, group.schedule
+        rows = evaluator.rows(built, evaluator.vectors(group, complex_values))
+        site = sites_of_rows(built, rows)
+        steps, charges = {}, {}
+        for quanta, (seconds, _) in evaluator.durations.items():
+            steps[quanta], charges[quanta] = _large_step(site, seconds)
+        charge = max(charge, roundings_of(site, schedule, charges))
+        z, s = compose_rows(every_matrix(site, _sized), schedule, steps)
+        n_z = z.shape[1]
+        large[site_key(group)] = Lifted(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
+    found = []
+    errors, plain = matrix_errors(evaluator, values), evaluator.lifted(complex_values)
+    for wiring, error in zip(evaluator.wirings, errors, strict=True):
+        whole = replace(wiring, now=tuple(map(np.abs, wiring.now)), before=tuple(map(np.abs, wiring.before)))
+        terms = charge + sum(now.shape[0] + now.shape[1] for now in wiring.now)
+        off = (2 * terms * UNIT) * closed_loop(whole, large).imag / STEP
+        rest, held = wiring.rest, wiring.held
+        own = off[:, rest[:, None], rest]
+        if len(held):
+            matrix = closed_loop(wiring, plain)
+            weights, _ = relative_weights(wiring, matrix)
+            moved, turned = np.abs(matrix.imag / STEP), np.abs(weights.imag / STEP)
+            below = off[:, held[:, None], rest] + 8 * (len(held) + 2) * UNIT * moved[:, held[:, None], rest]
+            own = own + np.abs(weights.real) @ below
+            if wiring.moving:
+                size = np.abs(np.linalg.inv(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest]))
+                wide = np.abs(weights.real)
+                late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ wide + error @ turned
+                late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ wide)
+                own = own + (size @ late) @ np.abs(matrix.real[:, held[:, None], rest])
+        found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
+    return tuple(found)
+
+
+def _sized(matrix: Matrices) -> Matrices:
+    """Return the magnitudes of values and slopes as numbers with a complex step."""
+    return np.asarray(np.abs(matrix.real) + 1j * np.abs(matrix.imag))
+
+
+def _large_step(site: LinearSite, seconds: float) -> tuple[Matrices, float]:
+    """Return the magnitudes of a step and of its slope, and its roundings.
+
+    [F G]′ is the integral of F(T − s) [A′ B′] [F(s) G(s); 0 1] over s from 0 to T; what F reaches in between
+    is taken from both ends and the middle.
+    """
+    a, b = np.abs(site.a.imag), np.abs(site.b.imag)
+    step, size, charge = exponential_rows(site.a.real, site.b.real, seconds)
+    half, _, _ = exponential_rows(site.a.real, site.b.real, seconds / 2)
+    n_x, n_u = b.shape[-2:]
+    whole = np.maximum(np.maximum(size, np.abs(half)), np.eye(n_x, n_x + n_u))
+    below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (*whole.shape[:-2], n_u, n_x + n_u))
+    slope = whole[..., :n_x] @ np.concatenate([a, b], axis=-1) @ np.concatenate([whole, below], axis=-2)
+    return np.maximum(np.abs(step), size) + 1j * seconds * slope, charge
 
 
 def _relative_errors(wiring: Wiring, matrix: Floats, error: Floats) -> tuple[Floats, Floats]:

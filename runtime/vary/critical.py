@@ -17,7 +17,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import with_unit, wrapped
+from apc.compiler.words import in_hertz, with_unit, wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
 from apc.runtime.frame.names import Free, find, parameter_of, unit_of
 from apc.runtime.given import given
@@ -88,7 +88,7 @@ class Critical:
             error = f" ± {one.error:.0e}" if one.error else ", exact"
             lines.append(f"{mark} {with_unit(f'{one.value:.15g}', self.unit)}{error}")
             kind = "jump, " if one.kind == "jump" else ""
-            lines.append(f"    {kind}stable {one.stable_side} it, {one.frequency_hz:.4g} Hz, {one.proof}")
+            lines.append(f"    {kind}stable {one.stable_side} it, {in_hertz(one.frequency_hz)}, {one.proof}")
         lines += ["", f"  scanned from {low} to {high}"]
         lines.append(f"  two crossings nearer than {self.cell:.0e} of the value could hide")
         if not self.whole:

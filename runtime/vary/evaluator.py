@@ -15,14 +15,16 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import PEERS, CompiledSystem, Parameter
+from apc.compiler.compiled import CompiledSystem, Group, Parameter, counts_peers
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.frame.rows import free_rows
 from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
 
 Floats = NDArray[np.float64]
@@ -35,12 +37,20 @@ GENERIC = Fraction(1, 1024) + Fraction(1, 65537)
 # what is cut off against rounding (both near 1e-10).
 DIFFERENCE = 2.0**-17
 
+# The step of the differences that say how far they are off, relative to the value: what is cut off, 1e-9 of
+# it, is about what rounding leaves of a matrix that is right to a few times 1e-14.
+WIDE_DIFFERENCE = 2.0**-14
+
+# What CasADi's evaluation of a site's Jacobians at its start rounds, in units of UNIT: each entry is a few
+# dozen operations, and an exponential makes no more of it than the entry is large.
+JACOBIAN_ROUNDINGS = 64
+
 # An eigenvalue left this near to 1 asks for the exact search for drifts: a pair at 1 is scattered by rounding
 # to the square root of 1e-15, and ten times that.
 DRIFT = 1e-6
 
 # The blocks of a point that has no matrix.
-NOTHING = [np.full((1, 1), np.nan)]
+NOTHING = [(np.full((1, 1), np.nan), np.full((1, 1), np.nan))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,8 +110,44 @@ class PointEvaluator:
         ]
         return split(*lifted_groups(apply(self.system, overrides), prepared=self.prepared)).systems
 
+    def differences(self, value: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return the matrix (n, n) at a point (m,) and its error, its derivatives (m, n, n) and theirs.
+
+        A difference of two steps and one of twice that cancel what each cuts off; what they differ by, and
+        the matrices' own errors over a step, bound what is left. A derivative is NaN where there is none.
+        """
+        here = self._bounded(value)
+        matrix, error = (one[0] for one in _filled_up_pairs([here]))
+        slopes, errors = np.full((2, len(value), *matrix.shape), np.nan)
+        for place, number in enumerate(value):
+            step = WIDE_DIFFERENCE * (abs(number) or 1.0)  # 0 has no size: its unit's
+            along = step * np.eye(len(value))[place]
+            at = {side: self._bounded(value + side * along) for side in (-2, -1, 1, 2)}
+            good = {side for side, one in at.items() if _shapes(one) == _shapes(here)}
+            way = next((way for way in (1, -1) if {way, 2 * way} <= good), 0)
+            if len(good) == len(at):
+                m, e = _filled_up_pairs([at[side] for side in (-2, -1, 1, 2)])
+                near, far = (m[2] - m[1]) / (2 * step), (m[3] - m[0]) / (4 * step)
+                # What is smooth bends half as much over half the width, a corner as much.
+                bends = [m[2] + m[1] - 2 * matrix, (m[3] + m[0] - 2 * matrix) / 4]
+                doubt = 2 * np.abs(bends[0] - bends[1]) / step
+            elif way and _shapes(last := self._bounded(value + 4 * way * along)) == _shapes(here):
+                m, e = _filled_up_pairs([at[way], at[2 * way], last])  # parabolas on one side
+                near = way * (4 * m[0] - 3 * matrix - m[1]) / (2 * step)
+                far = way * (4 * m[1] - 3 * matrix - m[2]) / (4 * step)
+                doubt = np.zeros_like(near)
+            else:
+                continue
+            slopes[place] = (4 * near - far) / 3
+            errors[place] = np.abs(near - far) / 3 + doubt + 8 * np.maximum(e.max(axis=0), error) / step
+        return matrix, error, slopes, errors
+
     def _blocks(self, value: Floats) -> list[Floats]:
         """Return each system's matrix in relative coordinates at a point (m,); NaN where there is none."""
+        return [matrix for matrix, _ in self._bounded(value)]
+
+    def _bounded(self, value: Floats) -> list[tuple[Floats, Floats]]:
+        """Return each system's matrix in relative coordinates with a bound on its error; NaN for none."""
         try:
             systems = self.closed_at(value.tolist())
         except ApcError:
@@ -110,7 +156,7 @@ class PointEvaluator:
         for system in systems:
             free = find_rigid_modes(system, with_drifts=False)
             reduced = _reduced(system, free)
-            if free.names and np.abs(np.linalg.eigvals(reduced) - 1).min(initial=np.inf) < DRIFT:
+            if free.names and np.abs(np.linalg.eigvals(reduced[0]) - 1).min(initial=np.inf) < DRIFT:
                 reduced = _reduced(system, find_rigid_modes(system))
             found.append(reduced)
         return found
@@ -138,10 +184,26 @@ def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
     return found
 
 
-def _reduced(system: ClosedSystem, free: RigidModes) -> Floats:
-    """Return the frame matrix of the coordinates relative to the rigid motions, see `spectrum`."""
+def _reduced(system: ClosedSystem, free: RigidModes) -> tuple[Floats, Floats]:
+    """Return the frame matrix of the coordinates relative to the rigid motions, see `spectrum`; its error."""
     held, rest, weights = relative_coordinates(free.basis)
-    return system.matrix[np.ix_(rest, rest)] - weights @ system.matrix[np.ix_(held, rest)]
+    moved = system.matrix[np.ix_(held, rest)]
+    found = system.matrix[np.ix_(rest, rest)] - weights @ moved
+    error = system.error + (JACOBIAN_ROUNDINGS * UNIT) * np.abs(system.matrix)
+    size = np.abs(weights)
+    off = error[np.ix_(rest, rest)] + size @ error[np.ix_(held, rest)]
+    return found, off + (8 * (len(held) + 2) * UNIT) * (size @ np.abs(moved))
+
+
+def _filled_up_pairs(pairs: Sequence[Sequence[tuple[Floats, Floats]]]) -> tuple[Floats, Floats]:
+    """Return the matrices of each point as one (k, n, n), and their errors."""
+    matrices, errors = ([[pair[place] for pair in one] for one in pairs] for place in (0, 1))
+    return _filled_up(matrices), _filled_up(errors)
+
+
+def _shapes(blocks: Sequence[tuple[Floats, Floats]]) -> list[int]:
+    """Return the sizes of a point's matrices; of a point without any, no size that another has."""
+    return [len(matrix) if np.isfinite(matrix).all() else -1 for matrix, _ in blocks]
 
 
 def evaluator(
@@ -195,16 +257,38 @@ def _unbounded(parameter: Parameter) -> Parameter:
 
 
 def free_parameters(system: CompiledSystem) -> list[Free]:
-    """Return the parameters that follow from no other and set no time: everybody's, then the groups' own.
+    """Return the parameters that follow from no other, set no time and count nobody, each as it can be set.
 
-    Everybody's value reaches the groups that have none of their own. What is given peer by peer, or to a
-    group as an expression, has no one value and is left out.
+    A parameter is everybody's where no group has a value of its own; else it is that of each group it
+    reaches, as everybody's would set the groups' own as well. What is given to a group peer by peer, or as
+    an expression, has no one value there and is left out.
     """
-    several = {column.name for group in system.groups for column in group.columns}
-    several |= {one.name for group in system.groups for one in group.values if one.expression}
-    listed = [Free(one.name) for one in system.parameters if one.expression is None and one.name != PEERS]
-    listed += [Free(one.name, group.name) for group in system.groups for one in group.values]
-    return [one for one in listed if one.name not in several and not reaches_time(system, one)]
+    listed = []
+    for one in system.parameters:
+        if one.expression is not None or counts_peers(one.name) or reaches_time(system, Free(one.name)):
+            continue
+        several = {
+            group.name: any(column.name == one.name for column in group.columns)
+            or any(own.name == one.name and own.expression for own in group.values)
+            for group in system.groups
+        }
+        own = any(own.name == one.name for group in system.groups for own in group.values)
+        if not own and not any(several.values()):
+            listed.append(Free(one.name))
+            continue
+        listed += [
+            Free(one.name, group.name)
+            for group in system.groups
+            if not several[group.name] and _reaches(system, group, one.name)
+        ]
+    return listed
+
+
+def _reaches(system: CompiledSystem, group: Group, name: str) -> bool:
+    """Say whether a parameter's value in a group enters the group's equations."""
+    values = {Free(name, group.name): np.array([float(GENERIC), float(2 * GENERIC)])}
+    with np.errstate(all="ignore"):
+        return len(free_rows(system, group, 0, values)) > 1
 
 
 def reaches_time(system: CompiledSystem, free: Free) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
-from apc.runtime.eigen.spectrum import angle_in_frame
+from apc.runtime.eigen.spectrum import angles_in_frame, whole_vectors
 
 # An eigenvalue of 1 leaves open how far the peers stand aside together; next to the boundary, where it is
 # this much larger, they stand where the motion takes them. Far above rounding, far below half a turn.
@@ -25,7 +25,10 @@ ASIDE = 1e-7
 
 @dataclass(frozen=True, slots=True)
 class Marginal:
-    """The closed system `name`'s motion that turns by `turn` radians in a frame of `frame_s` seconds."""
+    """The closed system `name`'s motion that turns by `turn` radians in a frame of `frame_s` seconds.
+
+    `turn` is NaN where it can't be told.
+    """
 
     name: str
     turn: float
@@ -66,15 +69,10 @@ def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenval
             continue
         value = complex(values[place])
         found, covectors = np.linalg.eig(reduced.T)
-        relative, covector = vectors[:, place], covectors[:, int(np.argmin(np.abs(found - value)))]
-        # Back to the whole state, as in `spectrum`: (λ − M_pp − M_pr W) x_p = M_pr y.
-        corner = system.matrix[np.ix_(held, held)] + driven @ weights
-        vector, shares = np.zeros(len(system.names), np.complex128), np.zeros(len(system.names))
-        beside = value * (1 + ASIDE) * np.eye(len(held)) - corner
-        vector[held] = np.linalg.lstsq(beside, driven @ relative, rcond=None)[0]
-        vector[rest] = relative + weights @ vector[held]
-        shares[rest] = np.abs(vector[rest] * covector)
-        shares[held] = np.abs(vector[held] * (covector @ weights))
-        best = off, Marginal(system.name, angle_in_frame(system, value, vector, shares), system.frame_s)
+        covector = covectors[:, int(np.argmin(np.abs(found - value)))]
+        one = np.array([value])
+        vector, shares = whole_vectors(system, free, one, vectors[:, [place]], covector[None], aside=ASIDE)
+        turn = float(angles_in_frame(system, one, vector, shares)[0])
+        best = off, Marginal(system.name, turn, system.frame_s)
     assert best is not None, "something moves where something neither grows nor dies out"
     return best[1]

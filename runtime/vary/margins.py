@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import wrapped
+from apc.compiler.words import in_hertz, wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
+from apc.runtime.eigen.spectrum import finite
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
@@ -231,7 +232,7 @@ def _margin(name: str, unit: str, present: float, crossing: Crossing | None, sca
         crossing.value,
         crossing.error,
         factor,
-        crossing.frequency_hz,
+        finite(crossing.frequency_hz),
         crossing.kind,
         scanned,
     )
@@ -253,7 +254,8 @@ def margins_report(found: Margins) -> str:
         end = f"{one.value:.7g} {unit}"
         times = f"{one.factor:.4g}" if one.factor is not None else "–"
         jump = ", jump" if one.kind == "jump" else ""
-        lines.append(f"{name}{start:<14} {end:<16} {times:>5}  {one.frequency_hz:.4g} Hz{jump}")
+        at = "–" if one.frequency_hz is None else in_hertz(one.frequency_hz)
+        lines.append(f"{name}{start:<14} {end:<16} {times:>5}  {at}{jump}")
     if found.note:
         lines += wrapped(found.note, "  ", "    ")
     return "\n".join(lines)

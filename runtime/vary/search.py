@@ -27,7 +27,7 @@ from apc.runtime.analysis.analysis import Prepared, analyze, lifted_groups
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes
-from apc.runtime.eigen.spectrum import DRIFTS
+from apc.runtime.eigen.spectrum import DRIFTS, finite
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.bracket import Bracket, bracket, bracket_in_floats
@@ -88,7 +88,7 @@ class Crossing:
             "value": self.value,
             "error": self.error,
             "stable_side": self.stable_side,
-            "frequency_hz": self.frequency_hz,
+            "frequency_hz": finite(self.frequency_hz),
             "kind": self.kind,
             "proof": self.proof,
         }

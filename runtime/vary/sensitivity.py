@@ -12,7 +12,7 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,14 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import with_unit, wrapped
+from apc.compiler.words import counted, with_unit, wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
+from apc.runtime.eigen.closing import ClosedSystem
+from apc.runtime.eigen.rigid import find_rigid_modes, relative_coordinates
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
-from apc.runtime.vary.batch import BatchEvaluator, Evaluator, matrix_errors
-from apc.runtime.vary.evaluator import DIFFERENCE, evaluator, free_parameters, keeps_size
+from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
+from apc.runtime.vary.batch import slope_errors as slope_errors_of
+from apc.runtime.vary.evaluator import PointEvaluator, evaluator, free_parameters
+from apc.runtime.vary.wiring import NEAR_ONE, Wiring, relative_weights
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -107,7 +111,7 @@ class Sensitivities:
 
 
 def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -> Sensitivities:
-    """Differentiate the spectral radius with respect to every parameter, and to every group's own.
+    """Differentiate the spectral radius with respect to every parameter, as each can be set.
 
     Parameters
     ----------
@@ -123,16 +127,10 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         free = _without_starts(system)
-        prepared = prepared or prepare(system)
-        family = evaluator(system, free, prepared=prepared)
-        here = np.array([[parameter_of(system, one).value for one in free]])
-        # What a stiffness of 0 leaves free is no relative motion of the scene as it is: it is not among those
-        # that vary then, having no derivative there.
-        matrices = family.matrices(here)
-        if not here.all() and all(np.isfinite(one).all() for one in matrices) and keeps_size(matrices):
-            free = [one for one, value in zip(free, here[0], strict=True) if value]
-            family, here = evaluator(system, free, prepared=prepared), here[:, here[0] != 0]
-        return _differentiate(system, family, free, here)
+        family = evaluator(system, free, prepared=prepared or prepare(system))
+        here = np.array([parameter_of(system, one).value for one in free])
+        moved = _by_points(family, here) if isinstance(family, PointEvaluator) else _by_batch(family, here)
+        return _differentiate(system, free, moved)
 
 
 def _without_starts(system: CompiledSystem) -> list[Free]:
@@ -142,56 +140,92 @@ def _without_starts(system: CompiledSystem) -> list[Free]:
     return [one for one in free_parameters(system) if one.name not in starts]
 
 
-def _differentiate(
-    system: CompiledSystem, family: Evaluator, free: Sequence[Free], here: Floats
-) -> Sensitivities:
-    count = len(free)
-    points = np.repeat(here, max(count, 1), axis=0)
-    pairs = family.slopes(points, np.eye(count)) if count else [(m, m) for m in family.matrices(here)]
-    errors = matrix_errors(family, here) if isinstance(family, BatchEvaluator) else None
-    names = [one.name for one in family.closed_at(here[0].tolist())]
-    if len(names) != len(pairs):  # all systems as blocks of one
-        names = ["all systems"] * len(pairs)
-    if not all(np.isfinite(matrix[0]).all() for matrix, _ in pairs):
-        return Sensitivities(0.0, (), (), NO_MATRIX)
-    clusters = [
-        (place, cluster)
-        for place, (matrix, _) in enumerate(pairs)
-        if matrix.shape[1]
-        for cluster in _clusters(matrix[0])
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moved:
+    """A closed system's matrix M (n, n) and its derivatives by m parameters (m, n, n), each with its error.
+
+    `rigid` (n, k) are motions that nothing holds back at these values, though something might at others:
+    M V spans what V does. All other eigenvalues are those to differentiate.
+    """
+
+    name: str
+    matrix: Floats
+    error: Floats
+    slopes: Floats
+    slope_errors: Floats
+    rigid: Floats
+
+
+def _by_points(family: PointEvaluator, here: Floats) -> list[_Moved]:
+    """Return what moves how in a scene that is linearized anew at every point: all systems as one."""
+    matrix, error, slopes, slope_errors = family.differences(here)
+    names = [one.name for one in family.closed_at(here.tolist())]
+    name = names[0] if len(names) == 1 else "all systems"
+    return [_Moved(name, matrix, error, slopes, slope_errors, np.zeros((len(matrix), 0)))]
+
+
+def _by_batch(family: BatchEvaluator, here: Floats) -> list[_Moved]:
+    """Return what moves how in a scene whose matrices follow from its parameters."""
+    count = len(here)
+    points = np.repeat(here[None], max(count, 1), axis=0)
+    along = np.eye(count) if count else np.zeros((1, 0))
+    pairs, errors = family.slopes(points, along), matrix_errors(family, here[None])
+    slope_errors = slope_errors_of(family, points, along)
+    closed = family.closed_at(here.tolist())
+    return [
+        _Moved(
+            one.name, matrix[0], error[0], slopes[:count], off[:count], _rigid_here(wiring, one, matrix[0])
+        )
+        for (matrix, slopes), error, off, one, wiring in zip(
+            pairs, errors, slope_errors, closed, family.wirings, strict=True
+        )
     ]
+
+
+def _rigid_here(wiring: Wiring, system: ClosedSystem, matrix: Floats) -> Floats:
+    """Return what is rigid at these values beyond what is so at all, in relative coordinates (n, k)."""
+    free = find_rigid_modes(system, with_drifts=False)
+    values = np.linalg.eigvals(matrix) if np.isfinite(matrix).all() else np.zeros(0)
+    at_one = int(np.sum(np.abs(values - 1) < NEAR_ONE))
+    if at_one > free.directions.shape[1] - wiring.rigid.directions.shape[1]:
+        free = find_rigid_modes(system)
+    more = free.basis.shape[1] - len(wiring.held)
+    if more <= 0:
+        return np.zeros((len(matrix), 0))
+    weights, _ = relative_weights(wiring, system.matrix[None])
+    weights = weights if weights.ndim == 2 else weights[0]
+    relative = free.basis[wiring.rest] - weights @ free.basis[wiring.held]
+    return np.linalg.svd(relative, full_matrices=False)[0][:, :more]
+
+
+def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequence[_Moved]) -> Sensitivities:
+    if not all(np.isfinite(one.matrix).all() for one in listed):
+        return Sensitivities(0.0, (), (), NO_MATRIX)
+    clusters = [cluster for one in listed for cluster in _clusters(one)]
     if not clusters:
         return Sensitivities(0.0, (), (), "nothing moves: there is no eigenvalue")
-    radius = max(float(np.abs(cluster[0]).max()) for _, cluster in clusters)
+    radius = max(float(np.abs(one.values).max()) for one in clusters)
     leading = [
-        (place, cluster)
-        for place, cluster in clusters
-        if float(np.abs(cluster[0]).max()) > radius - SHARED - _spread(cluster)
+        one for one in clusters if np.abs(one.values).max() > radius - SHARED - np.ptp(np.abs(one.values))
     ]
+    leading.sort(key=lambda one: -float(np.abs(one.values).max()))
     rows: list[Sensitivity] = []
     active: list[tuple[complex, str]] = []
-    notes = []
-    for place, (values, right, left, condition) in leading:
-        if not condition < WORST:
-            notes.append(f"an eigenvalue of {names[place]} is defective: it has no derivative")
+    notes, untied = [], dict[str, None]()
+    for one in leading:
+        if one.condition >= WORST:
+            notes.append(_defective(one))
             continue
-        error = np.zeros(()) if errors is None else errors[place][0]
         first = len(active)
-        active += [(complex(value), names[place]) for value in values]
-        for number, one in enumerate(free):
-            matrix, slope = pairs[place][0][number], pairs[place][1][number]
-            if not np.isfinite(slope).all():
-                continue  # it can be moved neither way
-            moved = left @ slope @ right
-            rates = np.linalg.eigvals(moved) if len(values) > 1 else moved[0]
-            growth = (values.conj() * rates).real / np.abs(values)
-            doubt = _doubt(matrix, slope, error, right, left)
-            if errors is None:
-                doubt += DIFFERENCE**2 * float(np.abs(growth).max())
-            parameter = parameter_of(system, one)
+        active += [(complex(value), one.moved.name) for value in one.values]
+        for number, (growth, doubt) in enumerate(_rates(one)):
+            parameter = parameter_of(system, free[number])
+            if growth is None:
+                untied[free[number].label] = None
+                continue
             rows += [
                 Sensitivity(
-                    one.label,
+                    free[number].label,
                     parameter.unit,
                     parameter.value,
                     float(rate),
@@ -200,58 +234,135 @@ def _differentiate(
                     first + k,
                 )
                 for k, rate in enumerate(np.sort(growth)[::-1])
+                if np.isfinite(rate)
             ]
     if len(active) > 1:
         notes.append(f"{len(active)} eigenvalues share the radius: the largest of their changes decides")
+    if untied:
+        notes.append(f"{' and '.join(untied)} would tie or move what was left out, and is not among these")
     rows.sort(key=lambda row: (-abs(row.relative), row.parameter, row.mode))
     return Sensitivities(radius, tuple(active), tuple(rows), "; ".join(notes))
 
 
-# A cluster: eigenvalues (c,) of the upper half plane, vectors as columns (n, c) and rows (c, n) with W V = 1,
-# and their condition.
-_Cluster = tuple[Complexes, Complexes, Complexes, float]
+def _defective(one: _Cluster) -> str:
+    """Say which eigenvalues have no derivative."""
+    size, many = float(np.abs(one.values).max()), len(one.values) > 1
+    what = f"{counted(len(one.values), 'eigenvalue')} of {one.moved.name} at magnitude {size:.6f}"
+    return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
 
-def _clusters(matrix: Floats) -> list[_Cluster]:
-    """Return the eigenvalues of the upper half plane, those that are one within rounding together."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cluster:
+    """Eigenvalues (c,) that are one within rounding, of a system without its rigid motions V.
+
+    `right` (n, c) and `left` (c, n) are their vectors, W X = 1, over the whole state: right ones up to
+    multiples of V, left ones with W V = 0. `condition` is theirs.
+    """
+
+    moved: _Moved
+    values: Complexes
+    right: Complexes
+    left: Complexes
+    condition: float
+
+
+def _clusters(moved: _Moved) -> list[_Cluster]:
+    """Return the largest eigenvalues, of each pair one, those that are one within rounding together."""
+    held, rest, weights = relative_coordinates(moved.rigid)
+    below = moved.matrix[np.ix_(held, rest)]
+    matrix = moved.matrix[np.ix_(rest, rest)] - weights @ below
+    if not len(matrix):
+        return []
+    error = moved.error[np.ix_(rest, rest)] + np.abs(weights) @ moved.error[np.ix_(held, rest)]
+    size = error + (8 * len(matrix) * UNIT) * (np.abs(matrix) + np.abs(weights) @ np.abs(below))
     values, right = (one.astype(np.complex128) for one in np.linalg.eig(matrix))
-    found, left = np.linalg.eig(matrix.T)
+    found, left = (one.astype(np.complex128) for one in np.linalg.eig(matrix.T))
+    largest = float(np.abs(values).max())
     clusters = []
-    seen = np.zeros(len(values), dtype=bool)
+    seen = (values.imag < 0) | (np.abs(values) < largest - SHARED - 2 * CLOSE * max(largest, CLOSE))
     for place in np.argsort(-np.abs(values), kind="stable"):
-        if seen[place] or values[place].imag < 0:
+        if seen[place]:
             continue
-        near = np.abs(values - values[place]) <= CLOSE * max(abs(values[place]), CLOSE)
-        seen |= near
-        rows = np.argsort(np.abs(found - values[place]), kind="stable")[: int(near.sum())]
-        columns = right[:, near]
-        w = left[:, rows].T.astype(np.complex128)
-        product = w @ columns
-        size = np.linalg.norm(w, 2) * np.linalg.norm(columns, 2)
+        near = np.flatnonzero(np.abs(values - values[place]) <= CLOSE * max(abs(values[place]), CLOSE))
+        if len(near) > 1 and _resolved(values[near], right[:, near], found, left, size):
+            near = np.array([place])
+        seen[near] = True
+        partners = np.argsort(np.abs(found - values[place]), kind="stable")[: len(near)]
+        rows, columns = left[:, partners].T, right[:, near]
+        product = rows @ columns
         least = float(np.linalg.svd(product, compute_uv=False)[-1])
-        condition = float(size / least) if least > 0 else np.inf
-        if condition < WORST:
-            w = np.linalg.solve(product, w).astype(np.complex128)
-        clusters.append((values[near], columns, w, condition))
+        condition = (
+            float(np.linalg.norm(rows, 2) * np.linalg.norm(columns, 2) / least) if least > 0 else np.inf
+        )
+        rows = np.linalg.solve(product, rows) if condition < WORST else rows
+        whole, covector = np.zeros((2, len(moved.matrix), len(near)), np.complex128)
+        whole[rest], covector[rest], covector[held] = columns, rows.T, -(rows @ weights).T
+        clusters.append(_Cluster(moved, values[near], whole, covector.T, condition))
     return clusters
 
 
-def _spread(cluster: _Cluster) -> float:
-    """Return by how much rounding may split a cluster's magnitudes."""
-    return float(np.ptp(np.abs(cluster[0])))
+def _resolved(values: Complexes, right: Complexes, found: Complexes, left: Complexes, size: Floats) -> bool:
+    """Say whether eigenvalues near to one another differ by more than the errors of all of them."""
+    rows = left[:, [int(np.argmin(np.abs(found - value))) for value in values]].T
+    scale = np.abs(np.einsum("ij,ji->i", rows, right))
+    off = np.einsum("ij,jk,ki->i", np.abs(rows), size, np.abs(right)) / scale
+    apart = np.abs(values[:, None] - values) + np.diag(np.full(len(values), np.inf))
+    return bool((apart > 4 * (off[:, None] + off)).all())
 
 
-def _doubt(matrix: Floats, slope: Floats, error: Floats, right: Complexes, left: Complexes) -> float:
-    """Estimate the error of a derivative: of the slope's rounding, and of vectors off by the matrix's.
+def _rates(one: _Cluster) -> Iterator[tuple[Floats | None, float]]:
+    """Yield for each parameter how fast the magnitudes (c,) grow with it, and their error.
 
-    A matrix off by E turns the vectors by about |W| |E| |V| over the gaps between eigenvalues, which the
-    condition stands for; the derivative changes by that times the slope.
+    None for a parameter that moves a rigid motion: what was left out would be a motion like any other then.
+
+    Notes
+    -----
+    A matrix off by E, its eigenvectors by residuals r and l, turns them by S (E X + r) and (W E + l) S, S the
+    resolvent at λ without the cluster: W dM X changes by W dM S (E X + r) + (W E + l) S dM X, to first order.
     """
-    size = np.abs(left) @ np.abs(slope) @ np.abs(right)
-    whole = np.abs(matrix) * (8 * len(matrix) * UNIT) + error
-    turned = float((np.abs(left) @ whole @ np.abs(right)).max())
-    condition = float(np.linalg.norm(left, 2) * np.linalg.norm(right, 2))
-    return float(size.max()) * (64 * len(matrix) * UNIT + condition * turned)
+    moved, w, x = one.moved, one.left, one.right
+    n, c = x.shape
+    if not len(moved.slopes):
+        return
+    known = np.array([bool(np.isfinite(slope).all()) for slope in moved.slopes])
+    slopes = np.where(known[:, None, None], moved.slopes, 0.0)
+    off = np.where(known[:, None, None], moved.slope_errors, 0.0)
+    rates = w @ slopes @ x  # (m, c, c)
+    middle = complex(one.values.mean())
+    # The rigid motions are left out as the cluster is: W V = 0.
+    span, dual = np.hstack([x, moved.rigid]), np.vstack([w, moved.rigid.T])
+    bordered = np.block([[middle * np.eye(n) - moved.matrix, span], [dual, np.zeros((len(dual),) * 2)]])
+    own = w @ moved.matrix @ x
+    whole = moved.error + (8 * n * UNIT) * np.abs(moved.matrix)
+    right_off = whole @ np.abs(x) + np.abs(_without(moved.matrix @ x - x @ own, moved.rigid))
+    left_off = np.abs(w) @ whole + np.abs(w @ moved.matrix - own @ w)
+    pushed = np.moveaxis(slopes @ x, 0, 1).reshape(n, -1)
+    pulled = np.moveaxis(w @ slopes, 2, 0).reshape(n, -1)
+    size = len(bordered)
+    nothing = np.zeros((size - n, pushed.shape[1]))
+    turned = np.linalg.solve(bordered, np.vstack([pushed, nothing]))[:n].reshape(n, -1, c)
+    weighed = np.linalg.solve(bordered.T, np.vstack([pulled, nothing]))[:n].reshape(n, -1, c)
+    doubt = np.abs(w) @ (off + (8 * n * UNIT) * np.abs(slopes)) @ np.abs(x)
+    doubt += np.abs(np.moveaxis(weighed, 0, 2)) @ right_off
+    doubt += left_off @ np.abs(np.moveaxis(turned, 0, 1))
+    shift = float((np.abs(w) @ whole @ np.abs(x)).max())
+    scale = float(np.abs(one.values).max())
+    for place, rate in enumerate(rates):
+        if not known[place]:
+            yield np.full(c, np.nan), np.nan
+            continue
+        still = np.abs(slopes[place] @ moved.rigid) <= off[place] @ np.abs(moved.rigid)
+        if not still.all():
+            yield None, np.nan
+            continue
+        moves = np.linalg.eigvals(rate) if c > 1 else rate[0]
+        growth = (one.values.conj() * moves).real / np.abs(one.values)
+        yield growth, 2 * float(doubt[place].sum()) + 2 * float(np.abs(rate).sum()) * shift / scale
+
+
+def _without(vectors: Complexes, rigid: Floats) -> Complexes:
+    """Return what of vectors is no rigid motion (of orthonormal ones)."""
+    return vectors - rigid @ (rigid.T @ vectors)
 
 
 def sensitivity_report(found: Sensitivities) -> str:
@@ -259,7 +370,7 @@ def sensitivity_report(found: Sensitivities) -> str:
     # Eigenvalues that share the radius often change alike, and then one row tells it.
     alike: dict[tuple[str, str], list[Sensitivity]] = {}
     for row in found.rows:
-        if row.relative:
+        if abs(row.derivative) > row.error and row.relative:  # else it can't be told from 0
             alike.setdefault((row.parameter, f"{row.relative / 100:+.2e}"), []).append(row)
     shown = list(alike.items())[:SHOWN]
     if not shown:

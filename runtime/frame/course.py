@@ -1,0 +1,167 @@
+"""What a mode does inside a frame: by how much it turns, whole turns counted.
+
+Takes: a site with its schedule, its state at a frame's start and what it hears, as a mode has them.
+Gives: `turns`.
+Guarantees: between events the motion is followed along the exact exponential, as finely as it takes; what
+can't be told is NaN.
+Does not: find modes (see `spectrum`).
+
+An eigenvalue e^{sT} of the frame's map knows Im s T up to whole turns. The motion itself knows them: a state
+x(t) of the mode, complex, goes around 0 by the angle Im s T within a frame. Where the eigenvalue and its
+vector are real, each change of sign is half a turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.frame.batch_lift import exponential_rows
+from apc.runtime.frame.lift import follow
+from apc.runtime.frame.schedule import Propagate, Schedule
+from apc.runtime.frame.site import LinearSite
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+Integers = NDArray[np.int64]
+
+# Points from one event to the next: at least so many, and this many in a turn of what swings fastest.
+FEWEST, A_TURN = 4, 16
+
+# How often they may be doubled until two counts agree, and how many numbers are held at once.
+DOUBLINGS, MOST = 8, 2**22
+
+# From point to point a motion that turns by less is followed closely enough.
+CLOSE = 1.0
+
+# What an angle may miss the eigenvalue's by, in radians: rounding misses it by far less, and a motion that is
+# not the eigenvalue's, as where a vector of a nearly vanishing one is mostly rounding, by any amount.
+OFF = 0.3
+
+# Angles up to here are half a turn the other way, which rounding or the sign of a zero made of a change
+# of sign.
+HALF_TURN_BACK = -np.pi * (1 - 2.0**-40)
+
+
+def turns(
+    site: LinearSite,
+    schedule: Schedule,
+    start: Complexes,
+    heard: Complexes,
+    states: Integers,
+    values: Complexes,
+) -> Floats:
+    """Return by how much modes turn in a frame (k,), in radians; NaN where it can't be told.
+
+    Parameters
+    ----------
+    site, schedule
+        A site's matrices in floats, and what happens in its frame.
+    start, heard
+        Its state z at the frame's start (n_z, k) and what it hears r (n_r, k), a column a mode.
+    states
+        Which continuous state is followed (k,).
+    values
+        The eigenvalues (k,).
+    """
+    found = np.full(len(values), np.nan)
+    swing = float(np.abs(np.linalg.eigvals(site.a).imag).max(initial=0.0)) / (2 * np.pi)
+    left = np.arange(len(values))
+    before = np.full(len(values), np.nan)
+    for doubled in range(DOUBLINGS + 1):
+        points = {
+            event.duration: _power_of_two(A_TURN * swing * float(event.duration * schedule.quantum), doubled)
+            for event in schedule.events
+            if isinstance(event, Propagate)
+        }
+        most = sum(points[event.duration] for event in schedule.events if isinstance(event, Propagate))
+        height = max(sum(site.b.shape), 1)
+        if not most * height <= MOST or not len(left):
+            break
+        chunk = MOST // (most * height)
+        for first in range(0, len(left), chunk):
+            some = left[first : first + chunk]
+            course = _course(site, schedule, points, start[:, some], heard[:, some], states[some])
+            angle, widest = turned_along(course)
+            agreed = (np.abs(angle - before[some]) < OFF) | (widest < CLOSE)
+            found[some[agreed]] = _of_eigenvalue(angle[agreed], values[some[agreed]])
+            before[some] = np.where(agreed, np.inf, angle)
+        left = left[before[left] < np.inf]
+    return found
+
+
+def _power_of_two(least: float, doubled: int) -> int:
+    """Return how many points there are in a step; too many to hold for what swings too fast."""
+    if not least < MOST:
+        return MOST + 1
+    return int(2 ** (np.ceil(np.log2(max(least, FEWEST))) + doubled))
+
+
+def _course(
+    site: LinearSite,
+    schedule: Schedule,
+    points: dict[int, int],
+    start: Complexes,
+    heard: Complexes,
+    states: Integers,
+) -> Complexes:
+    """Return the states followed at so many points of each step, and the end (points, k)."""
+    n_x, n_u = site.b.shape
+    count = start.shape[1]
+    steps, fine = {}, {}
+    below = np.eye(n_x + n_u)[n_x:]
+    for duration, number in points.items():
+        seconds = float(duration * schedule.quantum) / number
+        step = exponential_rows(site.a[None], site.b[None], seconds)[0][0]
+        powers = [np.vstack([step, below])]
+        while 2 ** len(powers) <= number:
+            powers.append(powers[-1] @ powers[-1])
+        fine[duration] = powers
+        steps[duration] = powers[-1]
+    columns = np.arange(count)
+    rows: list[Complexes] = []
+
+    def watch(duration: int, moving: NDArray[Any]) -> None:
+        path = moving[None]
+        for power in fine[duration][:-1]:
+            path = np.concatenate([path, power @ path])
+        rows.append(path[:, states, columns])
+
+    course = follow(site, schedule, steps, start, _heard_by(heard), watch=watch)
+    while True:
+        try:
+            next(course)
+        except StopIteration as end:
+            return np.concatenate([*rows, end.value[states, columns][None]])
+
+
+def _heard_by(heard: Complexes) -> Callable[[int], Complexes]:
+    return lambda row: heard[row]
+
+
+def turned_along(course: Complexes) -> tuple[Floats, Floats]:
+    """Return by how much courses (points, k) turn about 0, in radians, and the widest angle between points.
+
+    A change of sign is half a turn forwards, whatever the sign of the zero beside it; a course that stays at
+    0 has no angle.
+    """
+    size = np.abs(course)
+    moving = size > 0
+    # Where a course is exactly 0 it has the direction it came from, or leaves by.
+    place = np.maximum.accumulate(np.where(moving, np.arange(len(course))[:, None], -1), axis=0)
+    place = np.where(place < 0, np.argmax(moving, axis=0), place)
+    columns = np.arange(course.shape[1])
+    phases = course[place, columns] / size[place, columns]  # courses can grow or shrink out of floats' range
+    angles = np.angle(phases[1:] / phases[:-1])
+    angles = np.where(angles <= HALF_TURN_BACK, angles + 2 * np.pi, angles)
+    return angles.sum(axis=0), np.abs(angles).max(axis=0, initial=0.0)
+
+
+def _of_eigenvalue(turned: Floats, values: Complexes) -> Floats:
+    """Return the angles of eigenvalues with a motion's whole turns, NaN where the motion is another's."""
+    principal = np.where(values.imag == 0, np.where(values.real < 0, np.pi, 0.0), np.angle(values))
+    found = principal + 2 * np.pi * np.round((turned - principal) / (2 * np.pi))
+    return np.where(np.abs(turned - found) <= OFF, found, np.nan)

@@ -1,0 +1,369 @@
+# ruff: noqa: E501 -- scenes are written by long lines
+"""Sensitivities and frequencies of random scenes against 320-bit arithmetic.
+
+`python -m tests.bench.sensitivity_truth` draws scenes with weights on graphs, groups with numbers of their own, several
+clocks, couplers that are linearized where they start, stars, and no clocks at all. The truth comes from the
+compiled functions alone, event by event (see `bench.events`): derivatives from frame matrices on either side of
+a value, frequencies from following each mode through a frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import random
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from typing import Any
+
+import flint
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem
+from apc.runtime.analysis.analysis import Analysis, analyze, prepare
+from apc.runtime.bench.events import Happening, Play, build_peers, refusal
+from apc.runtime.bench.reference import (
+    RIGID,
+    _common_whom,
+    _difference_whom,
+    _from_state,
+    _to_state,
+    classes_of,
+)
+from apc.runtime.eigen.balls import precision
+from apc.runtime.frame.names import Free, find, parameter_of
+from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.vary.sensitivity import Sensitivities, sensitivities
+from tests.bench.judge import Judge
+from tests.topologies import compiled
+
+BITS = 320
+
+# A value is moved by so much of it: what a central difference cuts off is 1e-18 of the derivative.
+STEP = 2.0**-30
+CUT_OFF = 1e-15
+
+# Eigenvalues of the truth this near to one that is said are it, or stand in one cluster with it.
+SAME = 1e-9
+
+# Eigenvalues of the truth that differ by more differ; smaller numbers are none.
+APART = 1e-30
+
+# Points in which a mode is followed between two events, and the least share of the largest state's way that a
+# state's own must be to have an angle.
+POINTS, LEAST = 64, 1e-6
+
+# Modes smaller than this in a frame are not followed: what is left of them at its end drowns.
+FADED = 1e-9
+
+
+def scene(generator: random.Random) -> str:
+    """Return a topology at random, in which something may be unstable and nothing is refused."""
+    pick, number = generator.choice, lambda low, high: f"{10 ** generator.uniform(low, high):.4g}"
+    kind = pick(["plain", "plain", "groups", "groups", "star", "arcs", "still", "contact"])
+    tick, ratio = pick(["1 ms", "0.5 ms", "2 ms"]), pick(["1 ms", "4 ms", "8 ms", "2.5 ms"])
+    delay, late = pick(["0 s", "1 ms", "1/3 ms"]), pick(["0 s", "1 ms", "8 ms", "7/3 ms"])
+    masses = (
+        f"  device: {{mass: {number(-1.5, 0)} kg, damping: {number(-1, 1)} N*s/m}}\n"
+        f"  cube: {{mass: {number(-1, 0.5)} kg, damping: {number(-1, 1)} N*s/m, shared: true}}\n"
+    )
+    if kind == "still":  # no clocks: nothing is sampled
+        return (
+            f"topology: still\npeers: {{user: {{count: 1}}}}\nmasses:\n{masses}couplers:\n"
+            f"  s: {{type: SpringDamper, a: device, b: cube, stiffness: {number(-2, 3)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
+            f"  t: {{type: SpringDamper, a: cube, b: ground, stiffness: {number(-2, 3)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
+        )
+    groups, graph = f"user: {{count: {generator.randint(2, 4)}}}", ""
+    if kind in ("groups", "contact"):
+        own = f"contact.stiffness: {number(1, 3)} N/m, device.mass: {number(-1.5, 0)} kg"
+        groups = f"a: {{count: {generator.randint(1, 2)}}}\n  b: {{count: {generator.randint(1, 2)}, set: {{{own}}}}}"
+    if kind == "star":
+        groups, graph = (
+            f"hub: {{count: 1, set: {{device.mass: {number(-1, 0)} kg}}}}\n  tip: {{count: 2}}",
+            ", graph: star",
+        )
+    if kind == "arcs":
+        groups = "user: {count: 3}"
+        arcs = ", ".join(f"[{i}, {j}, {pick([0.5, 1, 2])}]" for i, j in ((1, 2), (2, 1), (2, 3), (3, 1)))
+        graph = f", graph: {{arcs: [{arcs}]}}"
+    contact = f"{{type: SampledSpringDamper, a: device, b: cube, stiffness: {number(1, 3)} N/m, damping: {number(-2, 0.3)} N*s/m, clock: haptic, delay: {delay}}}"
+    if kind == "contact":  # a wall that pushes: linear where it is touched or left
+        contact = f"{{type: OneSidedContact, a: device, b: cube, half_width: 1 mm, stiffness: {number(1, 3)} N/m, damping: {number(-2, 0)} N*s/m, clock: haptic, delay: {delay}}}"
+    coupling = pick(["AveragePosition", "FullMesh"])
+    more = pick(
+        [
+            "",
+            f"  arm: {{type: SpringDamperArm, flange: device, stiffness: {number(0, 2)} N/m, damping: 1 N*s/m}}\n",
+        ]
+    )
+    arm = f"hands:\n{more}" if more else ""
+    fast = f"  link: {{type: SpringDamper, a: device, b: cube, stiffness: {number(2, 5)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
+    fast = fast if generator.random() < 0.3 else ""
+    return (
+        f"topology: drawn\nclocks: {{haptic: {tick}, network: {ratio}, slow: {{period: {ratio}, phase: 0.25 ms}}}}\npeers:\n  {groups}\n"
+        f"masses:\n{masses}couplers:\n  contact: {contact}\n{fast}"
+        f"  coordination: {{type: {coupling}, object: cube, stiffness: {number(1, 2.7)} N/m, damping: {number(-2, 0)} N*s/m, clock: {pick(['haptic', 'slow'])}, delay: {delay}, link: lan}}\n"
+        f"links:\n  lan: {{clock: network, delay: {late}{graph}}}\n{arm}"
+    )
+
+
+def check_sensitivities(
+    system: CompiledSystem, found: Analysis | Sensitivities, *, like: CompiledSystem | None = None
+) -> str:
+    """Return what is wrong with the derivatives of a scene's spectral radius, "" if nothing is.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    found
+        Its sensitivities, or its analysis, from which only the radius is compared with theirs.
+    like
+        A scene with the same linearization and names, where the reference refuses this one.
+    """
+    said = found if isinstance(found, Sensitivities) else sensitivities(system)
+    if isinstance(found, Analysis) and said.active:
+        apart = abs(said.radius - found.spectral_radius)
+        if not apart <= 1e-9 + found.spectral_radius_error:
+            return f"the radius is {found.spectral_radius}, that of the derivatives {said.radius}"
+    system = like or system
+    if refusal(system, in_time=False) or not said.active:
+        return ""
+    with precision(BITS):
+        here = _matrices(system)
+        radius = max((float(abs(v)) for m in here for v in _values(m) if not _is_rigid(v)), default=0.0)
+        if abs(radius - said.radius) > SAME:
+            return f"the radius of the derivatives is {said.radius}, truth {radius}"
+        tops = [_top(here, value) for value, _ in said.active]
+        if any(not top for top in tops):
+            return "an eigenvalue that is differentiated is none of the scene"
+        moved: dict[str, list[Any]] = {}
+        for row in said.rows:
+            if row.parameter not in moved:
+                moved[row.parameter] = _slopes(system, here, row.parameter)
+            truths = [rate for top in tops[row.mode] for rate in _rates(top, moved[row.parameter])]
+            off = min(abs(row.derivative - rate) for rate in truths)
+            most = max(map(abs, truths))
+            if not off <= row.error + CUT_OFF * most + APART:
+                return (
+                    f"d|λ|/d {row.parameter} of mode {row.mode + 1} is {row.derivative} ± {row.error:.2g}, "
+                    f"truth {min(truths, key=lambda rate: abs(row.derivative - rate))}"
+                )
+    return ""
+
+
+def _matrices(system: CompiledSystem) -> list[Any]:
+    """Return the frame matrices of all closed systems."""
+    frame = prepare(system).schedules[0].frame_s
+    return [_whole_map(one, frame) for one in _happenings(system)]
+
+
+def _values(matrix: Any) -> list[Any]:
+    return [
+        v.mid()
+        for v in flint.acb_mat(matrix.mid()).eig(algorithm="approx", maxiter=flint.ctx.prec * matrix.nrows())
+    ]
+
+
+def _is_rigid(value: Any) -> bool:
+    return bool(float(abs(value - 1).mid()) < RIGID)
+
+
+def _top(here: Sequence[Any], value: complex) -> list[tuple[int, list[Any], Any, Any]]:
+    """Return the clusters at a value: the system's place, the eigenvalues, their vectors W and V, W V = 1.
+
+    Where several eigenvalues stand there but not in one place, each is one by itself as well.
+    """
+    found = []
+    for place, matrix in enumerate(here):
+        middle = flint.acb_mat(matrix.mid())
+        values = _values(matrix)
+        own = [one for one in values if not _is_rigid(one) and abs(complex(one) - value) < SAME]
+        groups = [own] if own else []
+        if any(float(abs(one - own[0])) > APART for one in own):
+            groups += [[one] for one in own]
+        found += [(place, group, *_vectors(middle, group)) for group in groups]
+    return found
+
+
+def _vectors(matrix: Any, own: Sequence[Any]) -> tuple[Any, Any]:
+    """Return left and right vectors of a cluster, W V = 1, by inverse iteration."""
+    n, c = matrix.nrows(), len(own)
+    centre = sum(own, flint.acb(0)) / c
+    shifted = matrix - (centre + flint.acb(2) ** -(BITS // 2)) * _unit(n)
+    generator = random.Random(n)
+    start = flint.acb_mat(n, c, [flint.acb(generator.uniform(-1, 1)) for _ in range(n * c)])
+    right, left = start, start
+    for _ in range(4):
+        right = _scaled(shifted.solve(right).mid())
+        left = _scaled(shifted.transpose().solve(left).mid())
+    w = left.transpose()
+    return (w * right).inv() * w, right
+
+
+def _unit(n: int) -> Any:
+    return flint.acb_mat(n, n, [flint.acb(i == j) for i in range(n) for j in range(n)])
+
+
+def _scaled(matrix: Any) -> Any:
+    size = max(float(abs(entry)) for entry in matrix.entries())
+    return matrix * (flint.acb(1) / flint.acb(size))
+
+
+def _slopes(system: CompiledSystem, here: Sequence[Any], name: str) -> list[Any]:
+    """Return the derivatives of all frame matrices by a parameter, set as `--set` does."""
+    known, group = find(system, name)
+    value = parameter_of(system, Free(known, group)).value
+
+    def at(number: float) -> list[Any]:
+        moved = _matrices(apply(system, [Override(known, group, Fraction(number))]))
+        return [flint.acb_mat(matrix.mid()) for matrix in moved]
+
+    if value:
+        low, high = value * (1 - STEP), value * (1 + STEP)
+        return [
+            (b - a) * (flint.acb(1) / (flint.acb(high) - flint.acb(low)))
+            for a, b in zip(at(low), at(high), strict=True)
+        ]
+    still = [flint.acb_mat(matrix.mid()) for matrix in here]
+    near, far = at(STEP**2), at(2 * STEP**2)
+    one = flint.acb(1) / flint.acb(2 * STEP**2)
+    return [(4 * b - 3 * a - c) * one for a, b, c in zip(still, near, far, strict=True)]
+
+
+def _rates(top: tuple[int, list[Any], Any, Any], slopes: Sequence[Any]) -> list[float]:
+    """Return how fast the magnitudes of a cluster grow."""
+    place, own, w, v = top
+    rate = w * slopes[place] * v
+    c = len(own)
+    moves = (
+        [rate[0, 0]] if c == 1 else [one.mid() for one in flint.acb_mat(rate.mid()).eig(algorithm="approx")]
+    )
+    return [float(((value.conjugate() * move) / abs(value)).real.mid()) for value in own for move in moves]
+
+
+def check_frequencies(system: CompiledSystem, found: Analysis) -> str:
+    """Return what is wrong with the frequencies of a scene's modes, "" if nothing is.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    found
+        Its analysis.
+    """
+    if refusal(system, in_time=False):
+        return ""
+    with precision(BITS):
+        scenes = list(_happenings(system))
+        frame = Fraction(prepare(system).schedules[0].frame_s)
+        maps = [_whole_map(scene, frame) for scene in scenes]
+        values = [_values(one) for one in maps]
+        for mode in found.modes:
+            if (
+                not math.isfinite(mode.frequency_hz)
+                or mode.magnitude < FADED
+                or mode.magnitude <= 2 * mode.error
+            ):
+                continue
+            truths = []
+            for scene, matrix, listed in zip(scenes, maps, values, strict=True):
+                near = [
+                    one for one in listed if abs(complex(one) - mode.eigenvalue) <= max(2 * mode.error, 1e-12)
+                ]
+                if near:
+                    _, right = _vectors(flint.acb_mat(matrix.mid()), near[:1])
+                    turns = _turns(scene, frame, [right[i, 0] for i in range(right.nrows())])
+                    truths += [abs(turn) / (2 * math.pi * float(frame)) for turn in turns]
+            if truths and min(abs(mode.frequency_hz - truth) for truth in truths) > 1e-4 / float(frame):
+                return f"mode {mode.eigenvalue} of {mode.shape}: {mode.frequency_hz} Hz, truth {sorted(set(truths))}"
+            rate = complex(math.log(mode.magnitude), 2 * math.pi * mode.frequency_hz * float(frame))
+            if abs(mode.damping_ratio - (-rate.real / abs(rate) if rate else 1.0)) > 1e-6:
+                return f"mode {mode.eigenvalue}: damping {mode.damping_ratio} at {mode.frequency_hz} Hz"
+    return ""
+
+
+def _happenings(system: CompiledSystem) -> Iterator[Happening]:
+    """Yield the common motion, and each class's differences, as peers to follow."""
+    classes = classes_of(system)
+    sites = build_peers(system, classes.peers, classes.groups, linear=True)
+    yield Happening(system, sites, _common_whom(sites, classes))
+    for place, count in enumerate(classes.counts):
+        if count > 1:
+            yield Happening(system, [sites[place]], _difference_whom(sites, classes, place))
+
+
+def _whole_map(scene: Happening, frame: Fraction) -> Any:
+    """Return the map of one frame over all states."""
+    n = sum(len(site.names) for site in scene.sites)
+    play = _from_state(scene, list(np.eye(n, dtype=int).astype(object)))
+    scene.play(play, Fraction(0), frame)
+    rows = [np.broadcast_to(np.asarray(row, dtype=object), n) for row in _to_state(scene, play)]
+    return flint.arb_mat(n, n, [flint.arb(entry) for row in rows for entry in row])
+
+
+def _turns(scene: Happening, frame: Fraction, state: Sequence[Any]) -> list[float]:
+    """Return by how much each continuous state that moves turns in a frame, in radians."""
+    both = [np.array([one.real, one.imag], dtype=object) for one in state]
+    play: Play = _from_state(scene, both)
+    rows = []
+
+    def note() -> None:
+        rows.append([complex(*map(float, np.broadcast_to(one, 2))) for x in play.x for one in x])
+
+    fastest = max(
+        (
+            math.sqrt(max(float(abs(e)) for e in site.rate.entries()) if site.rate.nrows() else 0.0)
+            for site in scene.sites
+        ),
+        default=0.0,
+    )
+    note()
+    instants = scene.instants(Fraction(0), frame)
+    for start, end in itertools.pairwise(instants):
+        count = min(max(POINTS, 8 * math.ceil(float(end - start) * fastest)), 20_000)
+        for place in range(count):
+            scene.play(
+                play, start + (end - start) * place / count, start + (end - start) * (place + 1) / count
+            )
+            note()
+    course = np.array(rows)
+    largest = np.abs(course).max(axis=0)
+    found = []
+    for place in np.flatnonzero(largest > LEAST * largest.max(initial=0.0)):
+        path = course[:, place][np.abs(course[:, place]) > 0]
+        steps = np.angle(path[1:] / path[:-1])
+        found.append(float(np.where(steps <= -math.pi + 1e-9, math.pi, steps).sum()))
+    return found
+
+
+def run(points: int, *, seed: int = 0) -> list[str]:
+    """Check so many random scenes; return what is wrong, with each scene's text."""
+    generator, wrong = random.Random(seed), []
+    for _ in range(points):
+        text = scene(generator)
+        system = compiled(text)
+        found = analyze(system)
+        wrong += [
+            f"{one}\n{text}"
+            for one in (check_sensitivities(system, found), check_frequencies(system, found))
+            if one
+        ]
+    return wrong
+
+
+def main() -> None:
+    """Print what is wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--points", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    judge = Judge()
+    for one in run(given.points, seed=given.seed):
+        judge.right(one, holds=False)
+    judge.end()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""Claims about `apc.runtime.frame.course`: the frequency a mode has, however long the frame."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.frame.course import turned_along
+from apc.runtime.vary.critical import critical
+from tests.topologies import compiled
+
+# Textbook: m x″ + d x′ + k x = 0.
+OSCILLATOR = """\
+topology: oscillator
+peers: {{user: {{count: 1}}}}
+masses:
+  device: {{mass: 1 kg}}
+couplers:
+  s: {{type: SpringDamper, a: device, b: ground, stiffness: {stiffness} N/m, damping: {damping} N*s/m}}
+"""
+# The same with a clock that makes the frame, and a force too small to matter.
+CLOCKED = OSCILLATOR.replace("peers:", "clocks: {{haptic: {frame}}}\npeers:") + (
+    "  t: {{type: SampledSpringDamper, a: device, b: ground, stiffness: 1e-9 N/m, clock: haptic}}\n"
+)
+
+
+def numbers(hertz: float, ratio: float) -> dict[str, str]:
+    natural = 2 * math.pi * hertz
+    return {"stiffness": repr(natural**2), "damping": repr(2 * ratio * natural)}
+
+
+@pytest.mark.parametrize(
+    ("hertz", "ratio"),
+    [(0.3, 0.1), (10.3, 0.05), (40, 0.02), (40, 0.0), (700, 0.001), (0.4999, 0.3), (5000, 1e-4)],
+)
+def test_an_oscillator_without_clocks_has_its_own_frequency(hertz: float, ratio: float) -> None:
+    """The frame is one second, so that all of them fold but the first."""
+    found = analyze(compiled(OSCILLATOR.format(**numbers(hertz, ratio))))
+    expected = hertz * math.sqrt(1 - ratio**2)
+    for mode in found.modes:
+        assert mode.frequency_hz == pytest.approx(expected, rel=1e-9)
+        assert mode.damping_ratio == pytest.approx(ratio, rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("frame", ["1 ms", "7/3 ms", "20 ms", "100 ms", "1 s"])
+@pytest.mark.parametrize(("hertz", "ratio"), [(3.3, 0.2), (40, 0.02), (700, 0.001)])
+def test_the_frame_does_not_matter(frame: str, hertz: float, ratio: float) -> None:
+    found = analyze(compiled(CLOCKED.format(frame=frame, **numbers(hertz, ratio))))
+    mode = found.modes[0]
+    assert mode.frequency_hz == pytest.approx(hertz * math.sqrt(1 - ratio**2), rel=1e-6)
+    assert mode.damping_ratio == pytest.approx(ratio, rel=1e-4)
+
+
+@pytest.mark.parametrize("halves", [1, 2, 79, 80, 1400])
+def test_what_folds_onto_the_real_axis_is_told_by_its_changes_of_sign(halves: int) -> None:
+    """So many half turns in a frame: e^{sT} is real, twice, up to the rounding of the numbers."""
+    damped = math.pi * halves
+    text = OSCILLATOR.format(stiffness=repr(damped**2 + 0.25), damping="1.0")
+    for mode in analyze(compiled(text)).modes:
+        assert mode.frequency_hz == pytest.approx(halves / 2, rel=1e-6)
+        assert mode.damping_ratio == pytest.approx(0.5 / math.hypot(damped, 0.5), rel=1e-6)
+
+
+def test_what_is_gone_within_a_frame_has_no_frequency_rather_than_a_wrong_one() -> None:
+    """e^(−31) of it is left after a frame: 3e-14, which rounding hides."""
+    found = analyze(compiled(OSCILLATOR.format(**numbers(10.0, 0.5))))
+    assert all(math.isnan(mode.frequency_hz) and math.isnan(mode.damping_ratio) for mode in found.modes)
+    assert [mode["frequency_hz"] for mode in found.to_dict()["modes"]] == [None, None]
+
+
+def test_a_fast_loop_has_the_frequency_of_its_limit() -> None:
+    """A spring computed every 10 µs, on a frame of 8 ms: 90 Hz, half of what the frame tells is 62.5 Hz."""
+    text = """\
+topology: fast
+clocks: {fast: 0.01 ms, slow: 8 ms}
+peers: {user: {count: 2}}
+masses:
+  device: {mass: 1 kg, damping: 20 N*s/m}
+couplers:
+  s: {type: SampledSpringDamper, a: device, b: ground, stiffness: 319775 N/m, clock: fast}
+  c: {type: AveragePosition, object: device, stiffness: 1e-6 N/m, clock: slow, link: lan}
+links:
+  lan: {clock: slow}
+"""
+    mode = analyze(compiled(text)).modes[0]
+    # To first order, a force held for T is late by T/2: damping less K T/2.
+    damping = 20 - 319775 * 5e-6
+    assert mode.frequency_hz == pytest.approx(math.sqrt(319775 - damping**2 / 4) / (2 * math.pi), rel=1e-4)
+    assert mode.damping_ratio == pytest.approx(damping / (2 * math.sqrt(319775)), rel=1e-3)
+
+
+def test_a_point_of_the_boundary_has_the_frequency_of_its_motion() -> None:
+    """A continuous spring of 300 Hz, made unstable by a slow tick's force: half the frame's rate is 62.5 Hz."""
+    text = """\
+topology: boundary
+clocks: {haptic: 8 ms}
+peers: {user: {count: 1}}
+masses:
+  device: {mass: 1 kg, damping: 0.5 N*s/m}
+couplers:
+  s: {type: SpringDamper, a: device, b: ground, stiffness: 3553058 N/m}
+  t: {type: SampledSpringDamper, a: device, b: ground, stiffness: 100 N/m, clock: haptic, delay: 1 ms}
+"""
+    system = compiled(text)
+    for one in critical(system, "t.stiffness").crossings:
+        assert one.frequency_hz == pytest.approx(300, rel=0.02)
+
+
+def test_a_change_of_sign_is_half_a_turn_whatever_the_zeros_sign() -> None:
+    course = np.array([complex(1.0, 0.0), complex(-1.5, -0.0), complex(1.2, 0.0), complex(-1.8, -0.0)])
+    course = np.append(course, complex(2.3, 0.0))
+    for one in (course, course.conj(), -course, course * np.exp(1j)):
+        turned, widest = turned_along(one[:, None])
+        assert turned[0] == pytest.approx(4 * math.pi, rel=1e-12)
+        assert widest[0] == pytest.approx(math.pi, rel=1e-12)
+
+
+def test_a_course_over_the_whole_range_of_floats_still_has_its_angle() -> None:
+    """A quarter turn a point for six points, from 1e-250 to 1e250 and back: one and a half turns."""
+    sizes = np.array([1e-250, 1e250, 1e-250, 1e250, 1e-250, 1e250, 1e-250])
+    course = sizes * np.exp(0.5j * np.pi * np.arange(7))
+    assert turned_along(course[:, None])[0] == pytest.approx(3 * np.pi)
+
+
+def test_a_course_that_starts_or_passes_at_zero_keeps_its_direction() -> None:
+    course = np.array([0, 1, 1j, 0, -1, 0], np.complex128)
+    assert turned_along(course[:, None])[0] == pytest.approx(np.pi)
