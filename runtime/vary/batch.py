@@ -26,6 +26,7 @@ from apc.runtime.eigen.closing import ClosedSystem, close_loop
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.peer_group import PeerGroup
+from apc.runtime.eigen.rigid import find_rigid_modes
 from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
@@ -44,6 +45,7 @@ from apc.runtime.vary.wiring import (
     reduced,
     relative_weights,
     site_key,
+    told_by_constants,
     wire,
 )
 
@@ -284,12 +286,17 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
     if not any(wiring.rigid.names for wiring in evaluator.wirings):
         return evaluator.wirings
     base = [parameter_of(evaluator.system, one).value for one in evaluator.free]
-    lifted = evaluator.lifted(np.array([[value * (1 + GENERIC_POINT) + 1e-3 for value in base]]))
+    other = [value * (1 + GENERIC_POINT) + 1e-3 for value in base]
+    lifted = evaluator.lifted(np.array([other]))
     found = []
-    for wiring in evaluator.wirings:
+    for place, wiring in enumerate(evaluator.wirings):
         matrix = closed_loop(wiring, lifted)
-        moving = bool(np.isfinite(matrix).all() and not are_rigid(wiring, matrix).all())
-        found.append(replace(wiring, moving=moving and not wiring.rigid.drifts))
+        moves = bool(np.isfinite(matrix).all() and not are_rigid(wiring, matrix).all())
+        if moves and not wiring.rigid.drifts:
+            there = find_rigid_modes(evaluator.exact_at(other)[place], with_drifts=False)
+            found.append(told_by_constants(wiring, there))
+        else:
+            found.append(wiring)
     return tuple(found)
 
 
