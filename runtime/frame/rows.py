@@ -106,7 +106,7 @@ def free_rows(
     given = {column.name for column in group.columns}
     known: dict[str, Any] = {free.name: value for free, value in values.items() if free.group is None}
     known |= {free.name: value for free, value in values.items() if free.group == group.name}
-    timings = {timing.name: float(timing.value) for timing in system.timings}
+    timings = {timing.name: timing for timing in system.timings}
 
     def value_of(name: str) -> Any:
         if name not in known:
@@ -114,9 +114,7 @@ def free_rows(
         return known[name]
 
     def evaluated(name: str) -> Any:
-        parameter = holder.get(name)
-        if parameter is None:
-            return timings[name]
+        parameter = holder.get(name) or timings[name]
         if parameter.expression and name not in given:
             from apc.compiler.language.expression import names
             from apc.compiler.language.grammar import parse_expression
@@ -127,7 +125,7 @@ def free_rows(
             if any(np.ndim(one) for one in reached):
                 return compute_rows(tree, value_of)
         column = columns.of(name)
-        return parameter.value if column is None else float(column[peer])
+        return float(parameter.value) if column is None else float(column[peer])
 
     listed = [value_of(name) for name in system.kinds[group.kind].parameters]
     count = max((len(one) for one in listed if np.ndim(one)), default=1)

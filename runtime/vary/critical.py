@@ -9,8 +9,9 @@ Does not: find two crossings nearer to each other than the cell size (see `cross
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit, wrapped
-from apc.runtime.analysis.analysis import Prepared, prepare
+from apc.runtime.analysis.analysis import Prepared, analyze, prepare
 from apc.runtime.frame.names import Free, find, parameter_of, unit_of
 from apc.runtime.given import given
 from apc.runtime.threads import single_threaded
@@ -137,10 +138,11 @@ def critical(
         prepared = prepare(system)
         if timed:
             _refuse_moving_start(system, prepared)
-            found = search_delay(system, free, limits[0] or 0.0, limits[1], prepared, told=told)
+            found = search_delay(system, free, limits[0] or Fraction(0), limits[1], prepared, told=told)
         else:
-            found = search(system, free, limits[0], limits[1], prepared, told=told)
-    chosen = _chosen(found, present)
+            low, high = (None if one is None else float(one) for one in limits)
+            found = search(system, free, low, high, prepared, told=told)
+        chosen = _chosen(found, present, lambda: analyze(system, prepared=prepared).stable)
     words = "stable" if found.stable == (True,) else "unstable" if found.stable else "undecided"
     verdict = f"{words} at every value scanned"
     if not found.enters:
@@ -172,12 +174,14 @@ def _refuse_moving_start(system: CompiledSystem, prepared: Prepared) -> None:
         )
 
 
-def _limit(option: str, text: str | None, free: Free, unit: str) -> float | None:
+def _limit(option: str, text: str | None, free: Free, unit: str) -> Fraction | None:
     """Read a limit, None if there is none."""
-    return None if text is None else float(given(option, text, what=free.name, unit=unit))
+    return None if text is None else given(option, text, what=free.name, unit=unit)
 
 
-def _check_limits(system: CompiledSystem, free: Free, limits: Sequence[float | None], *, timed: bool) -> None:
+def _check_limits(
+    system: CompiledSystem, free: Free, limits: Sequence[Fraction | None], *, timed: bool
+) -> None:
     """Refuse limits that leave nothing to look at."""
     low, high = limits
     least = 0.0 if timed else parameter_of(system, free).minimum
@@ -188,21 +192,23 @@ def _check_limits(system: CompiledSystem, free: Free, limits: Sequence[float | N
             (least is not None and value < least) or (most is not None and value > most)
         ):
             expected = f"at least {least:g}" if least is not None and value < least else f"at most {most:g}"
-            what, got = f"a limit of {free.name}", with_unit(f"{value:g}", unit)
+            what, got = f"a limit of {free.name}", with_unit(f"{float(value):g}", unit)
             raise ApcError(Mistake("E843", _PLACE, what, with_unit(expected, unit), got))
     bottom = low if low is not None else (least or 0.0)
     if high is not None and not high > bottom:
-        what, got = f"the range of {free.name}", with_unit(f"{bottom:g} to {high:g}", unit)
+        what, got = f"the range of {free.name}", with_unit(f"{float(bottom):g} to {float(high):g}", unit)
         raise ApcError(Mistake("E842", _PLACE, what, "an upper limit above the lower", got))
 
 
-def _chosen(found: Search, present: float) -> Crossing | None:
-    """Return the crossing that matters, see `Critical`."""
+def _chosen(found: Search, present: float, stable_now: Callable[[], bool | None]) -> Crossing | None:
+    """Return the crossing that matters, see `Critical`; on a jump, the scene itself tells its side."""
     if not found.edges:
         return None
-    above = [one for one in found.edges if one.value > present]
-    below = [one for one in found.edges if one.value <= present]
-    if found.stable[len(below)]:
-        return above[0] if above else below[-1]
+    below = sum(one.value < present for one in found.edges)
+    upto = sum(one.value <= present for one in found.edges)
+    if upto > below and found.stable[below] != stable_now():
+        below = upto
+    if found.stable[below]:
+        return found.edges[below] if below < len(found.edges) else found.edges[below - 1]
     lost = [one for one in found.edges if one.stable_side == "below"]
     return lost[0] if lost else found.edges[0]

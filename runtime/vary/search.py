@@ -1,7 +1,7 @@
 """All crossings of the stability boundary along one parameter or delay, each proved where it can be.
 
 Takes: a `CompiledSystem` and what varies in it.
-Gives: `Crossing`, `Search`, `search`, `search_delay`; `Line`, `courses_of`, `reach`, `spread`,
+Gives: `Crossing`, `Search`, `search`, `search_delay`, `delay_reach`; `Line`, `courses_of`, `reach`, `spread`,
 `proved_crossing` to search along a line through several parameters.
 Guarantees: every crossing has a bound on its error, proved by ball arithmetic wherever the equations can be
 had exactly, and said to be an estimate where not.
@@ -32,7 +32,7 @@ from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.runtime.vary.crossings import Courses, Root, Scan, scan
-from apc.runtime.vary.delays import Piece, delay_pieces, system_with_delay
+from apc.runtime.vary.delays import Piece, borders, delay_now, delay_pieces, system_with_delay
 from apc.runtime.vary.eigenvalues import eigenvalues
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
 from apc.runtime.vary.marginal import marginal_motion, with_rigid
@@ -53,8 +53,9 @@ SAMPLES = 6
 # rounding of an eigenvalue, UNIT times some hundreds, over how fast it moves.
 FLOAT_ROUNDINGS = 1e-12
 
-# Pieces of a delay that are scanned without a limit given, each from one coincidence of events to the next.
-PIECES = 64
+# Without a limit given, a delay is scanned over so many pieces at least, each from one coincidence of events
+# to the next, and up to so many times its present value.
+PIECES, FURTHER = 64, 2
 
 # Samples in a piece of a delay to begin with.
 PIECE_SAMPLES = 3
@@ -308,12 +309,11 @@ def _described(
 def search_delay(
     system: CompiledSystem,
     free: Free,
-    low: float,
-    high: float | None,
+    low: Fraction,
+    high: Fraction | None,
     prepared: Prepared,
     *,
-    pieces: int = PIECES,
-    first_above: float | None = None,
+    from_stable: bool = False,
     told: Told | None = None,
 ) -> Search:
     """Find the crossings of a delay: within pieces as of any parameter, and jumps between them.
@@ -325,13 +325,11 @@ def search_delay(
     free
         The timing, or a parameter that reaches timings.
     low, high
-        From which value to which; without `high` over so many `pieces`.
+        From which value to which; without `high` as far as `delay_reach` says.
     prepared
         From `analysis.prepare`.
-    pieces
-        How many pieces of the delay are scanned where `high` is not given.
-    first_above
-        Stop at the first crossing above this value.
+    from_stable
+        The scene is stable at `low`: where nothing above it is, that is a jump. The first crossing is enough.
     told
         Is told how far the search is.
 
@@ -339,25 +337,21 @@ def search_delay(
     -----
     Where events coincide, their order makes the value one with the piece before it or with the one after.
     """
-    start = Fraction(repr(low))
-    end = None if high is None else Fraction(repr(high))
+    end = high or delay_reach(system, free, low, pieces=PIECES, further=FURTHER)[0]
     edges: list[Crossing] = []
-    stable: list[bool] = []
+    stable = [True] if from_stable else []
     before: Piece | None = None
-    at, whole = start, True
-    every = delay_pieces(system, free, start, prepared, place=_PLACE, high=end)
-    for piece in itertools.islice(every, pieces if end is None else None):
-        at = piece.high if end is None else min(piece.high, end)
+    at, whole = low, True
+    for piece in delay_pieces(system, free, low, prepared, place=_PLACE, high=end):
+        at = min(piece.high, end)
         if told:
-            until = f" of {float(end):.6g} s" if end is not None else ""
-            told(f"looking at {free.label} up to {float(at):.6g} s{until}")
+            told(f"looking at {free.label} up to {float(at):.6g} s of {float(end):.6g} s")
         found = _piece_scan(piece, float(piece.low), float(at), prepared)
         whole = whole and found.whole
         if not len(found.points):
             continue
         first = bool(found.radius[0] < 1)
         if stable and stable[-1] != first:
-            assert before is not None, "what came before was scanned"
             edges.append(_jump(system, free, before, piece, prepared, stable_below=stable[-1]))
         if not stable or stable[-1] != first:
             stable.append(first)
@@ -365,9 +359,31 @@ def search_delay(
             edges.append(_delay_crossing(system, free, root, prepared, piece))
             stable.append(not stable[-1])
         before = piece
-        if first_above is not None and edges and edges[-1].value > first_above:
+        if from_stable and edges:
             break
-    return Search(tuple(edges), tuple(stable), (float(start), float(at)), whole, enters=True)
+    return Search(tuple(edges), tuple(stable), (float(low), float(at)), whole, enters=True)
+
+
+def delay_reach(
+    system: CompiledSystem, free: Free, low: Fraction, *, pieces: int, further: float
+) -> tuple[Fraction, int]:
+    """Return how far a delay is looked at where nobody says, and over how many pieces that is.
+
+    Parameters
+    ----------
+    system, free
+        The compiled scene, and what varies.
+    low
+        From which value.
+    pieces, further
+        Over so many pieces at least, and up to so many times the present value.
+    """
+    following = borders(system, free, place=_PLACE)
+    most = Fraction(further) * delay_now(system, free)
+    at, count = low, 0
+    while count < pieces or at < most:
+        at, count = following(at), count + 1
+    return at, count
 
 
 def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> Scan:
@@ -380,7 +396,7 @@ def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> Sc
         return Scan(np.array([low]), np.array([found.spectral_radius]), (), whole=True)
 
     def course(points: Floats) -> Sequence[tuple[Floats, Floats]]:
-        if family.timed:
+        if not piece.constant:
             return family.slopes(points[:, None], np.ones((len(points), 1)))
         matrices = family.matrices(points[:, None])
         return [(matrix, np.zeros_like(matrix)) for matrix in matrices]
@@ -392,7 +408,7 @@ def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> Sc
 def _jump(
     system: CompiledSystem,
     free: Free,
-    before: Piece,
+    before: Piece | None,
     after: Piece,
     prepared: Prepared,
     *,
@@ -400,7 +416,7 @@ def _jump(
 ) -> Crossing:
     """Describe a change of side between two pieces: the delay at which events coincide, exactly."""
     # The motion that grows is on the unstable side.
-    piece, way = (after, 1) if stable_below else (before, -1)
+    piece, way = (after, 1) if stable_below or before is None else (before, -1)
     beside = after.low + way * BESIDE * (piece.high - piece.low)
     grows = piece.inside if piece.constant else system_with_delay(system, free, beside)
     modes = analyze(grows, prepared=prepared).modes

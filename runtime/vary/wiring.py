@@ -1,7 +1,8 @@
 """Closing the loop of one system for many points at once, and taking its rigid motions out.
 
 Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
-Gives: `Lifted`, `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_weights`, `are_rigid`, `site_key`.
+Gives: `Lifted`, `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_weights`,
+`are_rigid`, `site_key`.
 Guarantees: the matrices are those of `modes.close_loop` in relative coordinates, to rounding; where the
 directions are not those of a rigid motion they are NaN.
 Does not: lift a site (see `batch`).
@@ -127,9 +128,7 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
     basis = wiring.rigid.basis
     same = [
         all(one == other for one, other in zip(*pair, strict=True))
-        for pair in zip(
-            zip(*wiring.rigid.exact, strict=True), zip(*there.exact, strict=True), strict=True
-        )
+        for pair in zip(zip(*wiring.rigid.exact, strict=True), zip(*there.exact, strict=True), strict=True)
     ]
     constant = np.where(np.array(same)[:, None], basis, 0.0)
     if np.linalg.matrix_rank(constant) < basis.shape[1]:
