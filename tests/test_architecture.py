@@ -50,7 +50,7 @@ HOUSE = (
         lift batch_lift residues
         """,
     ),
-    ("apc.runtime.network", "channel_law packets listener timetable weights gathering"),
+    ("apc.runtime.network", "channel_law nominal packets listener timetable weights gathering"),
     (
         "apc.runtime.eigen",
         """

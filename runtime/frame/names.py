@@ -1,7 +1,7 @@
 """What a person calls a parameter or a timing, and what stands behind the name.
 
 Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
-Gives: `Free`, `find`, `named_times`, `parameter_of`, `value_now`, `unit_of`.
+Gives: `Free`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`, `unit_of`.
 Guarantees: a name that means nothing raises, with the nearest real one.
 Does not: read or change values.
 """
@@ -42,7 +42,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
         E622 no such parameter, E623 the number of peers.
     """
     times = {timing.name for timing in named_times(system)}
-    known = {parameter.name for parameter in system.parameters} | times
+    known = {parameter.name for parameter in system.parameters if is_named(parameter.name)} | times
     groups = {group.name for group in system.groups}
     written = name[:80].strip() or "an empty name"
     first, _, rest = name.partition(".")
@@ -65,12 +65,18 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     return name, group
 
 
-def named_times(system: CompiledSystem) -> list[Timing]:
-    """Return the timings that stand in the scene under a name of their own.
+def is_named(name: str) -> bool:
+    """Say whether a parameter or timing stands in the scene under a name of its own.
 
-    What the compiler makes of a hold without delay, or of one by an expression, has a name with a blank.
+    What the compiler counts, as `count(lan)`, and the delay of a hold without one, or of one by an
+    expression, are not the user's to vary: their names hold what no name in a scene can.
     """
-    return [timing for timing in system.timings if " " not in timing.name]
+    return not set(name) & set(" (")
+
+
+def named_times(system: CompiledSystem) -> list[Timing]:
+    """Return the timings that stand in the scene under a name of their own."""
+    return [timing for timing in system.timings if is_named(timing.name)]
 
 
 def parameter_of(system: CompiledSystem, free: Free) -> Parameter:

@@ -18,10 +18,11 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import with_unit, wrapped
+from apc.compiler.words import measured, with_unit, wrapped
 from apc.runtime.analysis.analysis import Prepared, analyze, prepare
 from apc.runtime.frame.names import Free, find, parameter_of, unit_of
 from apc.runtime.given import given
+from apc.runtime.network.nominal import left_out, refuse_channel_number
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.crossings import CELL
@@ -41,6 +42,7 @@ class Critical:
     present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
     there is no crossing; `verdict` then says whether all that was scanned is stable. `enters` says whether
     anything that decides depends on the parameter: on a start value of a linear scene nothing does.
+    `left_out` says what of the scene the answer does not look at.
     """
 
     topology: str
@@ -56,6 +58,7 @@ class Critical:
     whole: bool
     enters: bool
     verdict: str
+    left_out: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer as plain data, ready for JSON."""
@@ -73,21 +76,26 @@ class Critical:
             "whole": self.whole,
             "enters": self.enters,
             "verdict": self.verdict,
+            "left_out": list(self.left_out),
         }
 
     def __str__(self) -> str:
         """Return the answer in words."""
         low, high = (with_unit(f"{one:.6g}", self.unit) for one in self.scanned)
         present = with_unit(f"{self.present:.6g}", self.unit)
-        lines = [f"{self.topology}: {self.parameter} is {present}", ""]
+        lines = [f"{self.topology}: {self.parameter} is {present}"]
+        for note in self.left_out:
+            lines += wrapped(note, "  ", "    ")
+        lines.append("")
         if self.value is None:
             lines += wrapped(self.verdict, "  ", "  ")
         if not self.enters:
             return "\n".join(lines)
         for one in self.crossings:
             mark = "→" if one.value == self.value else " "
-            error = f" ± {one.error:.0e}" if one.error else ", exact"
-            lines.append(f"{mark} {with_unit(f'{one.value:.15g}', self.unit)}{error}")
+            exact = f"{with_unit(f'{one.value:.15g}', self.unit)}, exact"
+            value = measured(one.value, one.error, self.unit) if one.error else exact
+            lines.append(f"{mark} {value}")
             kind = "jump, " if one.kind == "jump" else ""
             lines.append(f"    {kind}stable {one.stable_side} it, {one.frequency_hz:.4g} Hz, {one.proof}")
         lines += ["", f"  scanned from {low} to {high}"]
@@ -124,11 +132,12 @@ def critical(
     ------
     ApcError
         E622 no such parameter, E623 the number of peers, E842 a range that is none, E843 a limit out of the
-        parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear; and those of
-        `units.quantity`.
+        parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear, E896 a number
+        of an unreliable link; and those of `units.quantity`.
     """
     known, group = find(system, name.strip(), _PLACE)
     free = Free(known, group)
+    refuse_channel_number(system, free, _PLACE)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         timed = reaches_time(system, free)
         unit = unit_of(system, known)
@@ -136,6 +145,7 @@ def critical(
         limits = [_limit(*one, free, unit) for one in (("--lower", lower), ("--upper", upper))]
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
+        linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
         if timed:
             _refuse_moving_start(system, prepared)
             found = search_delay(system, free, limits[0] or Fraction(0), limits[1], prepared, told=told)
@@ -161,6 +171,7 @@ def critical(
         whole=found.whole,
         enters=found.enters,
         verdict="" if chosen else verdict,
+        left_out=left_out(system, linear=linear),
     )
 
 

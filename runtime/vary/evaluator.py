@@ -21,7 +21,7 @@ from apc.runtime.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
-from apc.runtime.frame.names import Free, parameter_of
+from apc.runtime.frame.names import Free, is_named, parameter_of
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
 
@@ -203,6 +203,7 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
     several |= {one.name for group in system.groups for one in group.values if one.expression}
     listed = [Free(one.name) for one in system.parameters if one.expression is None and one.name != PEERS]
     listed += [Free(one.name, group.name) for group in system.groups for one in group.values]
+    listed = [one for one in listed if is_named(one.name)]
     return [one for one in listed if one.name not in several and not reaches_time(system, one)]
 
 

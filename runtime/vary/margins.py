@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import wrapped
+from apc.compiler.words import known_digits, wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
 from apc.runtime.frame.names import Free, named_times, parameter_of
 from apc.runtime.threads import single_threaded
@@ -263,7 +263,7 @@ def margins_report(found: Margins) -> str:
         if one.value is None:
             lines.append(f"{name}{start:<14} no limit up to {one.scanned:.5g} {unit}")
             continue
-        end = f"{one.value:.7g} {unit}"
+        end = f"{known_digits(one.value, one.error or 0.0, 7)} {unit}"
         times = f"{one.factor:.4g}" if one.factor is not None else "–"
         jump = ", jump" if one.kind == "jump" else ""
         lines.append(f"{name}{start:<14} {end:<16} {times:>5}  {one.frequency_hz:.4g} Hz{jump}")

@@ -12,6 +12,7 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +25,7 @@ from apc.compiler.words import with_unit, wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.names import Free, parameter_of
+from apc.runtime.network.nominal import channel_numbers
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.batch import BatchEvaluator, Evaluator, matrix_errors
@@ -136,10 +138,11 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
 
 
 def _without_starts(system: CompiledSystem) -> list[Free]:
-    """Return the free parameters that are no start values."""
+    """Return the free parameters that are no start values, and no numbers of unreliable links."""
     starts = {state.start for kind in system.kinds for state in kind.states}
     starts |= {start for kind in system.kinds for one in kind.clocks for start in one.starts}
-    return [one for one in free_parameters(system) if one.name not in starts]
+    kept_out = starts | channel_numbers(system)
+    return [one for one in free_parameters(system) if one.name not in kept_out]
 
 
 def _differentiate(
@@ -207,6 +210,9 @@ def _differentiate(
     return Sensitivities(radius, tuple(active), tuple(rows), "; ".join(notes))
 
 
+# Digits of a change.
+DIGITS = 3
+
 # A cluster: eigenvalues (c,) of the upper half plane, vectors as columns (n, c) and rows (c, n) with W V = 1,
 # and their condition.
 _Cluster = tuple[Complexes, Complexes, Complexes, float]
@@ -259,8 +265,10 @@ def sensitivity_report(found: Sensitivities) -> str:
     # Eigenvalues that share the radius often change alike, and then one row tells it.
     alike: dict[tuple[str, str], list[Sensitivity]] = {}
     for row in found.rows:
-        if row.relative:
-            alike.setdefault((row.parameter, f"{row.relative / 100:+.2e}"), []).append(row)
+        off = row.error * abs(row.value)
+        if abs(row.relative) > off:
+            change = _change(row.relative / 100, off / 100)
+            alike.setdefault((row.parameter, change), []).append(row)
     shown = list(alike.items())[:SHOWN]
     if not shown:
         note = found.note if len(found.active) < 2 else ""
@@ -274,3 +282,9 @@ def sensitivity_report(found: Sensitivities) -> str:
     if found.note:
         lines += wrapped(found.note, "  ", "    ")
     return "\n".join(lines)
+
+
+def _change(value: float, error: float) -> str:
+    """Return a change to three digits, fewer where its error leaves them open."""
+    known = math.floor(math.log10(abs(value) / error)) if error else DIGITS
+    return f"{value:+.{min(max(known, 1), DIGITS) - 1}e}"
