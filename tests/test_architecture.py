@@ -76,8 +76,8 @@ HOUSE = (
     (
         "apc.runtime.vary",
         """
-        wiring batch evaluator marginal eigenvalues crossings bracket delays search critical margins
-        sensitivity
+        wiring batch evaluator symbols bends marginal eigenvalues crossings bracket delays search critical
+        margins sensitivity
         """,
     ),
     ("apc.runtime.sweep", "grid quantities table_file work store local cluster sweep"),

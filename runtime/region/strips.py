@@ -33,7 +33,7 @@ from apc.runtime.vary.crossings import scan
 from apc.runtime.vary.delays import Piece, delay_pieces
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
 from apc.runtime.vary.marginal import marginal_motion, with_rigid
-from apc.runtime.vary.search import SPAN, Line, proved_crossing, spread
+from apc.runtime.vary.search import SPAN, Line, proved_crossing
 
 Floats = NDArray[np.float64]
 
@@ -172,7 +172,7 @@ def _standing(
         0,
     )
     scale = line.scale()
-    found = scan(line.course, spread(low, high, scale), least=scale / SPAN)
+    found = scan(line.course, line.samples(low, high, scale)[0], least=scale / SPAN)
     if not len(found.points):
         return None
     arcs, heights = [], [0.0]

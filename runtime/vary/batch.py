@@ -127,11 +127,15 @@ class BatchEvaluator:
         """Return the parameter vectors (k, n_p) of a group, or (1, n_p) when no value reaches it."""
         if not self.tangents:
             return group.parameters[None]
-        first = int(group.peers[0])
-        place = int(np.searchsorted(self.exchange.starts, first, side="right")) - 1
-        peer = first - int(self.exchange.starts[place])
+        place, peer = self.first_peer(group)
         listed = {free: values[:, column] for column, free in enumerate(self.free)}
         return free_rows(self.system, self.system.groups[place], peer, listed)
+
+    def first_peer(self, group: PeerGroup) -> tuple[int, int]:
+        """Return which group of the scene the first of a group of like peers is of, and its number there."""
+        first = int(group.peers[0])
+        place = int(np.searchsorted(self.exchange.starts, first, side="right")) - 1
+        return place, first - int(self.exchange.starts[place])
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import measured, with_unit, wrapped
+from apc.compiler.words import counted, measured, with_unit, wrapped
 from apc.runtime.analysis.analysis import Prepared, analyze, prepare
 from apc.runtime.frame.names import Free, find, parameter_of, unit_of
 from apc.runtime.given import given
@@ -40,7 +40,9 @@ class Critical:
     `crossings` are all that were found from `scanned[0]` to `scanned[1]`, in order. `value` is the one that
     matters: with the present value stable, the first crossing above it or else the first below it; with the
     present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
-    there is no crossing; `verdict` then says whether all that was scanned is stable. `enters` says whether
+    there is no crossing; `verdict` then says whether all that was scanned is stable. `known` says
+    whether the equations are enclosed between the `looked` values that were looked at, so that only crossings
+    nearer than `cell` to one another can hide. `enters` says whether
     anything that decides depends on the parameter: on a start value of a linear scene nothing does.
     `left_out` says what of the scene the answer does not look at.
     """
@@ -56,6 +58,8 @@ class Critical:
     scanned: tuple[float, float]
     cell: float
     whole: bool
+    known: bool
+    looked: int
     enters: bool
     verdict: str
     left_out: tuple[str, ...] = ()
@@ -74,6 +78,8 @@ class Critical:
             "scanned": list(self.scanned),
             "cell": self.cell,
             "whole": self.whole,
+            "known": self.known,
+            "looked": self.looked,
             "enters": self.enters,
             "verdict": self.verdict,
             "left_out": list(self.left_out),
@@ -99,7 +105,12 @@ class Critical:
             kind = "jump, " if one.kind == "jump" else ""
             lines.append(f"    {kind}stable {one.stable_side} it, {one.frequency_hz:.4g} Hz, {one.proof}")
         lines += ["", f"  scanned from {low} to {high}"]
-        lines.append(f"  two crossings nearer than {self.cell:.0e} of the value could hide")
+        if self.known:
+            lines.append(f"  two crossings nearer than {self.cell:.0e} of the value could hide")
+        else:
+            values = counted(self.looked, "value")
+            what = f"{values} were looked at; what the equations do between two of them is not known: "
+            lines += wrapped(f"{what}a narrow change of the verdict could hide there", "  ", "  ")
         if not self.whole:
             lines.append("  an eigenvalue keeps near to the boundary: more of them could")
         return "\n".join(lines)
@@ -169,6 +180,8 @@ def critical(
         scanned=found.scanned,
         cell=CELL,
         whole=found.whole,
+        known=found.known,
+        looked=found.looked,
         enters=found.enters,
         verdict="" if chosen else verdict,
         left_out=left_out(system, linear=linear),

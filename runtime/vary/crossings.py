@@ -44,8 +44,9 @@ CAUTION = 0.5
 # Places at which a cubic is looked at.
 PLACES = 9
 
-# Cells narrower than this, relative to the value, are divided no further.
-CELL = 1e-3
+# Cells narrower than this, relative to the value, are divided no further; where the points to begin with are
+# nearer to one another, not those narrower than this share of what is between them.
+CELL, SHARE = 1e-3, 1 / 16
 
 # So few cells are divided into so many parts at once: a few matrices more take no longer, another call does.
 FEW, PARTS = 8, 8
@@ -169,7 +170,7 @@ def scan_lines(
     count = len(points)
     if not any(len(one) for one in points):
         return tuple(Scan(np.empty(0), np.empty(0), (), whole=True) for _ in points)
-    smallest = np.array(least, dtype=np.float64)
+    narrow = [_narrow(*pair) for pair in zip(points, least, strict=True)]
     lines = np.repeat(np.arange(count), [len(one) for one in points])
     samples = _sample(courses, lines, np.concatenate(points))
     new = np.ones(len(samples.points), dtype=bool)
@@ -178,7 +179,7 @@ def scan_lines(
         # A cell that was there before was found clear, or can't be divided.
         cells = np.flatnonzero((samples.lines[1:] == samples.lines[:-1]) & (new[1:] | new[:-1]))
         cells = cells[cells <= _last_cells(samples, count)[samples.lines[cells]]] if first else cells
-        cells = cells[_widths(samples, cells, smallest) > CELL]
+        cells = cells[_wide(samples, cells, points, narrow)]
         cells = cells[_open(samples, cells)]
         going &= np.bincount(samples.lines[cells], minlength=count) <= MOST_OPEN
         whole &= going
@@ -229,11 +230,24 @@ def _sample(courses: Courses, lines: Integers, points: Floats) -> _Samples:
     return samples.chosen(np.abs(samples.radius() - 1) > UNSURE)
 
 
-def _widths(samples: _Samples, cells: NDArray[np.intp], least: Floats) -> Floats:
-    """Return the cells' widths relative to their values, or to the least of their lines."""
+def _narrow(points: Floats, least: float) -> Floats:
+    """Return, for each cell between the points to begin with, how narrow its parts may get."""
+    size = np.maximum(np.maximum(np.abs(points[:-1]), np.abs(points[1:])), least)
+    return np.asarray(np.minimum(CELL * size, SHARE * np.diff(points)))
+
+
+def _wide(
+    samples: _Samples, cells: NDArray[np.intp], points: Sequence[Floats], narrow: Sequence[Floats]
+) -> Truths:
+    """Say of each cell whether it may be divided."""
     low, high = samples.points[cells], samples.points[cells + 1]
-    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), least[samples.lines[cells]])
-    return np.asarray((high - low) / size)
+    lines = samples.lines[cells]
+    found = np.zeros(len(cells), dtype=bool)
+    for line in np.unique(lines):
+        own = lines == line
+        first = np.searchsorted(points[line], low[own], side="right") - 1
+        found[own] = high[own] - low[own] > narrow[line][np.clip(first, 0, len(narrow[line]) - 1)]
+    return found
 
 
 def _between(samples: _Samples, cells: NDArray[np.intp], parts: int) -> tuple[Integers, Floats]:

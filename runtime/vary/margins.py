@@ -1,7 +1,7 @@
 """How much each coupler's stiffness and damping, and each delay, may grow before the boundary.
 
 Takes: a `CompiledSystem`.
-Gives: `Margin`, `Margins`, `margins`, `margins_report`.
+Gives: `Margin`, `Margins`, `margins`, `margins_report`; `coupler_parameters`.
 Guarantees: a margin is the next crossing above the present value, with its error; none is said together with
 how far was looked.
 Does not: look below the present value (see `critical`), or vary two at once (see `box`).
@@ -37,7 +37,6 @@ from apc.runtime.vary.search import (
     proved_crossing,
     reach,
     search_delay,
-    spread,
 )
 
 Floats = NDArray[np.float64]
@@ -108,7 +107,7 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Marg
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
-        free = _coupler_parameters(system)
+        free = coupler_parameters(system)
         found = _parameter_margins(system, free, prepared)
         if isinstance(found, str):
             return Margins((), found)
@@ -119,7 +118,7 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Marg
         return Margins((*found, *delays), "")
 
 
-def _coupler_parameters(system: CompiledSystem) -> list[Free]:
+def coupler_parameters(system: CompiledSystem) -> list[Free]:
     """Return the stiffnesses and dampings of parts without motion of their own, and the named ones."""
     moving = {state.name.rpartition(".")[0] for kind in system.kinds for state in kind.states}
     return [
@@ -183,7 +182,8 @@ def _along(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Ma
         limit = parameter_of(system, free).maximum
         top = min(GROWTH * scales[place], np.inf if limit is None else limit)
         if top > present[place]:
-            points[place] = spread(float(present[place]), float(top), float(scales[place]))
+            start, end = float(present[place]), float(top)
+            points[place], _ = ways[place][1].samples(start, end, float(scales[place]))
     scans = scan_lines(courses, points, [scale / GROWTH for scale in scales], first=True)
     found: list[Margin | None] = []
     for (free, line), start, some, scanned in zip(ways, present.tolist(), points, scans, strict=True):

@@ -30,6 +30,7 @@ from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes
 from apc.runtime.eigen.spectrum import DRIFTS
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
+from apc.runtime.vary.bends import bends
 from apc.runtime.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.runtime.vary.crossings import Courses, Root, Scan, scan
 from apc.runtime.vary.delays import Piece, borders, delay_now, delay_pieces, system_with_delay
@@ -100,14 +101,17 @@ class Search:
     """All crossings of one parameter in an interval, with what lies between them.
 
     `edges` are the crossings in order, and `stable` says of each stretch, one more than there are crossings,
-    whether it is stable; it is empty when no sample told. `enters` says whether any matrix was seen to change
-    along the way.
+    whether it is stable; it is empty when no sample told. `known` says whether the equations are enclosed
+    between the `looked` values that were looked at, `enters` whether any matrix was seen to change along the
+    way.
     """
 
     edges: tuple[Crossing, ...]
     stable: tuple[bool, ...]
     scanned: tuple[float, float]
     whole: bool
+    known: bool
+    looked: int
     enters: bool
 
 
@@ -130,6 +134,19 @@ class Line:
         along = np.zeros((len(values), len(self.base)))
         along[:, self.column] = 1.0
         return self.family.slopes(self.points(values), along)
+
+    def samples(self, bottom: float, top: float, scale: float) -> tuple[Floats, bool]:
+        """Return values from bottom to top to begin a scan with, and whether the equations between are known.
+
+        As `spread`, and as many more as the equations' coefficients ask for, see `bends`.
+        """
+        return self.with_bends(spread(bottom, top, scale), scale / SPAN)
+
+    def with_bends(self, points: Floats, least: float) -> tuple[Floats, bool]:
+        """Return points with those that the equations' coefficients ask for, and whether these are known."""
+        family = self.family
+        found = bends(family, self.base, self.column) if isinstance(family, BatchEvaluator) else None
+        return (points, False) if found is None else found.between(points, least)
 
     def scale(self) -> float:
         """Return the present value or, where it is 0, the change that would move some eigenvalue by 1."""
@@ -209,13 +226,14 @@ def search(
         )
         return pairs
 
-    found = scan(course, spread(bottom, top, scale), least=scale / SPAN)
+    points, known = line.samples(bottom, top, scale)
+    found = scan(course, points, least=scale / SPAN)
     edges = []
     for number, root in enumerate(found.roots):
         if told:
             told(f"proving crossing {number + 1} of {len(found.roots)}")
         edges.append(proved_crossing(root, line, found))
-    return _search(edges, found, (bottom, top), enters=enters)
+    return _search(edges, found, (bottom, top), known=known, enters=enters)
 
 
 def spread(bottom: float, top: float, scale: float) -> Floats:
@@ -237,18 +255,20 @@ def spread(bottom: float, top: float, scale: float) -> Floats:
     return np.asarray(found[np.append(True, np.diff(found) > 0)])
 
 
-def _search(edges: Sequence[Crossing], found: Scan, asked: tuple[float, float], *, enters: bool) -> Search:
+def _search(
+    edges: Sequence[Crossing], found: Scan, asked: tuple[float, float], *, known: bool, enters: bool
+) -> Search:
     """Put the crossings together with the stretches between them."""
     points, radius = found.points, found.radius
     if not len(points):
-        return Search((), (), asked, whole=False, enters=enters)
+        return Search((), (), asked, whole=False, known=known, looked=0, enters=enters)
     ends = [-np.inf, *(one.value for one in edges), np.inf]
     stable = tuple(
         bool(radius[(points > low) & (points < high)][0] < 1) for low, high in itertools.pairwise(ends)
     )
     # A limit on which an eigenvalue lies on the circle, as a stiffness of exactly 0, is no sample itself.
     scanned = (min(asked[0], float(points[0])), min(asked[1], float(points[-1])))
-    return Search(tuple(edges), stable, scanned, found.whole, enters)
+    return Search(tuple(edges), stable, scanned, found.whole, known, len(points), enters)
 
 
 def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
@@ -341,13 +361,13 @@ def search_delay(
     edges: list[Crossing] = []
     stable = [True] if from_stable else []
     before: Piece | None = None
-    at, whole = low, True
+    at, whole, known, looked = low, True, True, 0
     for piece in delay_pieces(system, free, low, prepared, place=_PLACE, high=end):
         at = min(piece.high, end)
         if told:
             told(f"looking at {free.label} up to {float(at):.6g} s of {float(end):.6g} s")
-        found = _piece_scan(piece, float(piece.low), float(at), prepared)
-        whole = whole and found.whole
+        found, enclosed = _piece_scan(piece, float(piece.low), float(at), prepared)
+        whole, known, looked = whole and found.whole, known and enclosed, looked + len(found.points)
         if not len(found.points):
             continue
         first = bool(found.radius[0] < 1)
@@ -361,7 +381,8 @@ def search_delay(
         before = piece
         if from_stable and edges:
             break
-    return Search(tuple(edges), tuple(stable), (float(low), float(at)), whole, enters=True)
+    scanned = float(low), float(at)
+    return Search(tuple(edges), tuple(stable), scanned, whole, known, looked, enters=True)
 
 
 def delay_reach(
@@ -386,14 +407,14 @@ def delay_reach(
     return at, count
 
 
-def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> Scan:
-    """Scan one piece, its ends as limits from within."""
+def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> tuple[Scan, bool]:
+    """Scan one piece, its ends as limits from within; say whether the equations are known all over it."""
     family = piece.evaluator
     if family is None:
         found = analyze(piece.inside, prepared=prepared)
         if found.stable is None or found.verdict == DRIFTS:
-            return Scan(np.empty(0), np.empty(0), (), whole=found.verdict == DRIFTS)
-        return Scan(np.array([low]), np.array([found.spectral_radius]), (), whole=True)
+            return Scan(np.empty(0), np.empty(0), (), whole=found.verdict == DRIFTS), True
+        return Scan(np.array([low]), np.array([found.spectral_radius]), (), whole=True), True
 
     def course(points: Floats) -> Sequence[tuple[Floats, Floats]]:
         if not piece.constant:
@@ -401,8 +422,12 @@ def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> Sc
         matrices = family.matrices(points[:, None])
         return [(matrix, np.zeros_like(matrix)) for matrix in matrices]
 
-    points = np.array([low]) if piece.constant else np.linspace(low, high, PIECE_SAMPLES)
-    return scan(course, points, least=high - low)
+    points, known = np.array([low]), True
+    if not piece.constant:
+        points = np.linspace(low, high, PIECE_SAMPLES)
+    if family.tangents:
+        points, known = Line(family, np.array([low]), 0).with_bends(points, high - low)
+    return scan(course, points, least=high - low), known
 
 
 def _jump(
