@@ -178,6 +178,8 @@ def _standing(
     arcs, heights = [], [0.0]
     for root in found.roots:
         crossing = proved_crossing(root, line, found)
+        if crossing is None:
+            return None
         height = min(max((crossing.value - low) / (high - low), 0.0), 1.0)
         heights.append(height)
         middle = np.array([[(ends[0] + ends[1]) / 2, height]])

@@ -164,7 +164,11 @@ def critical(
             low, high = (None if one is None else float(one) for one in limits)
             found = search(system, free, low, high, prepared, told=told)
         chosen = _chosen(found, present, lambda: analyze(system, prepared=prepared).stable)
-    words = "stable" if found.stable == (True,) else "unstable" if found.stable else "undecided"
+        side = found.stable[0] if found.stable else None
+        if not chosen and found.scanned[0] <= present <= found.scanned[1]:
+            # Floats alone say of which side all samples are; the analysis bounds its error.
+            side = side if analyze(system, prepared=prepared).stable == side else None
+    words = {True: "stable", False: "unstable", None: "undecided"}[side]
     verdict = f"{words} at every value scanned"
     if not found.enters:
         verdict = f"{words} whatever its value: nothing that decides stability depends on it"

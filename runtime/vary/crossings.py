@@ -15,7 +15,7 @@ Several lines are scanned in step: a call for many small matrices takes hardly l
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,7 +172,7 @@ def scan_lines(
         return tuple(Scan(np.empty(0), np.empty(0), (), whole=True) for _ in points)
     narrow = [_narrow(*pair) for pair in zip(points, least, strict=True)]
     lines = np.repeat(np.arange(count), [len(one) for one in points])
-    samples = _sample(courses, lines, np.concatenate(points))
+    samples = _sample(courses, lines, np.concatenate(points), ends=True)
     new = np.ones(len(samples.points), dtype=bool)
     whole, going = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
     for _ in range(MOST_LEVELS):
@@ -217,8 +217,16 @@ def _last_cells(samples: _Samples, count: int) -> Integers:
     return found
 
 
-def _sample(courses: Courses, lines: Integers, points: Floats) -> _Samples:
-    """Return the samples at points that have matrices and a side."""
+def _sample(courses: Courses, lines: Integers, points: Floats, *, ends: bool = False) -> _Samples:
+    """Return the samples at points that have matrices and a side.
+
+    Parameters
+    ----------
+    courses, lines, points
+        The matrices, and where.
+    ends
+        Whether the first and last point of each line are ends: these may lie on the circle, see `_off_circle`.
+    """
     pairs = courses(lines, points)
     sound = np.ones(len(points), dtype=bool)
     for matrix, slope in pairs:
@@ -227,7 +235,37 @@ def _sample(courses: Courses, lines: Integers, points: Floats) -> _Samples:
     values, slopes = tuple(v for v, _ in found), tuple(d for _, d in found)
     samples = _Samples(lines[sound], points[sound], values, slopes)
     # What lies on the circle within rounding tells no side, unless something is clearly outside.
-    return samples.chosen(np.abs(samples.radius() - 1) > UNSURE)
+    sure = np.abs(samples.radius() - 1) > UNSURE
+    if not ends:
+        return samples.chosen(sure)
+    lines = samples.lines
+    first, last = np.diff(lines, prepend=-1) > 0, np.diff(lines, append=len(lines)) > 0
+    # Beside an end that only rounding moves off the circle, the next sample tells no side either.
+    way = np.where(first & np.append(sure[1:], False), 1, np.where(last & np.append(False, sure[:-1]), -1, 0))
+    return _off_circle(samples, np.where(sure, 0, way), sure)
+
+
+def _off_circle(samples: _Samples, way: Integers, sure: Truths) -> _Samples:
+    """Return the sure samples, and ends of lines on the circle as they are just inside the line.
+
+    As where a stiffness vanishes, and sets free what it holds: an eigenvalue leaves the circle as it grows.
+
+    Parameters
+    ----------
+    samples
+        All samples.
+    way
+        1 at the first sample of a line, −1 at the last, where these lie on the circle; 0 elsewhere.
+    sure
+        Which samples lie clearly inside or outside.
+    """
+    moved, kept = [], sure | (way != 0)
+    for values, slopes in zip(samples.values, samples.slopes, strict=True):
+        on = (np.abs(np.abs(values) - 1) <= UNSURE) & (way != 0)[:, None]
+        leaving = np.sign((values.conj() * slopes).real) * way[:, None]
+        kept = kept & ~(on & (leaving == 0)).any(axis=1)
+        moved.append(np.where(on, values * (1 + 2 * UNSURE * leaving), values))
+    return replace(samples, values=tuple(moved)).chosen(kept)
 
 
 def _narrow(points: Floats, least: float) -> Floats:

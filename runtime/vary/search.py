@@ -27,7 +27,7 @@ from apc.runtime.analysis.analysis import Prepared, analyze, lifted_groups
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes
-from apc.runtime.eigen.spectrum import DRIFTS
+from apc.runtime.eigen.spectrum import DRIFTS, solve_spectrum
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.bends import bends
@@ -232,7 +232,8 @@ def search(
     for number, root in enumerate(found.roots):
         if told:
             told(f"proving crossing {number + 1} of {len(found.roots)}")
-        edges.append(proved_crossing(root, line, found))
+        crossing = proved_crossing(root, line, found)
+        edges += [crossing] if crossing else []
     return _search(edges, found, (bottom, top), known=known, enters=enters)
 
 
@@ -266,15 +267,13 @@ def _search(
     stable = tuple(
         bool(radius[(points > low) & (points < high)][0] < 1) for low, high in itertools.pairwise(ends)
     )
-    # A limit on which an eigenvalue lies on the circle, as a stiffness of exactly 0, is no sample itself.
-    scanned = (min(asked[0], float(points[0])), min(asked[1], float(points[-1])))
+    scanned = (float(points[0]), float(points[-1]))
     return Search(tuple(edges), stable, scanned, found.whole, known, len(points), enters)
 
 
-def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
-    """Prove a crossing, if it can be proved, and describe it."""
-    place = int(np.searchsorted(found.points, root.value))
-    low, high = found.points[max(place - 1, 0)], found.points[min(place, len(found.points) - 1)]
+def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
+    """Prove a crossing, if it can be proved, and describe it; None where both sides are proved alike."""
+    beside = low, high = _beside(root, found)
     if not root.slope:  # a defective cluster: its samples are scattered as well
         low, high = root.value - abs(root.value) / 2, root.value + abs(root.value) / 2
     family = line.family
@@ -288,7 +287,9 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
         def all_of_them(value: float) -> tuple[ClosedSystem, ...]:
             return family.closed_at(point(value))
 
-        held = bracket_in_floats(root, all_of_them, low=float(low), high=float(high))
+        held = bracket_in_floats(root, all_of_them, low=low, high=high)
+        if held is None and _alike(*(all_of_them(one) for one in beside)):
+            return None
         return _described(root, held, [(one, _free(one)) for one in all_of_them(root.value)])
 
     @functools.cache
@@ -299,10 +300,24 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
     def at(value: float) -> ClosedSystem:
         return family.system_at(point(value), root.system)
 
-    proved = bracket(root, systems, low=float(low), high=float(high))
+    proved = bracket(root, systems, low=low, high=high)
     if proved is None:
-        proved = bracket_in_floats(root, lambda value: [at(value)], low=float(low), high=float(high))
+        proved = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
+    if proved is None and _alike(*(family.closed_at(point(one)) for one in beside)):
+        return None
     return _described(root, proved, [(at(root.value), systems(root.value)[root.system][1])])
+
+
+def _beside(root: Root, found: Scan) -> tuple[float, float]:
+    """Return the samples on either side of a root."""
+    place = int(np.searchsorted(found.points, root.value))
+    return float(found.points[max(place - 1, 0)]), float(found.points[min(place, len(found.points) - 1)])
+
+
+def _alike(one: Sequence[ClosedSystem], other: Sequence[ClosedSystem]) -> bool:
+    """Say whether the analyses on both sides of a root have one verdict: floats alone took it for one."""
+    sides = [solve_spectrum(systems).stable for systems in (one, other)]
+    return sides[0] is not None and sides[0] == sides[1]
 
 
 def _free(system: ClosedSystem) -> RigidModes:
@@ -376,8 +391,10 @@ def search_delay(
         if not stable or stable[-1] != first:
             stable.append(first)
         for root in found.roots:
-            edges.append(_delay_crossing(system, free, root, prepared, piece))
-            stable.append(not stable[-1])
+            crossing = _delay_crossing(system, free, root, found, prepared, piece)
+            if crossing:
+                edges.append(crossing)
+                stable.append(not stable[-1])
         before = piece
         if from_stable and edges:
             break
@@ -456,9 +473,9 @@ def _jump(
 
 
 def _delay_crossing(
-    system: CompiledSystem, free: Free, root: Root, prepared: Prepared, piece: Piece
-) -> Crossing:
-    """Prove a crossing within a piece, whose systems are built anew for every value."""
+    system: CompiledSystem, free: Free, root: Root, found: Scan, prepared: Prepared, piece: Piece
+) -> Crossing | None:
+    """Prove a crossing within a piece, whose systems are built anew for every value, as `proved_crossing`."""
 
     @functools.cache
     def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
@@ -474,4 +491,6 @@ def _delay_crossing(
             low=float(piece.low),
             high=float(piece.high),
         )
+    if held is None and _alike(*([one for one, _ in systems(value)] for value in _beside(root, found))):
+        return None
     return _described(root, held, [systems(root.value)[root.system]])
