@@ -1,15 +1,25 @@
 """The words of messages and reports: numbers with their nouns and units, and lines that fit a terminal.
 
-Takes: numbers and texts. Gives: `WIDTH`, `cut`, `counted`, `with_unit`, `in_hertz`, `wrapped`.
-Guarantees: a line is at most `WIDTH` columns wide, but for a word that has no place to break it at.
+Takes: numbers and texts.
+Gives: `WIDTH`, `cut`, `counted`, `measured`, `known_digits`, `with_unit`, `in_hertz`, `wrapped`.
+Guarantees: no digit is shown that its number's error leaves open; a line is at most `WIDTH` columns wide, but
+for a word that has no place to break it at.
 Does not: know what is told, or print.
 """
 
 from __future__ import annotations
 
+import math
 import re
+from decimal import ROUND_UP, Context, Decimal
 
 WIDTH = 80  # columns of a terminal as it opens
+
+# Digits of a float, and one.
+_DIGITS = 18
+
+# Above all digits that two floats can have apart.
+_WIDE = Context(prec=1500)
 
 _PIECE = re.compile(r"[^*/(,]+[*/(,]*|[*/(,]+")  # of a word, broken behind an operator
 
@@ -22,6 +32,35 @@ def cut(text: str) -> str:
 def counted(number: int, noun: str, form: str = "d") -> str:
     """Return a number and its noun; `form` is Python's format of the number: `,` groups its digits."""
     return f"{number:{form}} {noun}" + ("" if number == 1 else "s")
+
+
+def measured(value: float, error: float, unit: str = "1") -> str:
+    """Return a number with its error, to the digit that the error stands in, as "0.25 ± 3e-02 m".
+
+    The error is rounded up, and holds what rounding the number takes away as well.
+    """
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return f"{with_unit(f'{value:.6g}', unit)} ± {error:.0e}"
+    exact, off = Decimal(value), Decimal(error)
+    place = max(off.adjusted(), exact.adjusted() - _DIGITS) if error else exact.adjusted() - _DIGITS
+    while True:
+        shown = exact.quantize(Decimal((0, (1,), place)), context=_WIDE)
+        whole = _WIDE.add(abs(_WIDE.subtract(shown, exact)), off)
+        whole = Context(prec=1, rounding=ROUND_UP).plus(whole)
+        if whole.adjusted() <= place or not whole:
+            break
+        place = whole.adjusted()
+    digits = max(exact.adjusted() - place, 0)
+    text = f"{shown:f}" if -5 < exact.adjusted() < _DIGITS else f"{float(shown):.{digits}e}"
+    return f"{with_unit(text, unit)} ± {float(whole):.0e}"
+
+
+def known_digits(value: float, error: float, most: int) -> str:
+    """Return a number to at most so many digits, fewer where its error leaves them open."""
+    if not (value and math.isfinite(value) and math.isfinite(error)):
+        return f"{value:.{most}g}"
+    digits = Decimal(value).adjusted() - Decimal(error).adjusted() if error else most
+    return f"{value:.{min(max(digits, 1), most)}g}"
 
 
 def with_unit(number: str, unit: str) -> str:

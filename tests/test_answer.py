@@ -73,7 +73,7 @@ def test_the_method_of_the_paper_agrees_and_proves_nothing() -> None:
 def test_packet_loss_is_said_to_be_out_of_the_verdict(tmp_path: Path) -> None:
     path = tmp_path / "lossy.yaml"
     path.write_text(replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 2 %}")), encoding="utf-8")
-    notes = " ".join(analyze(compile_topology(path)).notes)
+    notes = " ".join(analyze(compile_topology(path)).left_out)
     assert "lan" in notes and "apc simulate" in notes
 
 

@@ -50,7 +50,7 @@ HOUSE = (
         lift batch_lift course residues
         """,
     ),
-    ("apc.runtime.network", "channel_law packets listener timetable weights gathering"),
+    ("apc.runtime.network", "channel_law nominal packets listener timetable weights gathering"),
     (
         "apc.runtime.eigen",
         """
@@ -76,8 +76,8 @@ HOUSE = (
     (
         "apc.runtime.vary",
         """
-        wiring batch evaluator marginal eigenvalues crossings bracket delays search critical margins
-        sensitivity
+        wiring batch evaluator symbols bends marginal eigenvalues crossings bracket delays search critical
+        margins sensitivity
         """,
     ),
     ("apc.runtime.sweep", "grid quantities table_file work store local cluster sweep"),

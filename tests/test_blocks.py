@@ -45,5 +45,5 @@ def test_the_first_block_names_what_left_the_range_of_floats_and_ends_before_it(
 def test_a_pole_is_reached_and_told() -> None:
     played = blocks(prepare(alone(lambda x, u: 50 * (x + 1) ** 2), Settings(Fraction(1, 10), jit=False)))
     assert len(next(played).time) == 19  # 1/(1 − 50 t) − 1: the last whole frame ends at 19 ms
-    with pytest.raises(ApcError, match=r"E915 the motion of x can't be integrated"):
+    with pytest.raises(ApcError, match=r"E871 the motion of x can't be integrated"):
         next(played)

@@ -11,9 +11,9 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.runtime.network.channel_law import LATEST, PARETO_MOST, channel_law, deviates, nominal_notes
+from apc.runtime.network.channel_law import LATEST, PARETO_MOST, channel_law, deviates
 from tests.lossy import RELIABLE, delays, unreliable
-from tests.topologies import AVERAGE, compiled
+from tests.topologies import compiled
 
 
 def test_the_numbers_are_the_scenes_and_follow_a_setting() -> None:
@@ -40,16 +40,6 @@ def test_a_group_can_not_set_a_number_of_a_link() -> None:
     system = apc.set_parameters(compiled(unreliable("loss: 2 %")), {"user.lan.loss": "5 %"})
     with pytest.raises(ApcError, match=r"E891 lan\.loss is of a link, .*: user can't set it"):
         channel_law(system, system.links[0], Fraction(0))
-
-
-def test_an_analysis_can_say_what_it_leaves_out() -> None:
-    assert nominal_notes(compiled(AVERAGE)) == ()
-    assert nominal_notes(compiled(unreliable("loss: 0 %, jitter: 0 ms"))) == ()
-    [note] = nominal_notes(compiled(unreliable("loss: {p: 1 %, r: 25 %}, jitter: 2 ms")))
-    assert note == (
-        "packet loss (3.85 %) and jitter of lan are not in this verdict: every packet takes the nominal "
-        "8 ms; see apc simulate"
-    )
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,6 @@ def test_a_scene_that_is_not_stable_has_no_margins_and_says_so() -> None:
 
 
 def test_the_table_fits_80_columns() -> None:
-    text = margins_report(margins(compiled(AVERAGE), pieces=1))
+    text = margins_report(margins(compiled(AVERAGE)))
     assert max(map(len, text.splitlines())) <= 80
     assert "no limit up to" in text

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from apc.compiler.words import WIDTH
+from apc.compiler.words import WIDTH, measured
 from apc.runtime.analysis.analysis import analyze
 from apc.runtime.analysis.needs import needs
 from apc.runtime.answers.report import analysis_report, compile_report
@@ -55,7 +55,7 @@ def test_an_analysis_names_verdict_radius_and_error() -> None:
     lines = analysis_report(result).splitlines()
     assert lines[0] == "three-users-average: stable up to a common translation"
     radius = next(line for line in lines if "spectral radius" in line)
-    assert f"{result.spectral_radius:.12g} ± {result.spectral_radius_error:.0e} per frame of 8 ms" in radius
+    assert f"{measured(result.spectral_radius, result.spectral_radius_error)} per frame of 8 ms" in radius
     assert "  peers            3, 8 states each" in lines
     assert "  method           modes, 1 translation left out" in lines
 

@@ -30,7 +30,7 @@ from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.parameters import Numbers, resolve
 from apc.runtime.frame.schedule import ORDER, Schedule
 from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.network.channel_law import nominal_notes
+from apc.runtime.network.nominal import left_out
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 
@@ -55,7 +55,8 @@ class Analysis:
 
     `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `plan.METHODS`.
     `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
-    say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided.
+    say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided;
+    `left_out` says what of the scene the answer does not look at.
     """
 
     topology: str
@@ -72,6 +73,7 @@ class Analysis:
     linearized: bool
     notes: tuple[str, ...]
     proof: str = ""
+    left_out: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Return the verdict in words, the numbers, and the modes as a table."""
@@ -108,6 +110,7 @@ class Analysis:
             "linearized": self.linearized,
             "notes": list(self.notes),
             "proof": self.proof,
+            "left_out": list(self.left_out),
         }
 
 
@@ -190,8 +193,9 @@ def analyze(
         rigid_modes=spectrum.rigid_modes,
         modes=spectrum.modes,
         linearized=linearized,
-        notes=(*plan.notes, *notes, *spectrum.notes, *nominal_notes(system)),
+        notes=(*plan.notes, *notes, *spectrum.notes),
         proof=f"{spectrum.proof}, of the linearization" if spectrum.proof and linearized else spectrum.proof,
+        left_out=left_out(system),
     )
 
 

@@ -32,10 +32,11 @@ from apc.runtime.eigen.ratios import NotRational, Ratio, Ratios
 from apc.runtime.eigen.runs import Runs
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.linearize import site_of_row
-from apc.runtime.frame.names import find
+from apc.runtime.frame.names import Free, find
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.frame.parameters import exact_numbers
 from apc.runtime.frame.site import LinearSite
+from apc.runtime.network.nominal import refuse_channel_number
 
 _PLACE = Place("box")
 
@@ -72,8 +73,8 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
     Raises
     ------
     ApcError
-        E830 not of that form, E831 a parameter that a box can't leave open, E833 limits that can't be; those
-        of `names.find` and `units.quantity`.
+        E830 not of that form, E831 a parameter that a box can't leave open, E833 limits that can't be; E896
+        a number of an unreliable link; those of `names.find` and `units.quantity`.
     """
     # Imported here: the language of quantities, which an analysis without a box never needs.
     from apc.compiler.language.units import quantity
@@ -82,6 +83,7 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
     if not (equals and name and value):
         raise _malformed(text, place)
     known, group = find(system, name, place)
+    refuse_channel_number(system, Free(known, group), place)
     parameter = _parameter(system, known, group, place)
     if value.startswith(("±", "+-")):
         share = _percentage(value.removeprefix("±").removeprefix("+-"), text, place)

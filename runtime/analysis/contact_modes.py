@@ -20,7 +20,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.words import in_hertz, wrapped
+from apc.compiler.words import in_hertz, measured, wrapped
 from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.runtime.eigen.spectrum import UNSTABLE, finite
@@ -35,6 +35,10 @@ MOST_NAMED = 30  # columns of a mode's name; a longer one has a line of its own
 
 # For each group of the scene, the names of the parts that are on.
 _Setting = tuple[frozenset[str], ...]
+
+
+# Digits of a spectral radius that its column has room for.
+SHOWN = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +110,7 @@ class ContactModes:
             if mode.refusal:
                 lines += [f"{head}  not analysed:", *wrapped(mode.refusal, "    ", "    ")]
                 continue
-            radius = f"{mode.spectral_radius:.9f} ± {mode.spectral_radius_error:.0e}"
+            radius = measured(mode.spectral_radius, max(mode.spectral_radius_error, SHOWN))
             frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
             verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
             lines.append(f"{head}  {radius:<19}  {frequency:>9}  {verdict}{'*' if mode.linearized else ''}")

@@ -25,6 +25,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError
+from apc.compiler.words import measured
 from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
@@ -115,7 +116,7 @@ class Conventions:
         """Return the outcomes as lines of at most 80 columns."""
         lines = [f"{self.topology}: {self._headline()}", ""]
         for number, one in enumerate(self.outcomes, 1):
-            radius = f"{one.spectral_radius:.9f} ± {one.spectral_radius_error:.0e}"
+            radius = measured(one.spectral_radius, one.spectral_radius_error)
             lines.append(f"  {number}  {one.verdict or 'not analysed'}")
             lines.append(f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}")
             lines += [f"     {departure}" for departure in one.departures or (DEFAULT,)]

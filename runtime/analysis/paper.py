@@ -34,6 +34,7 @@ from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, independent_pl
 from apc.runtime.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.lift import COEFFICIENT_ROUNDINGS
+from apc.runtime.network.nominal import left_out
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 
@@ -163,6 +164,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
             f"A_cl is {size} × {size}; {dead} of its columns are zero and as many eigenvalues with them",
             *spectrum.notes,
         ),
+        left_out=left_out(system),
     )
 
 

@@ -7,6 +7,7 @@ Does not: compute.
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -14,7 +15,7 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.words import WIDTH, counted, in_hertz, wrapped
+from apc.compiler.words import WIDTH, counted, in_hertz, measured, wrapped
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from apc.runtime.eigen.spectrum import Mode
 
 MOST_ROWS = 16
+DECIMALS = 6  # of a magnitude
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
 LARGE = 1e4  # a larger magnitude needs another notation to fit its column
 MOVES_WIDTH = 30  # columns at most of what a mode moves, at least of what it is cut to
@@ -111,7 +113,10 @@ def timings_report(taken: Sequence[tuple[str, float]]) -> str:
 
 def analysis_report(result: Analysis) -> str:
     """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
-    lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}", ""]
+    lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"]
+    for note in result.left_out:
+        lines += _note(note)
+    lines.append("")
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
     if result.linearized:
         words = f"{NEAR_THE_START}\n{words}"
@@ -121,7 +126,7 @@ def analysis_report(result: Analysis) -> str:
         removed = f", {counted(result.rigid_modes, 'translation')} left out"
     lines += [
         "",
-        f"  spectral radius  {result.spectral_radius:.12g} ± {result.spectral_radius_error:.0e}"
+        f"  spectral radius  {measured(result.spectral_radius, result.spectral_radius_error)}"
         f" per frame of {_time(result.frame_s)}",
         f"  peers            {result.peers}, {result.states_per_peer} states each",
         f"  method           {result.method}{removed}",
@@ -163,13 +168,22 @@ def _mode_table(modes: tuple[Mode, ...]) -> str:
 
 def _cells(mode: Mode) -> tuple[str, ...]:
     return (
-        f"{mode.magnitude:.6f}" if mode.magnitude < LARGE else f"{mode.magnitude:.6e}",
+        _magnitude(mode),
         mode.shape,
         str(mode.multiplicity),
         in_hertz(mode.frequency_hz) if mode.frequency_hz else "–",
         "–" if isnan(mode.damping_ratio) else f"{mode.damping_ratio:.3g}",
         _leading(mode),
     )
+
+
+def _magnitude(mode: Mode) -> str:
+    """Return a magnitude to six digits behind the point, fewer where its error leaves them open."""
+    if mode.magnitude >= LARGE:
+        return f"{mode.magnitude:.6e}"
+    known = -math.floor(math.log10(mode.error)) - 1 if 0 < mode.error < math.inf else DECIMALS
+    decimals = min(max(known, 0), DECIMALS)
+    return f"{mode.magnitude:.{decimals}f}" + " " * (DECIMALS - decimals)
 
 
 def _table_lines(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:

@@ -8,11 +8,17 @@ Does not: compute.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import click
 
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.options import json_option, print_result, set_option
 from apc.progress import status_line
 from apc.runtime.threads import start_single_threaded
+
+# What the name of a scene ends in.
+SCENES = (".yaml", ".yml", ".apc")
 
 
 @click.command("critical")
@@ -42,7 +48,24 @@ def critical_command(
     from apc.inputs import open_scene
     from apc.runtime.vary.critical import critical
 
+    _check_order(path, file)
     system = open_scene(file, settings)
     with status_line() as told:
         found = critical(system, path, lower=lower, upper=upper, told=told)
     print_result(found, as_json=as_json)
+
+
+def _check_order(path: str, file: str | None) -> None:
+    """Refuse a scene where the parameter belongs: the two were exchanged, or only one was given."""
+    if Path(path).suffix.lower() not in SCENES:
+        return
+    got, name = f"{path}, then {file}", file
+    if file is None:
+        from apc.inputs import open_scene
+        from apc.runtime.vary.margins import coupler_parameters
+
+        got = f"{path} alone"
+        name = next((one.label for one in coupler_parameters(open_scene(path, ()))), None)
+    hint = f"apc critical {name} {path}" if name else ""
+    wanted = "a parameter or delay, then the scene"
+    raise ApcError(Mistake("E841", Place("apc critical"), "the command", wanted, got, hint))

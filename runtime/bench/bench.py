@@ -97,7 +97,7 @@ class Comparison:
 
     `quantity` says what `error` is of, `relative` to what, `timed` what a time is of. `reference` is the
     truth in words, or why there is none; `refused` are the methods that can't serve the scene, with the
-    reason.
+    reason; `left_out` is what of the scene none of them looks at.
     """
 
     task: str
@@ -108,6 +108,7 @@ class Comparison:
     reference: str
     refused: tuple[tuple[str, str], ...]
     notes: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @property
     def chosen(self) -> Measured | None:
@@ -252,6 +253,7 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
         reference=said,
         refused=(*left_out, *refused),
         notes=tuple(notes),
+        left_out=default.left_out,
     )
 
 

@@ -33,11 +33,11 @@ def bench_report(found: Bench) -> str:
 def _task(found: Comparison) -> str:
     title = f"apc {found.task}: time against error of the {found.quantity}"
     left_out = [_filled(f"{name} left out: {reason}") for name, reason in found.refused]
+    head = [title, *(_filled(note) for note in found.left_out), ""]
     if not found.measured:
-        return "\n".join([title, "", *left_out])
+        return "\n".join([*head, *left_out])
     lines = [
-        title,
-        "",
+        *head,
         "  method                      median     spread      error      bound",
     ]
     for one in found.measured:

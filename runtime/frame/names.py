@@ -1,7 +1,7 @@
 """What a person calls a parameter or a timing, and what stands behind the name.
 
 Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
-Gives: `Free`, `find`, `parameter_of`, `unit_of`.
+Gives: `Free`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`, `unit_of`.
 Guarantees: a name that means nothing raises, with the nearest real one.
 Does not: read or change values.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from apc.compiler.compiled import PEERS, CompiledSystem, Parameter, counts_peers
+from apc.compiler.compiled import PEERS, CompiledSystem, Parameter, Timing, counts_peers
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 
 # The sections of a topology, which a name may start with.
@@ -41,7 +41,8 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     ApcError
         E622 no such parameter, E623 the number of peers, or of those that are heard.
     """
-    known = {parameter.name for parameter in system.parameters} | {timing.name for timing in system.timings}
+    times = {timing.name for timing in named_times(system)}
+    known = {parameter.name for parameter in system.parameters if is_named(parameter.name)} | times
     groups = {group.name for group in system.groups}
     written = name[:80].strip() or "an empty name"
     first, _, rest = name.partition(".")
@@ -51,7 +52,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     group = None
     if name not in known and first in groups and rest in {parameter.name for parameter in system.parameters}:
         name, group = rest, first
-    if group is not None and name in {timing.name for timing in system.timings}:
+    if group is not None and name in times:
         what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
         raise ApcError(Mistake("E622", place, what, hint=name))
     if counts_peers(name):
@@ -61,9 +62,23 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
         message = f"{written} is {what} and compile again"
         raise ApcError(Mistake("E623", place, message))
     if name not in known:
-        near = nearest(name, sorted(one for one in known if not counts_peers(one)))
+        near = nearest(name, sorted(known))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
     return name, group
+
+
+def is_named(name: str) -> bool:
+    """Say whether a parameter or timing stands in the scene under a name of its own.
+
+    What the compiler counts, as `peers` and `count(lan)`, and the delay of a hold without one or by an
+    expression, are not the user's to vary: their names hold what no name in a scene can.
+    """
+    return name != PEERS and not set(name) & set(" (")
+
+
+def named_times(system: CompiledSystem) -> list[Timing]:
+    """Return the timings that stand in the scene under a name of their own."""
+    return [timing for timing in system.timings if is_named(timing.name)]
 
 
 def parameter_of(system: CompiledSystem, free: Free) -> Parameter:
@@ -73,6 +88,12 @@ def parameter_of(system: CompiledSystem, free: Free) -> Parameter:
             if group.name == free.group and parameter.name == free.name:
                 return parameter
     return next(parameter for parameter in system.parameters if parameter.name == free.name)
+
+
+def value_now(system: CompiledSystem, free: Free) -> float:
+    """Return the present value of a parameter or timing, in SI."""
+    times = {timing.name: timing.value for timing in system.timings}
+    return float(times[free.name]) if free.name in times else parameter_of(system, free).value
 
 
 def unit_of(system: CompiledSystem, name: str) -> str:

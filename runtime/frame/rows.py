@@ -1,7 +1,7 @@
 """Parameter vectors for many at once: the different peers of a group, or many values of some parameters.
 
 Takes: a `CompiledSystem`, a group of it, and values of `Free` parameters.
-Gives: `Columns`, `different_rows`, `free_rows`.
+Gives: `Columns`, `different_rows`, `free_rows`, `free_values`.
 Guarantees: what depends on a value by an expression is worked out with it, in floats, in a time that grows
 with the number of values; what none reaches keeps the very number it was compiled with. Complex values are
 complex steps: the imaginary part is a derivative.
@@ -10,8 +10,8 @@ Does not: check bounds; change what everybody shares (`overrides`, in exact rati
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.names import OVERRIDE, Free
+
+if TYPE_CHECKING:
+    from apc.compiler.language.expression import Expr
 
 Floats = NDArray[np.float64]
 
@@ -101,12 +104,42 @@ def free_rows(
     -------
     The vectors (k, n_p), or (1, n_p) when none of the values reaches this peer.
     """
+    from apc.runtime.frame.row_arithmetic import compute_rows
+
+    listed = free_values(system, group, peer, values, compute_rows)
+    count = max((len(one) for one in listed if np.ndim(one)), default=1)
+    dtype = np.result_type(np.float64, *(one.dtype for one in listed if np.ndim(one)))
+    rows = np.empty((count, len(listed)), dtype=dtype)
+    for place, one in enumerate(listed):
+        rows[:, place] = one
+    return rows
+
+
+def free_values(
+    system: CompiledSystem,
+    group: Group,
+    peer: int,
+    values: Mapping[Free, Any],
+    compute: Callable[[Expr, Callable[[str], Any]], Any],
+) -> list[Any]:
+    """Return a peer's parameters, those that a free one reaches in its kind of number, the others as floats.
+
+    Parameters
+    ----------
+    system, group, peer
+        As for `free_rows`.
+    values
+        The value of each free parameter.
+    compute
+        Gives the value of an expression, the second argument that of a name.
+    """
     holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
     columns = Columns(system, group, holder)
     given = {column.name for column in group.columns}
     known: dict[str, Any] = {free.name: value for free, value in values.items() if free.group is None}
     known |= {free.name: value for free, value in values.items() if free.group == group.name}
-    timings = {timing.name: float(timing.value) for timing in system.timings}
+    reached = set(known)
+    timings = {timing.name: timing for timing in system.timings}
 
     def value_of(name: str) -> Any:
         if name not in known:
@@ -114,25 +147,19 @@ def free_rows(
         return known[name]
 
     def evaluated(name: str) -> Any:
-        parameter = holder.get(name)
-        if parameter is None:
-            return timings[name]
+        parameter = holder.get(name) or timings[name]
         if parameter.expression and name not in given:
             from apc.compiler.language.expression import names
             from apc.compiler.language.grammar import parse_expression
-            from apc.runtime.frame.row_arithmetic import compute_rows
 
             tree = parse_expression(parameter.expression, Place(name, 1, 1, parameter.expression))
-            reached = [value_of(".".join(node.parts)) for node in names(tree)]
-            if any(np.ndim(one) for one in reached):
-                return compute_rows(tree, value_of)
+            parts = [".".join(node.parts) for node in names(tree)]
+            for part in parts:
+                value_of(part)
+            if not reached.isdisjoint(parts):
+                reached.add(name)
+                return compute(tree, value_of)
         column = columns.of(name)
-        return parameter.value if column is None else float(column[peer])
+        return float(parameter.value) if column is None else float(column[peer])
 
-    listed = [value_of(name) for name in system.kinds[group.kind].parameters]
-    count = max((len(one) for one in listed if np.ndim(one)), default=1)
-    dtype = np.result_type(np.float64, *(one.dtype for one in listed if np.ndim(one)))
-    rows = np.empty((count, len(listed)), dtype=dtype)
-    for place, one in enumerate(listed):
-        rows[:, place] = one
-    return rows
+    return [value_of(name) for name in system.kinds[group.kind].parameters]

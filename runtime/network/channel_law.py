@@ -1,7 +1,7 @@
 """What an unreliable link does to packets, in numbers.
 
 Takes: a link's `Channel` and the scene's numbers; for `deviates`, random numbers from 0 to less than 1.
-Gives: `ChannelLaw`, `channel_law`; `deviates`, the jitter's distributions, and `LATEST`; `nominal_notes`.
+Gives: `ChannelLaw`, `channel_law`; `deviates`, the jitter's distributions, and `LATEST`.
 Guarantees: one law for all ways of a link with one delay; nothing is drawn here, so that it is the same with
 every version of NumPy.
 Does not: draw a packet (see `packets`).
@@ -127,27 +127,3 @@ def deviates(distribution: str, one: Floats, two: Floats) -> Floats:
     tail = (1 - one) ** (-1 / PARETO_SHAPE)
     late = (tail - PARETO_SHAPE / (PARETO_SHAPE - 1)) * 4 / 3
     return np.asarray(np.minimum(late, PARETO_MOST), dtype=np.float64)
-
-
-def nominal_notes(system: CompiledSystem) -> tuple[str, ...]:
-    """Return, for each unreliable link, what an analysis of its nominal delay leaves out."""
-    timings = {timing.name: timing.value for timing in system.timings}
-    notes = []
-    for link in system.links:
-        if link.channel is None:
-            continue
-        law = channel_law(system, link, timings[link.delay])
-        named = []
-        if law.mean_loss:
-            named.append(f"packet loss ({100 * law.mean_loss:.3g} %)")
-        if law.jitter:
-            named.append("jitter")
-        if law.trace is not None:
-            named.append("the recorded delays")
-        if named:
-            delay = f"{float(timings[link.delay]) * 1e3:.6g} ms"
-            notes.append(
-                f"{' and '.join(named)} of {link.name} are not in this verdict: every packet takes the "
-                f"nominal {delay}; see apc simulate"
-            )
-    return tuple(notes)

@@ -55,6 +55,7 @@ def draw_region(found: Region, ax: Any = None) -> Any:
     _frame(ax, found.x, found.y)
     _draw(ax, found, 1, 0)
     _name_stable_side(ax, (found,), (1,))
+    _entitle(ax, "", (found,))
     return ax
 
 
@@ -77,9 +78,7 @@ def draw_panels(found: Panels) -> Any:
         if place % columns:
             ax.set_ylabel("")
         letter = f"({panel_letter(place)}) " if count > 1 else ""
-        title = f"{letter}{_unbroken(panel.title)}".strip()
-        if title:
-            ax.set_title("\n".join(textwrap.wrap(title, 48)), fontsize=8.5)
+        _entitle(ax, f"{letter}{_unbroken(panel.title)}".strip(), panel.regions)
     for ax in axes[count:]:
         ax.set_axis_off()
     handles, labels = axes[0].get_legend_handles_labels()
@@ -94,6 +93,14 @@ def draw_panels(found: Panels) -> Any:
             handlelength=3,
         )
     return figure
+
+
+def _entitle(ax: Any, title: str, regions: Sequence[Region]) -> None:
+    """Set a title, and beneath it what the regions leave out."""
+    notes = dict.fromkeys(note for one in regions for note in one.left_out)
+    lines = [line for text in (title, *notes) for line in textwrap.wrap(text, 48)]
+    if lines:
+        ax.set_title("\n".join(lines), fontsize=8.5)
 
 
 def _unbroken(settings: str) -> str:

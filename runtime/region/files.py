@@ -70,6 +70,7 @@ def write_panels(path: Path, found: Panels) -> None:
         made = {
             "axes": [first.x.to_dict(), first.y.to_dict()],
             "apc": program_version(),
+            "left_out": {one.topology: list(one.left_out) for panel in found.panels for one in panel.regions},
             "origin": _origins(found),
         }
         write_table(path, headings(first), [kind for _, kind in COLUMNS], rows, made)

@@ -25,6 +25,7 @@ from apc.runtime.analysis.ranges import Range
 from apc.runtime.eigen.spectrum import finite
 from apc.runtime.frame.names import Free
 from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.network.nominal import left_out, refuse_channel_number
 from apc.runtime.region.area import stable_area
 from apc.runtime.region.axes import PLACE
 from apc.runtime.region.boundary import Arc, relative_to, trace
@@ -133,7 +134,8 @@ class Region:
     `stable_area` is in the product of the axes' units. `cell` are the sides of the cells the rectangle was
     looked at in, in SI; where values hinted at more, cells down to `finest` of them. `corner` says whether
     the corner of both lower ends is stable, `stepped` that the boundary is right to a cell only, as times
-    vary, `linearized` that the scene is not linear.
+    vary, `linearized` that the scene is not linear;
+    `left_out` says what of the scene the answer does not look at.
     """
 
     topology: str
@@ -147,6 +149,7 @@ class Region:
     corner: bool
     stepped: bool
     linearized: bool
+    left_out: tuple[str, ...]
     system: CompiledSystem
 
     def __str__(self) -> str:
@@ -173,6 +176,7 @@ class Region:
             "area_unit": _product(self.x.unit, self.y.unit),
             "cell": list(self.cell),
             "finest_cell": self.finest,
+            "left_out": list(self.left_out),
             "origin": dict(self.system.origin.texts),
         }
 
@@ -251,7 +255,8 @@ def region(
     Raises
     ------
     ApcError
-        E905 the scene can't be analysed everywhere in the rectangle; and those of `analysis.lifted_groups`.
+        E896 a number of an unreliable link; E905 the scene can't be analysed everywhere in the rectangle; and
+        those of `analysis.lifted_groups`.
 
     Notes
     -----
@@ -260,12 +265,15 @@ def region(
     line from cell edge to cell edge, its error the size of a cell.
     """
     free = tuple(Free(axis.name, axis.group) for axis in axes)
+    for one in free:
+        refuse_channel_number(system, one, PLACE)
     low = np.array([float(axis.low) for axis in axes])
     rectangle = Rectangle(low, np.array([float(axis.high) for axis in axes]) - low)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]
         linear = all(site.parameters_suffice for site in used)
+        affine = all(site.affine for site in used)
         times = [place for place, one in enumerate(free) if reaches_time(system, one)]
         source: BatchEvaluator | PointEvaluator
         if times:
@@ -294,6 +302,7 @@ def region(
         corner=found.corner,
         stepped=stepped,
         linearized=not linear,
+        left_out=left_out(system, linear=affine),
         system=system,
     )
 

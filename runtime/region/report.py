@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from math import isnan
 
-from apc.compiler.words import with_unit
+from apc.compiler.words import known_digits, measured, with_unit, wrapped
 from apc.runtime.region.panels import Panels, panel_letter
 from apc.runtime.region.region import Curve, Region
 
@@ -19,14 +19,17 @@ MOST_CURVES = 12
 def region_report(found: Region) -> str:
     """Return what `apc region` prints of one region."""
     width = max(len(found.x.label), len(found.y.label))
-    lines = [f"{found.topology}: {_words(found)}", ""]
+    lines = [f"{found.topology}: {_words(found)}"]
+    for note in found.left_out:
+        lines += wrapped(note, "  ", "    ")
+    lines.append("")
     for letter, axis in (("x", found.x), ("y", found.y)):
         span = with_unit(f"{float(axis.low):.6g} to {float(axis.high):.6g}", axis.unit)
         lines.append(f"  {letter}  {axis.label:<{width}}  {span}")
     whole = float(found.rectangle.width.prod())
     share = 100 * found.stable_area / whole
-    off = f" ± {found.stable_area_error:.0e}" if found.stable_area_error else ""
-    area = f"{found.stable_area:.9g}{off}"
+    off = found.stable_area_error
+    area = measured(found.stable_area, off) if off else f"{found.stable_area:.9g}"
     lines += ["", f"  stable area  {area} in SI, {share:.4g} % of the rectangle"]
     if found.curves:
         lines += ["", "  boundary     frequency [Hz]   from (x, y)         to (x, y)           error"]
@@ -39,8 +42,6 @@ def region_report(found: Region) -> str:
     )
     lines += ["", f"  Looked at in cells of {cell}, and finer where the"]
     lines.append("  eigenvalues hint at more; an island inside one cell could be missed.")
-    if found.linearized:
-        lines.append("  The scene is not linear: this holds near its start values only.")
     if found.stepped:
         lines.append("  Along these times the boundary has steps: it is right to a cell only.")
     return "\n".join(lines)
@@ -73,6 +74,11 @@ def _row(curve: Curve) -> str:
     span = (
         "–" if isnan(low) else f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
     )
-    start = "({:.6g}, {:.6g})".format(*curve.points[0])
-    end = "closed" if curve.closed else "({:.6g}, {:.6g})".format(*curve.points[-1])
+    start = _point(curve, 0)
+    end = "closed" if curve.closed else _point(curve, -1)
     return f"  {curve.mode:<11.11}  {span:<15}  {start:<18}  {end:<18}  {curve.error:.0e}"
+
+
+def _point(curve: Curve, place: int) -> str:
+    """Return a point of a curve, whose error is relative to each coordinate."""
+    return "({}, {})".format(*(known_digits(one, curve.error * abs(one), 6) for one in curve.points[place]))

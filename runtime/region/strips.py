@@ -33,7 +33,7 @@ from apc.runtime.vary.crossings import scan
 from apc.runtime.vary.delays import Piece, delay_pieces
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
 from apc.runtime.vary.marginal import marginal_motion, with_rigid
-from apc.runtime.vary.search import SPAN, Line, proved_crossing, spread
+from apc.runtime.vary.search import SPAN, Line, proved_crossing
 
 Floats = NDArray[np.float64]
 
@@ -172,12 +172,14 @@ def _standing(
         0,
     )
     scale = line.scale()
-    found = scan(line.course, spread(low, high, scale), least=scale / SPAN)
+    found = scan(line.course, line.samples(low, high, scale)[0], least=scale / SPAN)
     if not len(found.points):
         return None
     arcs, heights = [], [0.0]
     for root in found.roots:
         crossing = proved_crossing(root, line, found)
+        if crossing is None:
+            return None
         height = min(max((crossing.value - low) / (high - low), 0.0), 1.0)
         heights.append(height)
         middle = np.array([[(ends[0] + ends[1]) / 2, height]])

@@ -61,7 +61,7 @@ def blocks(simulation: Simulation, *, run: int = 0) -> Iterator[Block]:
     Raises
     ------
     ApcError
-        E872 an equation has no solution at some instant, E915 a motion can't be integrated any further; what
+        E872 an equation has no solution at some instant, E871 a motion can't be integrated any further; what
         was before is yielded first.
     """
     last = int(simulation.settings.duration / simulation.quantum)  # rounds down
@@ -88,7 +88,7 @@ def _unsolved(simulation: Simulation, frame: int) -> ApcError:
         "no value, or a force jumps to and fro without end"
     )
     hint = "dry friction by tanh in the place of sign; --method semi-implicit:0.1ms shows what happens"
-    return ApcError(Mistake("E915", place, what, hint=hint))
+    return ApcError(Mistake("E871", place, what, hint=hint))
 
 
 def _arrivals(simulation: Simulation, run: int) -> Arrivals | None:

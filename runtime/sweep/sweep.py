@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, with_unit, wrapped
+from apc.runtime.frame.names import Free
+from apc.runtime.network.nominal import left_out, refuse_channel_number
 from apc.runtime.sweep.grid import Grid, build_grid, check_size, parse_axis
 from apc.runtime.sweep.local import Workers, cores, local_processes, this_process
 from apc.runtime.sweep.quantities import VERDICT, Cell, Row, find_quantity
@@ -96,6 +98,8 @@ class Sweep:
         """Return the sweep in a few lines: where the rows are, what was swept, the verdicts."""
         where = f" → {self.out}" if self.out else ""
         lines = [f"{self.topology}: {self.points:,} points{where}"]
+        for note in self.made_of["left_out"]:
+            lines += wrapped(note, "  ", "    ")
         for axis in self.grid.axes:
             ends = f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}"
             lines.append(
@@ -143,15 +147,16 @@ def sweep(
     Raises
     ------
     ApcError
-        An axis is at fault (E622, E881 to E883, E204, …); E884 nothing is computed under that name; E885
-        other work stands at the target; E887 or E601 the target can't be written; E888 the cluster; E889 a
-        process ended. What is finished is kept.
+        An axis is at fault (E622, E881 to E883, E896, E204, …); E884 nothing is computed under that name;
+        E885 other work stands at the target; E887 or E601 the target can't be written; E888 the cluster;
+        E889 a process ended. What is finished is kept.
     """
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
     grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
     quantity = find_quantity(system, of)
     for axis in grid.axes:
+        refuse_channel_number(system, Free(axis.name, axis.group), PLACE)
         if axis.label == of.partition(":")[2].strip():
             what = f"{axis.label} is swept: there is nothing to look for at one value of it"
             raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
@@ -181,6 +186,7 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
         "topology": system.name,
         "peers": system.peers,
         "of": work.of,
+        "left_out": list(left_out(system)),
         "points": work.grid.points,
         "over": [
             {"parameter": axis.label, "unit": axis.unit, "values": [float(value) for value in axis.values]}

@@ -26,13 +26,14 @@ from apc.runtime.eigen.closing import ClosedSystem, close_loop
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.peer_group import PeerGroup
+from apc.runtime.eigen.rigid import find_rigid_modes
 from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows, roundings_of
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.jacobians import SiteJacobians
 from apc.runtime.frame.lift import lift
 from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
-from apc.runtime.frame.names import Free, parameter_of
+from apc.runtime.frame.names import Free, value_now
 from apc.runtime.frame.rows import free_rows
 from apc.runtime.frame.schedule import Propagate
 from apc.runtime.frame.site import LinearSite, every_matrix
@@ -44,6 +45,7 @@ from apc.runtime.vary.wiring import (
     reduced,
     relative_weights,
     site_key,
+    told_by_constants,
     wire,
 )
 
@@ -88,8 +90,9 @@ class BatchEvaluator:
     """An `Evaluator` of a scene whose matrices follow from its parameters in closed form.
 
     `durations` are the seconds of each step by its quanta, as (constant, slope), the slope over the only free
-    value where that is a time; then the parameters stay. `tangents` are the coefficients of each kind with
-    their derivatives; `fixed` the exponentials of the groups where nothing free reaches them.
+    value where that is a time. `tangents` are the coefficients of each kind with their derivatives, none
+    where a time varies that stands in no coefficient; `fixed` the exponentials of the groups where nothing
+    free reaches them.
     """
 
     system: CompiledSystem
@@ -124,13 +127,17 @@ class BatchEvaluator:
 
     def vectors(self, group: PeerGroup, values: Matrices) -> Matrices:
         """Return the parameter vectors (k, n_p) of a group, or (1, n_p) when no value reaches it."""
-        if self.timed:
+        if not self.tangents:
             return group.parameters[None]
-        first = int(group.peers[0])
-        place = int(np.searchsorted(self.exchange.starts, first, side="right")) - 1
-        peer = first - int(self.exchange.starts[place])
+        place, peer = self.first_peer(group)
         listed = {free: values[:, column] for column, free in enumerate(self.free)}
         return free_rows(self.system, self.system.groups[place], peer, listed)
+
+    def first_peer(self, group: PeerGroup) -> tuple[int, int]:
+        """Return which group of the scene the first of a group of like peers is of, and its number there."""
+        first = int(group.peers[0])
+        place = int(np.searchsorted(self.exchange.starts, first, side="right")) - 1
+        return place, first - int(self.exchange.starts[place])
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
@@ -168,6 +175,10 @@ class BatchEvaluator:
         Their matrices in floats are still those of the point that stands for all.
         """
         assert not self.timed, "another time is another schedule"
+        return self.sites_at(value)
+
+    def sites_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
+        """Return the same, whatever varies; of a time, all but the steps is of that point."""
         moved = {
             site_key(group): (vector, linearize_exact(group.jacobians, vector))
             for group, vector in self._points(value)
@@ -242,6 +253,7 @@ def batch_evaluator(
     exchange: Exchange,
     *,
     durations: Mapping[int, tuple[float, float]] | None = None,
+    follows: bool = True,
 ) -> BatchEvaluator:
     """Prepare groups of peers for many values of some parameters.
 
@@ -255,9 +267,10 @@ def batch_evaluator(
         The scene's peers at a point that stands for all, from `analysis.lifted_groups`.
     durations
         Where a time varies: the seconds of each step by its quanta, as constant and slope.
+    follows
+        Whether any coefficient may follow what varies.
     """
     systems = split(groups, exchange).systems
-    timed = durations is not None
     if durations is None:
         durations = {
             event.duration: (float(event.duration * group.schedule.quantum), 0.0)
@@ -265,8 +278,7 @@ def batch_evaluator(
             for event in group.schedule.events
             if isinstance(event, Propagate)
         }
-    # A time moves no coefficient.
-    tangents = {} if timed else {one.jacobians.kind.name: _tangent(one.jacobians) for one in groups}
+    tangents = {one.jacobians.kind.name: _tangent(one.jacobians) for one in groups} if follows else {}
     found = BatchEvaluator(
         system=system,
         free=tuple(free),
@@ -278,20 +290,25 @@ def batch_evaluator(
         fixed={},
     )
     found = replace(found, fixed=_fixed(found))
-    return found if timed else replace(found, wirings=_told_apart(found))
+    return replace(found, wirings=_told_apart(found)) if follows else found
 
 
 def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
     """Return the wirings, those marked whose rigid directions are not the same at another point."""
     if not any(wiring.rigid.names for wiring in evaluator.wirings):
         return evaluator.wirings
-    base = np.array([[parameter_of(evaluator.system, one).value for one in evaluator.free]])
-    lifted = evaluator.lifted(base * (1 + _generic(len(evaluator.free))[0]) + 1e-3)
+    base = np.array([value_now(evaluator.system, one) for one in evaluator.free])
+    other = (base * (1 + _generic(len(base))[0][0]) + 1e-3).tolist()
+    lifted = evaluator.lifted(np.array([other]))
     found = []
-    for wiring in evaluator.wirings:
+    for place, wiring in enumerate(evaluator.wirings):
         matrix = closed_loop(wiring, lifted)
-        moving = bool(np.isfinite(matrix).all() and not are_rigid(wiring, matrix).all())
-        found.append(replace(wiring, moving=moving and not wiring.rigid.drifts))
+        moves = bool(np.isfinite(matrix).all() and not are_rigid(wiring, matrix).all())
+        if moves and not wiring.rigid.drifts:
+            there = find_rigid_modes(evaluator.sites_at(other)[place], with_drifts=False)
+            found.append(told_by_constants(wiring, there))
+        else:
+            found.append(wiring)
     return tuple(found)
 
 

@@ -9,18 +9,20 @@ Does not: find two crossings nearer to each other than the cell size (see `cross
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import in_hertz, with_unit, wrapped
-from apc.runtime.analysis.analysis import Prepared, prepare
+from apc.compiler.words import counted, in_hertz, measured, with_unit, wrapped
+from apc.runtime.analysis.analysis import Prepared, analyze, prepare
 from apc.runtime.frame.names import Free, find, parameter_of, unit_of
 from apc.runtime.given import given
+from apc.runtime.network.nominal import left_out, refuse_channel_number
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.crossings import CELL
@@ -38,8 +40,11 @@ class Critical:
     `crossings` are all that were found from `scanned[0]` to `scanned[1]`, in order. `value` is the one that
     matters: with the present value stable, the first crossing above it or else the first below it; with the
     present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
-    there is no crossing; `verdict` then says whether all that was scanned is stable. `enters` says whether
+    there is no crossing; `verdict` then says whether all that was scanned is stable. `known` says
+    whether the equations are enclosed between the `looked` values that were looked at, so that only crossings
+    nearer than `cell` to one another can hide. `enters` says whether
     anything that decides depends on the parameter: on a start value of a linear scene nothing does.
+    `left_out` says what of the scene the answer does not look at.
     """
 
     topology: str
@@ -53,8 +58,11 @@ class Critical:
     scanned: tuple[float, float]
     cell: float
     whole: bool
+    known: bool
+    looked: int
     enters: bool
     verdict: str
+    left_out: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer as plain data, ready for JSON."""
@@ -70,27 +78,39 @@ class Critical:
             "scanned": list(self.scanned),
             "cell": self.cell,
             "whole": self.whole,
+            "known": self.known,
+            "looked": self.looked,
             "enters": self.enters,
             "verdict": self.verdict,
+            "left_out": list(self.left_out),
         }
 
     def __str__(self) -> str:
         """Return the answer in words."""
         low, high = (with_unit(f"{one:.6g}", self.unit) for one in self.scanned)
         present = with_unit(f"{self.present:.6g}", self.unit)
-        lines = [f"{self.topology}: {self.parameter} is {present}", ""]
+        lines = [f"{self.topology}: {self.parameter} is {present}"]
+        for note in self.left_out:
+            lines += wrapped(note, "  ", "    ")
+        lines.append("")
         if self.value is None:
             lines += wrapped(self.verdict, "  ", "  ")
         if not self.enters:
             return "\n".join(lines)
         for one in self.crossings:
             mark = "→" if one.value == self.value else " "
-            error = f" ± {one.error:.0e}" if one.error else ", exact"
-            lines.append(f"{mark} {with_unit(f'{one.value:.15g}', self.unit)}{error}")
+            exact = f"{with_unit(f'{one.value:.15g}', self.unit)}, exact"
+            value = measured(one.value, one.error, self.unit) if one.error else exact
+            lines.append(f"{mark} {value}")
             kind = "jump, " if one.kind == "jump" else ""
             lines.append(f"    {kind}stable {one.stable_side} it, {in_hertz(one.frequency_hz)}, {one.proof}")
         lines += ["", f"  scanned from {low} to {high}"]
-        lines.append(f"  two crossings nearer than {self.cell:.0e} of the value could hide")
+        if self.known:
+            lines.append(f"  two crossings nearer than {self.cell:.0e} of the value could hide")
+        else:
+            values = counted(self.looked, "value")
+            what = f"{values} were looked at; what the equations do between two of them is not known: "
+            lines += wrapped(f"{what}a narrow change of the verdict could hide there", "  ", "  ")
         if not self.whole:
             lines.append("  an eigenvalue keeps near to the boundary: more of them could")
         return "\n".join(lines)
@@ -123,11 +143,12 @@ def critical(
     ------
     ApcError
         E622 no such parameter, E623 the number of peers, E842 a range that is none, E843 a limit out of the
-        parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear; and those of
-        `units.quantity`.
+        parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear, E896 a number
+        of an unreliable link; and those of `units.quantity`.
     """
     known, group = find(system, name.strip(), _PLACE)
     free = Free(known, group)
+    refuse_channel_number(system, free, _PLACE)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         timed = reaches_time(system, free)
         unit = unit_of(system, known)
@@ -135,13 +156,19 @@ def critical(
         limits = [_limit(*one, free, unit) for one in (("--lower", lower), ("--upper", upper))]
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
+        linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
         if timed:
             _refuse_moving_start(system, prepared)
-            found = search_delay(system, free, limits[0] or 0.0, limits[1], prepared, told=told)
+            found = search_delay(system, free, limits[0] or Fraction(0), limits[1], prepared, told=told)
         else:
-            found = search(system, free, limits[0], limits[1], prepared, told=told)
-    chosen = _chosen(found, present)
-    words = "stable" if found.stable == (True,) else "unstable" if found.stable else "undecided"
+            low, high = (None if one is None else float(one) for one in limits)
+            found = search(system, free, low, high, prepared, told=told)
+        chosen = _chosen(found, present, lambda: analyze(system, prepared=prepared).stable)
+        side = found.stable[0] if found.stable else None
+        if not chosen and found.scanned[0] <= present <= found.scanned[1]:
+            # Floats alone say of which side all samples are; the analysis bounds its error.
+            side = side if analyze(system, prepared=prepared).stable == side else None
+    words = {True: "stable", False: "unstable", None: "undecided"}[side]
     verdict = f"{words} at every value scanned"
     if not found.enters:
         verdict = f"{words} whatever its value: nothing that decides stability depends on it"
@@ -157,8 +184,11 @@ def critical(
         scanned=found.scanned,
         cell=CELL,
         whole=found.whole,
+        known=found.known,
+        looked=found.looked,
         enters=found.enters,
         verdict="" if chosen else verdict,
+        left_out=left_out(system, linear=linear),
     )
 
 
@@ -172,12 +202,14 @@ def _refuse_moving_start(system: CompiledSystem, prepared: Prepared) -> None:
         )
 
 
-def _limit(option: str, text: str | None, free: Free, unit: str) -> float | None:
+def _limit(option: str, text: str | None, free: Free, unit: str) -> Fraction | None:
     """Read a limit, None if there is none."""
-    return None if text is None else float(given(option, text, what=free.name, unit=unit))
+    return None if text is None else given(option, text, what=free.name, unit=unit)
 
 
-def _check_limits(system: CompiledSystem, free: Free, limits: Sequence[float | None], *, timed: bool) -> None:
+def _check_limits(
+    system: CompiledSystem, free: Free, limits: Sequence[Fraction | None], *, timed: bool
+) -> None:
     """Refuse limits that leave nothing to look at."""
     low, high = limits
     least = 0.0 if timed else parameter_of(system, free).minimum
@@ -188,21 +220,23 @@ def _check_limits(system: CompiledSystem, free: Free, limits: Sequence[float | N
             (least is not None and value < least) or (most is not None and value > most)
         ):
             expected = f"at least {least:g}" if least is not None and value < least else f"at most {most:g}"
-            what, got = f"a limit of {free.name}", with_unit(f"{value:g}", unit)
+            what, got = f"a limit of {free.name}", with_unit(f"{float(value):g}", unit)
             raise ApcError(Mistake("E843", _PLACE, what, with_unit(expected, unit), got))
     bottom = low if low is not None else (least or 0.0)
     if high is not None and not high > bottom:
-        what, got = f"the range of {free.name}", with_unit(f"{bottom:g} to {high:g}", unit)
+        what, got = f"the range of {free.name}", with_unit(f"{float(bottom):g} to {float(high):g}", unit)
         raise ApcError(Mistake("E842", _PLACE, what, "an upper limit above the lower", got))
 
 
-def _chosen(found: Search, present: float) -> Crossing | None:
-    """Return the crossing that matters, see `Critical`."""
+def _chosen(found: Search, present: float, stable_now: Callable[[], bool | None]) -> Crossing | None:
+    """Return the crossing that matters, see `Critical`; on a jump, the scene itself tells its side."""
     if not found.edges:
         return None
-    above = [one for one in found.edges if one.value > present]
-    below = [one for one in found.edges if one.value <= present]
-    if found.stable[len(below)]:
-        return above[0] if above else below[-1]
+    below = sum(one.value < present for one in found.edges)
+    upto = sum(one.value <= present for one in found.edges)
+    if upto > below and found.stable[below] != stable_now():
+        below = upto
+    if found.stable[below]:
+        return found.edges[below] if below < len(found.edges) else found.edges[below - 1]
     lost = [one for one in found.edges if one.stable_side == "below"]
     return lost[0] if lost else found.edges[0]

@@ -15,7 +15,7 @@ Several lines are scanned in step: a call for many small matrices takes hardly l
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,9 @@ CAUTION = 0.5
 # Places at which a cubic is looked at.
 PLACES = 9
 
-# Cells narrower than this, relative to the value, are divided no further.
-CELL = 1e-3
+# Cells narrower than this, relative to the value, are divided no further; where the points to begin with are
+# nearer to one another, not those narrower than this share of what is between them.
+CELL, SHARE = 1e-3, 1 / 16
 
 # So few cells are divided into so many parts at once: a few matrices more take no longer, another call does.
 FEW, PARTS = 8, 8
@@ -169,16 +170,16 @@ def scan_lines(
     count = len(points)
     if not any(len(one) for one in points):
         return tuple(Scan(np.empty(0), np.empty(0), (), whole=True) for _ in points)
-    smallest = np.array(least, dtype=np.float64)
+    narrow = [_narrow(*pair) for pair in zip(points, least, strict=True)]
     lines = np.repeat(np.arange(count), [len(one) for one in points])
-    samples = _sample(courses, lines, np.concatenate(points))
+    samples = _sample(courses, lines, np.concatenate(points), ends=True)
     new = np.ones(len(samples.points), dtype=bool)
     whole, going = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
     for _ in range(MOST_LEVELS):
         # A cell that was there before was found clear, or can't be divided.
         cells = np.flatnonzero((samples.lines[1:] == samples.lines[:-1]) & (new[1:] | new[:-1]))
         cells = cells[cells <= _last_cells(samples, count)[samples.lines[cells]]] if first else cells
-        cells = cells[_widths(samples, cells, smallest) > CELL]
+        cells = cells[_wide(samples, cells, points, narrow)]
         cells = cells[_open(samples, cells)]
         going &= np.bincount(samples.lines[cells], minlength=count) <= MOST_OPEN
         whole &= going
@@ -216,8 +217,16 @@ def _last_cells(samples: _Samples, count: int) -> Integers:
     return found
 
 
-def _sample(courses: Courses, lines: Integers, points: Floats) -> _Samples:
-    """Return the samples at points that have matrices and a side."""
+def _sample(courses: Courses, lines: Integers, points: Floats, *, ends: bool = False) -> _Samples:
+    """Return the samples at points that have matrices and a side.
+
+    Parameters
+    ----------
+    courses, lines, points
+        The matrices, and where.
+    ends
+        Whether the first and last point of each line are ends, which may lie on the circle (`_off_circle`).
+    """
     pairs = courses(lines, points)
     sound = np.ones(len(points), dtype=bool)
     for matrix, slope in pairs:
@@ -226,14 +235,57 @@ def _sample(courses: Courses, lines: Integers, points: Floats) -> _Samples:
     values, slopes = tuple(v for v, _ in found), tuple(d for _, d in found)
     samples = _Samples(lines[sound], points[sound], values, slopes)
     # What lies on the circle within rounding tells no side, unless something is clearly outside.
-    return samples.chosen(np.abs(samples.radius() - 1) > UNSURE)
+    sure = np.abs(samples.radius() - 1) > UNSURE
+    if not ends:
+        return samples.chosen(sure)
+    lines = samples.lines
+    first, last = np.diff(lines, prepend=-1) > 0, np.diff(lines, append=len(lines)) > 0
+    # Beside an end that only rounding moves off the circle, the next sample tells no side either.
+    way = np.where(first & np.append(sure[1:], False), 1, np.where(last & np.append(False, sure[:-1]), -1, 0))
+    return _off_circle(samples, np.where(sure, 0, way), sure)
 
 
-def _widths(samples: _Samples, cells: NDArray[np.intp], least: Floats) -> Floats:
-    """Return the cells' widths relative to their values, or to the least of their lines."""
+def _off_circle(samples: _Samples, way: Integers, sure: Truths) -> _Samples:
+    """Return the sure samples, and ends of lines on the circle as they are just inside the line.
+
+    As where a stiffness vanishes, and sets free what it holds: an eigenvalue leaves the circle as it grows.
+
+    Parameters
+    ----------
+    samples
+        All samples.
+    way
+        1 at the first sample of a line, −1 at the last, where these lie on the circle; 0 elsewhere.
+    sure
+        Which samples lie clearly inside or outside.
+    """
+    moved, kept = [], sure | (way != 0)
+    for values, slopes in zip(samples.values, samples.slopes, strict=True):
+        on = (np.abs(np.abs(values) - 1) <= UNSURE) & (way != 0)[:, None]
+        leaving = np.sign((values.conj() * slopes).real) * way[:, None]
+        kept = kept & ~(on & (leaving == 0)).any(axis=1)
+        moved.append(np.where(on, values * (1 + 2 * UNSURE * leaving), values))
+    return replace(samples, values=tuple(moved)).chosen(kept)
+
+
+def _narrow(points: Floats, least: float) -> Floats:
+    """Return, for each cell between the points to begin with, how narrow its parts may get."""
+    size = np.maximum(np.maximum(np.abs(points[:-1]), np.abs(points[1:])), least)
+    return np.asarray(np.minimum(CELL * size, SHARE * np.diff(points)))
+
+
+def _wide(
+    samples: _Samples, cells: NDArray[np.intp], points: Sequence[Floats], narrow: Sequence[Floats]
+) -> Truths:
+    """Say of each cell whether it may be divided."""
     low, high = samples.points[cells], samples.points[cells + 1]
-    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), least[samples.lines[cells]])
-    return np.asarray((high - low) / size)
+    lines = samples.lines[cells]
+    found = np.zeros(len(cells), dtype=bool)
+    for line in np.unique(lines):
+        own = lines == line
+        first = np.searchsorted(points[line], low[own], side="right") - 1
+        found[own] = high[own] - low[own] > narrow[line][np.clip(first, 0, len(narrow[line]) - 1)]
+    return found
 
 
 def _between(samples: _Samples, cells: NDArray[np.intp], parts: int) -> tuple[Integers, Floats]:

@@ -1,7 +1,7 @@
 """A system's frame matrices as a delay varies: piece by piece, as far as the order of events stays the same.
 
 Takes: a `CompiledSystem` and a parameter or timing that reaches its delays.
-Gives: `Piece`, `delay_pieces`, `system_with_delay`, `delay_now`.
+Gives: `Piece`, `delay_pieces`, `borders`, `system_with_delay`, `delay_now`.
 Guarantees: pieces join on without a gap; events coincide at the values between them and nowhere else.
 Does not: vary periods or phases: another period is another frame.
 
@@ -11,10 +11,13 @@ only, so that over a link nothing changes within a piece at all.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+
+import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -29,8 +32,8 @@ from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
 
 # Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal
-# there by accident.
-INSIDE = (Fraction(3, 11), Fraction(7, 13))
+# there by accident. No time of a scene is a multiple of one part in this prime number.
+INSIDE = (Fraction(28_571, 104_729), Fraction(56_393, 104_729))
 
 # A schedule as it is up to the length of its steps.
 _Form = tuple[object, ...]
@@ -96,44 +99,71 @@ def delay_pieces(
     ApcError
         E844 a period or phase, or what is not linear in the parameter.
     """
-    grid = _grid(system, free, place)
+    following = borders(system, free, place=place)
     known: dict[tuple[object, ...], BatchEvaluator] = {}
     while high is None or low < high:
-        following = grid(low)
-        yield _piece(system, free, low, following, prepared, known)
-        low = following
+        end = following(low)
+        yield _piece(system, free, low, end, prepared, known)
+        low = end
 
 
-def _grid(system: CompiledSystem, free: Free, place: Place) -> Callable[[Fraction], Fraction]:
-    """Return what gives the next value at which events may coincide that don't at the values before it."""
+def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fraction], Fraction]:
+    """Return what gives the next value at which events coincide that don't at the values before it.
+
+    What is held acts a delay after each tick of its clock: it may coincide with a tick of any clock, or with
+    what another delay lets act. A packet is read at ticks. Two rhythms of periods P and Q meet at every
+    multiple of their common divisor.
+
+    Raises
+    ------
+    ApcError
+        E844 a period or phase, or what is not linear in the parameter.
+    """
     fixed = {time for clock in system.clocks for time in (clock.period, clock.phase)}
     if free.name in fixed:
         raise _rhythm(free, place)
     now = delay_now(system, free)
     step = Fraction(1, 1009)
     at = [resolve(system_with_delay(system, free, now + share * step)).timings for share in (0, 1, 2)]
-    reached = [name for name in at[0] if at[0][name] != at[1][name]]
-    if any(name in fixed for name in reached):
+    slopes = {name: (at[1][name] - at[0][name]) / step for name in at[0]}
+    if any(slopes[name] for name in fixed):
         raise _rhythm(free, place)
-    lines = []
-    for name in reached:
-        slope = (at[1][name] - at[0][name]) / step
+    for name, slope in slopes.items():
         if at[2][name] != at[0][name] + 2 * slope * step:
             what = f"{name} is not linear in {free.name}: its critical value can't be searched"
             raise ApcError(Mistake("E844", place, what))
-        lines.append((at[0][name] - slope * now, slope))
-    others = [value for name, value in at[0].items() if name not in reached]
-    unit = common_divisor(others)
-    pairs = [(a - c, b - d) for i, (a, b) in enumerate(lines) for c, d in lines[:i] if b != d]
+    clocks = {clock.name: clock for clock in system.clocks}
+    holds = dict.fromkeys((hold.clock, hold.delay) for kind in system.kinds for hold in kind.holds)
+    packets = dict.fromkeys(
+        (link.clock, delay)
+        for link in system.links
+        for delay in (link.delay, *(pair.delay for pair in link.delays))
+    )
+    ticks = [(name, "") for name in clocks]
+    meetings = [
+        *itertools.product(holds, [*ticks, *holds]),
+        *itertools.product(packets, ticks),
+    ]
+    found = set()
+    for one, other in meetings:
+        first, second = (
+            (clocks[clock], at[0].get(delay, Fraction(0)), slopes.get(delay, Fraction(0)))
+            for clock, delay in (one, other)
+        )
+        slope = first[2] - second[2]
+        if slope:
+            apart = at[0][first[0].phase] + first[1] - at[0][second[0].phase] - second[1]
+            divisor = common_divisor([at[0][first[0].period], at[0][second[0].period]])
+            found.add((apart - slope * now, slope, divisor))
 
     def following(value: Fraction) -> Fraction:
-        """Return the least larger value at which constant + slope·value is a multiple of the unit."""
-        found = []
-        for constant, slope in (*lines, *pairs):
-            count = (constant + slope * value) / unit
+        """Return the least larger value at which some constant + slope·value is a multiple of its divisor."""
+        nearest = []
+        for constant, slope, divisor in found:
+            count = (constant + slope * value) / divisor
             number = math.floor(count) + 1 if slope > 0 else math.ceil(count) - 1
-            found.append((number * unit - constant) / slope)
-        return min(found)
+            nearest.append((number * divisor - constant) / slope)
+        return min(nearest, default=value + (now or 1))
 
     return following
 
@@ -154,14 +184,19 @@ def _piece(
     """Build the evaluator of one piece from its schedules at two values inside."""
     values = [low + share * (high - low) for share in INSIDE]
     systems = [system_with_delay(system, free, value) for value in values]
+    numbers = [resolve(one) for one in systems]
     schedules = [
         build_schedules(
-            one, resolve(one).timings, [site.pattern for site in prepared.jacobians], order=prepared.order
+            system, one.timings, [site.pattern for site in prepared.jacobians], order=prepared.order
         )
-        for one in systems
+        for one in numbers
     ]
     durations: dict[int, tuple[float, float]] = {}
-    constant = True
+    follows = any(
+        not np.array_equal(here, there)
+        for here, there in zip(numbers[0].parameters, numbers[1].parameters, strict=True)
+    )
+    constant = not follows
     for here, there in zip(*schedules, strict=True):
         assert _form(here) == _form(there), "the order of events changes within a piece"
         for quanta, (first, second) in _steps(here, there).items():
@@ -173,9 +208,9 @@ def _piece(
         return Piece(low, high, known[key], constant, systems[0])
     if constant and max(sum(one.depths) for one in schedules[0]) > LONG_LINES:
         return Piece(low, high, None, constant, systems[0])
-    shared = Prepared(prepared.jacobians, schedules[0], resolve(systems[0]).timings, prepared.order)
+    shared = Prepared(prepared.jacobians, schedules[0], numbers[0].timings, prepared.order)
     groups, exchange = lifted_groups(systems[0], prepared=shared)
-    found = batch_evaluator(systems[0], (free,), groups, exchange, durations=durations)
+    found = batch_evaluator(systems[0], (free,), groups, exchange, durations=durations, follows=follows)
     if constant:
         known[key] = found
     return Piece(low, high, found, constant, systems[0])

@@ -15,14 +15,14 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Group, Parameter, counts_peers
+from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError
 from apc.runtime.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
 from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.names import Free, parameter_of
+from apc.runtime.frame.names import Free, is_named, parameter_of
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.frame.rows import free_rows
 from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
@@ -265,7 +265,7 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
     """
     listed = []
     for one in system.parameters:
-        if one.expression is not None or counts_peers(one.name) or reaches_time(system, Free(one.name)):
+        if one.expression is not None or not is_named(one.name) or reaches_time(system, Free(one.name)):
             continue
         several = {
             group.name: any(column.name == one.name for column in group.columns)

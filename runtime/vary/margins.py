@@ -1,7 +1,7 @@
 """How much each coupler's stiffness and damping, and each delay, may grow before the boundary.
 
 Takes: a `CompiledSystem`.
-Gives: `Margin`, `Margins`, `margins`, `margins_report`.
+Gives: `Margin`, `Margins`, `margins`, `margins_report`; `coupler_parameters`.
 Guarantees: a margin is the next crossing above the present value, with its error; none is said together with
 how far was looked.
 Does not: look below the present value (see `critical`), or vary two at once (see `box`).
@@ -20,17 +20,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import in_hertz, wrapped
+from apc.compiler.words import in_hertz, known_digits, wrapped
 from apc.runtime.analysis.analysis import Prepared, prepare
 from apc.runtime.eigen.spectrum import finite
-from apc.runtime.frame.names import Free, parameter_of
+from apc.runtime.frame.names import Free, named_times, parameter_of
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.crossings import scan_lines
 from apc.runtime.vary.delays import delay_now
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size
-from apc.runtime.vary.search import Crossing, Line, courses_of, proved_crossing, reach, search_delay, spread
+from apc.runtime.vary.search import (
+    Crossing,
+    Line,
+    courses_of,
+    delay_reach,
+    proved_crossing,
+    reach,
+    search_delay,
+)
 
 Floats = NDArray[np.float64]
 
@@ -40,9 +48,9 @@ UNITS = ("N/m", "kg/s^2", "N*s/m", "kg/s")
 # How many times the present value is looked at (or the change that would move an eigenvalue by 1).
 GROWTH = 1e3
 
-# How many pieces of a delay, each from one coincidence of events to the next, mostly a tick.
-PIECES = 4
-
+# How far a delay is looked at: over so many pieces, each from one coincidence of events to the next, mostly
+# a tick, and up to so many times its present value; over more pieces than the most it takes too long.
+PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 
 # Larger systems than this are left alone: hundreds of eigenproblems of theirs take more than a second.
 MOST_STATES = 60
@@ -53,7 +61,7 @@ class Margin:
     """How far a parameter may grow: to `value`, right to `error`, both in SI, `factor` times its present one.
 
     `value` and `error` are None when no boundary was found up to `scanned`; `factor` is None then, and for a
-    present value of 0.
+    present value of 0. `note` says why it was not looked for, where it was not.
     """
 
     parameter: str
@@ -65,6 +73,7 @@ class Margin:
     frequency_hz: float | None
     kind: str
     scanned: float
+    note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the margin as plain data, ready for JSON."""
@@ -87,7 +96,7 @@ class Margins:
         return {"margins": [one.to_dict() for one in self.rows], "note": self.note}
 
 
-def margins(system: CompiledSystem, *, prepared: Prepared | None = None, pieces: int = PIECES) -> Margins:
+def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Margins:
     """Find how much each stiffness, damping and delay may grow, all else as it is.
 
     Parameters
@@ -96,23 +105,21 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, pieces:
         The compiled scene. One that isn't stable has no margins.
     prepared
         From `analysis.prepare`, of this system with any numbers.
-    pieces
-        How many pieces of each delay are looked at, see `delays`.
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
-        free = _coupler_parameters(system)
+        free = coupler_parameters(system)
         found = _parameter_margins(system, free, prepared)
         if isinstance(found, str):
             return Margins((), found)
         used = [prepared.jacobians[group.kind] for group in system.groups]
         if not all(site.parameters_suffice for site in used):
             return Margins(tuple(found), "delays were not varied: the scene is linearized at its start")
-        delays = [_delay_margin(system, one, prepared, pieces) for one in _delays(system)]
+        delays = [_delay_margin(system, one, prepared) for one in _delays(system)]
         return Margins((*found, *delays), "")
 
 
-def _coupler_parameters(system: CompiledSystem) -> list[Free]:
+def coupler_parameters(system: CompiledSystem) -> list[Free]:
     """Return the stiffnesses and dampings of parts without motion of their own, and the named ones."""
     moving = {state.name.rpartition(".")[0] for kind in system.kinds for state in kind.states}
     return [
@@ -127,7 +134,7 @@ def _delays(system: CompiledSystem) -> list[Free]:
     waited = [hold.delay for kind in system.kinds for hold in kind.holds]
     for link in system.links:
         waited += [link.delay, *(pair.delay for pair in link.delays)]
-    free = {timing.name for timing in system.timings if timing.expression is None}
+    free = {timing.name for timing in named_times(system) if timing.expression is None}
     return [Free(name) for name in dict.fromkeys(waited) if name in free]
 
 
@@ -176,7 +183,8 @@ def _along(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Ma
         limit = parameter_of(system, free).maximum
         top = min(GROWTH * scales[place], np.inf if limit is None else limit)
         if top > present[place]:
-            points[place] = spread(float(present[place]), float(top), float(scales[place]))
+            start, end = float(present[place]), float(top)
+            points[place], _ = ways[place][1].samples(start, end, float(scales[place]))
     scans = scan_lines(courses, points, [scale / GROWTH for scale in scales], first=True)
     found: list[Margin | None] = []
     for (free, line), start, some, scanned in zip(ways, present.tolist(), points, scans, strict=True):
@@ -211,14 +219,16 @@ def _radius(matrices: Sequence[Floats]) -> float:
     return max((float(np.abs(np.linalg.eigvals(one)).max(initial=0.0)) for one in matrices), default=0.0)
 
 
-def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, pieces: int) -> Margin:
+def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared) -> Margin:
     """Return the margin of a delay."""
-    present = delay_now(system, free)
-    found = search_delay(
-        system, free, float(present), None, prepared, pieces=pieces, first_above=float(present)
-    )
-    above = [one for one in found.edges if one.value >= float(present)]
-    return _margin(free.name, "s", float(present), above[0] if above else None, found.scanned[1])
+    now = delay_now(system, free)
+    end, count = delay_reach(system, free, now, pieces=PIECES, further=FURTHER)
+    present = float(now)
+    if count > MOST_PIECES:
+        note = f"{count} orders of events up to {float(end):.4g} s"
+        return Margin(free.name, "s", present, None, None, None, None, "", present, note)
+    found = search_delay(system, free, now, end, prepared, from_stable=True)
+    return _margin(free.name, "s", present, found.edges[0] if found.edges else None, found.scanned[1])
 
 
 def _margin(name: str, unit: str, present: float, crossing: Crossing | None, scanned: float) -> Margin:
@@ -248,10 +258,13 @@ def margins_report(found: Margins) -> str:
     for one in found.rows:
         name, unit = f"  {one.parameter:<{width}}  ", one.unit
         start = f"{one.present:.5g} {unit}"
+        if one.note:
+            lines.append(f"{name}{start:<14} not looked for: {one.note}")
+            continue
         if one.value is None:
             lines.append(f"{name}{start:<14} no limit up to {one.scanned:.5g} {unit}")
             continue
-        end = f"{one.value:.7g} {unit}"
+        end = f"{known_digits(one.value, one.error or 0.0, 7)} {unit}"
         times = f"{one.factor:.4g}" if one.factor is not None else "–"
         jump = ", jump" if one.kind == "jump" else ""
         at = "–" if one.frequency_hz is None else in_hertz(one.frequency_hz)

@@ -1,7 +1,7 @@
 """All crossings of the stability boundary along one parameter or delay, each proved where it can be.
 
 Takes: a `CompiledSystem` and what varies in it.
-Gives: `Crossing`, `Search`, `search`, `search_delay`; `Line`, `courses_of`, `reach`, `spread`,
+Gives: `Crossing`, `Search`, `search`, `search_delay`, `delay_reach`; `Line`, `courses_of`, `reach`, `spread`,
 `proved_crossing` to search along a line through several parameters.
 Guarantees: every crossing has a bound on its error, proved by ball arithmetic wherever the equations can be
 had exactly, and said to be an estimate where not.
@@ -27,12 +27,13 @@ from apc.runtime.analysis.analysis import Prepared, analyze, lifted_groups
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes
-from apc.runtime.eigen.spectrum import DRIFTS, finite
+from apc.runtime.eigen.spectrum import DRIFTS, finite, solve_spectrum
 from apc.runtime.frame.names import Free, parameter_of
 from apc.runtime.vary.batch import BatchEvaluator
+from apc.runtime.vary.bends import bends
 from apc.runtime.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.runtime.vary.crossings import Courses, Root, Scan, scan
-from apc.runtime.vary.delays import Piece, delay_pieces, system_with_delay
+from apc.runtime.vary.delays import Piece, borders, delay_now, delay_pieces, system_with_delay
 from apc.runtime.vary.eigenvalues import eigenvalues
 from apc.runtime.vary.evaluator import PointEvaluator, evaluator
 from apc.runtime.vary.marginal import marginal_motion, with_rigid
@@ -53,8 +54,9 @@ SAMPLES = 6
 # rounding of an eigenvalue, UNIT times some hundreds, over how fast it moves.
 FLOAT_ROUNDINGS = 1e-12
 
-# Pieces of a delay that are scanned without a limit given, each from one coincidence of events to the next.
-PIECES = 64
+# Without a limit given, a delay is scanned over so many pieces at least, each from one coincidence of events
+# to the next, and up to so many times its present value.
+PIECES, FURTHER = 64, 2
 
 # Samples in a piece of a delay to begin with.
 PIECE_SAMPLES = 3
@@ -99,14 +101,17 @@ class Search:
     """All crossings of one parameter in an interval, with what lies between them.
 
     `edges` are the crossings in order, and `stable` says of each stretch, one more than there are crossings,
-    whether it is stable; it is empty when no sample told. `enters` says whether any matrix was seen to change
-    along the way.
+    whether it is stable; it is empty when no sample told. `known` says whether the equations are enclosed
+    between the `looked` values that were looked at, `enters` whether any matrix was seen to change along the
+    way.
     """
 
     edges: tuple[Crossing, ...]
     stable: tuple[bool, ...]
     scanned: tuple[float, float]
     whole: bool
+    known: bool
+    looked: int
     enters: bool
 
 
@@ -129,6 +134,19 @@ class Line:
         along = np.zeros((len(values), len(self.base)))
         along[:, self.column] = 1.0
         return self.family.slopes(self.points(values), along)
+
+    def samples(self, bottom: float, top: float, scale: float) -> tuple[Floats, bool]:
+        """Return values from bottom to top to begin a scan with, and whether the equations between are known.
+
+        As `spread`, and as many more as the equations' coefficients ask for, see `bends`.
+        """
+        return self.with_bends(spread(bottom, top, scale), scale / SPAN)
+
+    def with_bends(self, points: Floats, least: float) -> tuple[Floats, bool]:
+        """Return points with those that the equations' coefficients ask for, and whether these are known."""
+        family = self.family
+        found = bends(family, self.base, self.column) if isinstance(family, BatchEvaluator) else None
+        return (points, False) if found is None else found.between(points, least)
 
     def scale(self) -> float:
         """Return the present value or, where it is 0, the change that would move some eigenvalue by 1."""
@@ -208,13 +226,15 @@ def search(
         )
         return pairs
 
-    found = scan(course, spread(bottom, top, scale), least=scale / SPAN)
+    points, known = line.samples(bottom, top, scale)
+    found = scan(course, points, least=scale / SPAN)
     edges = []
     for number, root in enumerate(found.roots):
         if told:
             told(f"proving crossing {number + 1} of {len(found.roots)}")
-        edges.append(proved_crossing(root, line, found))
-    return _search(edges, found, (bottom, top), enters=enters)
+        crossing = proved_crossing(root, line, found)
+        edges += [crossing] if crossing else []
+    return _search(edges, found, (bottom, top), known=known, enters=enters)
 
 
 def spread(bottom: float, top: float, scale: float) -> Floats:
@@ -236,24 +256,24 @@ def spread(bottom: float, top: float, scale: float) -> Floats:
     return np.asarray(found[np.append(True, np.diff(found) > 0)])
 
 
-def _search(edges: Sequence[Crossing], found: Scan, asked: tuple[float, float], *, enters: bool) -> Search:
+def _search(
+    edges: Sequence[Crossing], found: Scan, asked: tuple[float, float], *, known: bool, enters: bool
+) -> Search:
     """Put the crossings together with the stretches between them."""
     points, radius = found.points, found.radius
     if not len(points):
-        return Search((), (), asked, whole=False, enters=enters)
+        return Search((), (), asked, whole=False, known=known, looked=0, enters=enters)
     ends = [-np.inf, *(one.value for one in edges), np.inf]
     stable = tuple(
         bool(radius[(points > low) & (points < high)][0] < 1) for low, high in itertools.pairwise(ends)
     )
-    # A limit on which an eigenvalue lies on the circle, as a stiffness of exactly 0, is no sample itself.
-    scanned = (min(asked[0], float(points[0])), min(asked[1], float(points[-1])))
-    return Search(tuple(edges), stable, scanned, found.whole, enters)
+    scanned = (float(points[0]), float(points[-1]))
+    return Search(tuple(edges), stable, scanned, found.whole, known, len(points), enters)
 
 
-def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
-    """Prove a crossing, if it can be proved, and describe it."""
-    place = int(np.searchsorted(found.points, root.value))
-    low, high = found.points[max(place - 1, 0)], found.points[min(place, len(found.points) - 1)]
+def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
+    """Prove a crossing, if it can be proved, and describe it; None where both sides are proved alike."""
+    beside = low, high = _beside(root, found)
     if not root.slope:  # a defective cluster: its samples are scattered as well
         low, high = root.value - abs(root.value) / 2, root.value + abs(root.value) / 2
     family = line.family
@@ -267,7 +287,9 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
         def all_of_them(value: float) -> tuple[ClosedSystem, ...]:
             return family.closed_at(point(value))
 
-        held = bracket_in_floats(root, all_of_them, low=float(low), high=float(high))
+        held = bracket_in_floats(root, all_of_them, low=low, high=high)
+        if held is None and _alike(*(all_of_them(one) for one in beside)):
+            return None
         return _described(root, held, [(one, _free(one)) for one in all_of_them(root.value)])
 
     @functools.cache
@@ -278,10 +300,24 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing:
     def at(value: float) -> ClosedSystem:
         return family.system_at(point(value), root.system)
 
-    proved = bracket(root, systems, low=float(low), high=float(high))
+    proved = bracket(root, systems, low=low, high=high)
     if proved is None:
-        proved = bracket_in_floats(root, lambda value: [at(value)], low=float(low), high=float(high))
+        proved = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
+    if proved is None and _alike(*(family.closed_at(point(one)) for one in beside)):
+        return None
     return _described(root, proved, [(at(root.value), systems(root.value)[root.system][1])])
+
+
+def _beside(root: Root, found: Scan) -> tuple[float, float]:
+    """Return the samples on either side of a root."""
+    place = int(np.searchsorted(found.points, root.value))
+    return float(found.points[max(place - 1, 0)]), float(found.points[min(place, len(found.points) - 1)])
+
+
+def _alike(one: Sequence[ClosedSystem], other: Sequence[ClosedSystem]) -> bool:
+    """Say whether the analyses on both sides of a root have one verdict: floats alone took it for one."""
+    sides = [solve_spectrum(systems).stable for systems in (one, other)]
+    return sides[0] is not None and sides[0] == sides[1]
 
 
 def _free(system: ClosedSystem) -> RigidModes:
@@ -308,12 +344,11 @@ def _described(
 def search_delay(
     system: CompiledSystem,
     free: Free,
-    low: float,
-    high: float | None,
+    low: Fraction,
+    high: Fraction | None,
     prepared: Prepared,
     *,
-    pieces: int = PIECES,
-    first_above: float | None = None,
+    from_stable: bool = False,
     told: Told | None = None,
 ) -> Search:
     """Find the crossings of a delay: within pieces as of any parameter, and jumps between them.
@@ -325,13 +360,11 @@ def search_delay(
     free
         The timing, or a parameter that reaches timings.
     low, high
-        From which value to which; without `high` over so many `pieces`.
+        From which value to which; without `high` as far as `delay_reach` says.
     prepared
         From `analysis.prepare`.
-    pieces
-        How many pieces of the delay are scanned where `high` is not given.
-    first_above
-        Stop at the first crossing above this value.
+    from_stable
+        The scene is stable at `low`: where nothing above it is, that is a jump. The first crossing is enough.
     told
         Is told how far the search is.
 
@@ -339,60 +372,85 @@ def search_delay(
     -----
     Where events coincide, their order makes the value one with the piece before it or with the one after.
     """
-    start = Fraction(repr(low))
-    end = None if high is None else Fraction(repr(high))
+    end = high or delay_reach(system, free, low, pieces=PIECES, further=FURTHER)[0]
     edges: list[Crossing] = []
-    stable: list[bool] = []
+    stable = [True] if from_stable else []
     before: Piece | None = None
-    at, whole = start, True
-    every = delay_pieces(system, free, start, prepared, place=_PLACE, high=end)
-    for piece in itertools.islice(every, pieces if end is None else None):
-        at = piece.high if end is None else min(piece.high, end)
+    at, whole, known, looked = low, True, True, 0
+    for piece in delay_pieces(system, free, low, prepared, place=_PLACE, high=end):
+        at = min(piece.high, end)
         if told:
-            until = f" of {float(end):.6g} s" if end is not None else ""
-            told(f"looking at {free.label} up to {float(at):.6g} s{until}")
-        found = _piece_scan(piece, float(piece.low), float(at), prepared)
-        whole = whole and found.whole
+            told(f"looking at {free.label} up to {float(at):.6g} s of {float(end):.6g} s")
+        found, enclosed = _piece_scan(piece, float(piece.low), float(at), prepared)
+        whole, known, looked = whole and found.whole, known and enclosed, looked + len(found.points)
         if not len(found.points):
             continue
         first = bool(found.radius[0] < 1)
         if stable and stable[-1] != first:
-            assert before is not None, "what came before was scanned"
             edges.append(_jump(system, free, before, piece, prepared, stable_below=stable[-1]))
         if not stable or stable[-1] != first:
             stable.append(first)
         for root in found.roots:
-            edges.append(_delay_crossing(system, free, root, prepared, piece))
-            stable.append(not stable[-1])
+            crossing = _delay_crossing(system, free, root, found, prepared, piece)
+            if crossing:
+                edges.append(crossing)
+                stable.append(not stable[-1])
         before = piece
-        if first_above is not None and edges and edges[-1].value > first_above:
+        if from_stable and edges:
             break
-    return Search(tuple(edges), tuple(stable), (float(start), float(at)), whole, enters=True)
+    scanned = float(low), float(at)
+    return Search(tuple(edges), tuple(stable), scanned, whole, known, looked, enters=True)
 
 
-def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> Scan:
-    """Scan one piece, its ends as limits from within."""
+def delay_reach(
+    system: CompiledSystem, free: Free, low: Fraction, *, pieces: int, further: float
+) -> tuple[Fraction, int]:
+    """Return how far a delay is looked at where nobody says, and over how many pieces that is.
+
+    Parameters
+    ----------
+    system, free
+        The compiled scene, and what varies.
+    low
+        From which value.
+    pieces, further
+        Over so many pieces at least, and up to so many times the present value.
+    """
+    following = borders(system, free, place=_PLACE)
+    most = Fraction(further) * delay_now(system, free)
+    at, count = low, 0
+    while count < pieces or at < most:
+        at, count = following(at), count + 1
+    return at, count
+
+
+def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> tuple[Scan, bool]:
+    """Scan one piece, its ends as limits from within; say whether the equations are known all over it."""
     family = piece.evaluator
     if family is None:
         found = analyze(piece.inside, prepared=prepared)
         if found.stable is None or found.verdict == DRIFTS:
-            return Scan(np.empty(0), np.empty(0), (), whole=found.verdict == DRIFTS)
-        return Scan(np.array([low]), np.array([found.spectral_radius]), (), whole=True)
+            return Scan(np.empty(0), np.empty(0), (), whole=found.verdict == DRIFTS), True
+        return Scan(np.array([low]), np.array([found.spectral_radius]), (), whole=True), True
 
     def course(points: Floats) -> Sequence[tuple[Floats, Floats]]:
-        if family.timed:
+        if not piece.constant:
             return family.slopes(points[:, None], np.ones((len(points), 1)))
         matrices = family.matrices(points[:, None])
         return [(matrix, np.zeros_like(matrix)) for matrix in matrices]
 
-    points = np.array([low]) if piece.constant else np.linspace(low, high, PIECE_SAMPLES)
-    return scan(course, points, least=high - low)
+    points, known = np.array([low]), True
+    if not piece.constant:
+        points = np.linspace(low, high, PIECE_SAMPLES)
+    if family.tangents:
+        points, known = Line(family, np.array([low]), 0).with_bends(points, high - low)
+    return scan(course, points, least=high - low), known
 
 
 def _jump(
     system: CompiledSystem,
     free: Free,
-    before: Piece,
+    before: Piece | None,
     after: Piece,
     prepared: Prepared,
     *,
@@ -400,7 +458,7 @@ def _jump(
 ) -> Crossing:
     """Describe a change of side between two pieces: the delay at which events coincide, exactly."""
     # The motion that grows is on the unstable side.
-    piece, way = (after, 1) if stable_below else (before, -1)
+    piece, way = (after, 1) if stable_below or before is None else (before, -1)
     beside = after.low + way * BESIDE * (piece.high - piece.low)
     grows = piece.inside if piece.constant else system_with_delay(system, free, beside)
     modes = analyze(grows, prepared=prepared).modes
@@ -415,9 +473,9 @@ def _jump(
 
 
 def _delay_crossing(
-    system: CompiledSystem, free: Free, root: Root, prepared: Prepared, piece: Piece
-) -> Crossing:
-    """Prove a crossing within a piece, whose systems are built anew for every value."""
+    system: CompiledSystem, free: Free, root: Root, found: Scan, prepared: Prepared, piece: Piece
+) -> Crossing | None:
+    """Prove a crossing within a piece, whose systems are built anew for every value, as `proved_crossing`."""
 
     @functools.cache
     def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
@@ -433,4 +491,6 @@ def _delay_crossing(
             low=float(piece.low),
             high=float(piece.high),
         )
+    if held is None and _alike(*([one for one, _ in systems(value)] for value in _beside(root, found))):
+        return None
     return _described(root, held, [systems(root.value)[root.system]])

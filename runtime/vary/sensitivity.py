@@ -12,6 +12,7 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,7 @@ from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.rigid import find_rigid_modes, relative_coordinates
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.names import Free, parameter_of
+from apc.runtime.network.nominal import channel_numbers
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
@@ -134,10 +136,11 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
 
 
 def _without_starts(system: CompiledSystem) -> list[Free]:
-    """Return the free parameters that are no start values."""
+    """Return the free parameters that are no start values, and no numbers of unreliable links."""
     starts = {state.start for kind in system.kinds for state in kind.states}
     starts |= {start for kind in system.kinds for one in kind.clocks for start in one.starts}
-    return [one for one in free_parameters(system) if one.name not in starts]
+    kept_out = starts | channel_numbers(system)
+    return [one for one in free_parameters(system) if one.name not in kept_out]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -249,6 +252,10 @@ def _defective(one: _Cluster) -> str:
     size, many = float(np.abs(one.values).max()), len(one.values) > 1
     what = f"{counted(len(one.values), 'eigenvalue')} of {one.moved.name} at magnitude {size:.6f}"
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
+
+
+# Digits of a change.
+DIGITS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -371,7 +378,8 @@ def sensitivity_report(found: Sensitivities) -> str:
     alike: dict[tuple[str, str], list[Sensitivity]] = {}
     for row in found.rows:
         if abs(row.derivative) > row.error and row.relative:  # else it can't be told from 0
-            alike.setdefault((row.parameter, f"{row.relative / 100:+.2e}"), []).append(row)
+            change = _change(row.relative / 100, row.error * abs(row.value) / 100)
+            alike.setdefault((row.parameter, change), []).append(row)
     shown = list(alike.items())[:SHOWN]
     if not shown:
         note = found.note if len(found.active) < 2 else ""
@@ -385,3 +393,9 @@ def sensitivity_report(found: Sensitivities) -> str:
     if found.note:
         lines += wrapped(found.note, "  ", "    ")
     return "\n".join(lines)
+
+
+def _change(value: float, error: float) -> str:
+    """Return a change to three digits, fewer where its error leaves them open."""
+    known = math.floor(math.log10(abs(value) / error)) if error else DIGITS
+    return f"{value:+.{min(max(known, 1), DIGITS) - 1}e}"

@@ -1,7 +1,8 @@
 """Closing the loop of one system for many points at once, and taking its rigid motions out.
 
 Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
-Gives: `Lifted`, `Wiring`, `wire`, `closed_loop`, `reduced`, `relative_weights`, `are_rigid`, `site_key`.
+Gives: `Lifted`, `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_weights`,
+`are_rigid`, `site_key`.
 Guarantees: the matrices are those of `modes.close_loop` in relative coordinates, to rounding; where the
 directions are not those of a rigid motion they are NaN.
 Does not: lift a site (see `batch`).
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.loop import Packet, packet_places
 from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates, relative_places
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
@@ -108,6 +109,33 @@ def _without(system: ClosedSystem, listed: Sequence[tuple[Floats, Floats]], rigi
         rest=rest,
         weights=weights,
         moving=False,
+    )
+
+
+def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
+    """Return the wiring of directions that follow the parameters, given up for them where they don't.
+
+    A held force follows its stiffness, and tells nothing of the motion where that is next to nothing; how far
+    a mass has moved is the same for every stiffness.
+
+    Parameters
+    ----------
+    wiring
+        A wiring, its rigid motions those of one point.
+    there
+        Those of another point.
+    """
+    basis = wiring.rigid.basis
+    same = [
+        all(one == other for one, other in zip(*pair, strict=True))
+        for pair in zip(zip(*wiring.rigid.exact, strict=True), zip(*there.exact, strict=True), strict=True)
+    ]
+    constant = np.where(np.array(same)[:, None], basis, 0.0)
+    if np.linalg.matrix_rank(constant) < basis.shape[1]:
+        return replace(wiring, moving=True)
+    held, rest = relative_places(constant)
+    return replace(
+        wiring, held=held, rest=rest, weights=basis[rest] @ np.linalg.inv(basis[held]), moving=True
     )
 
 

@@ -1,0 +1,102 @@
+"""What an answer about the nominal network leaves out: lost packets, jitter, recorded delays.
+
+Takes: a `CompiledSystem`.
+Gives: `left_out`, `channel_numbers`, `refuse_channel_number`.
+Guarantees: a question about a number that only lost or late packets depend on is refused by name, as its
+answer would be about a network without them.
+Does not: answer for an unreliable network (see `simulate`).
+"""
+
+from __future__ import annotations
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.runtime.frame.names import Free, unit_of
+from apc.runtime.network.channel_law import channel_law
+
+NOT_LINEAR = "left out: the scene is not linear, and this holds near its start values only"
+
+
+def left_out(system: CompiledSystem, *, linear: bool = True) -> tuple[str, ...]:
+    """Return what an analysis of the nominal network leaves out, for each unreliable link.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    linear
+        Whether the answer holds for motions of any size.
+    """
+    timings = {timing.name: timing.value for timing in system.timings}
+    notes = [] if linear else [NOT_LINEAR]
+    for link in system.links:
+        if link.channel is None:
+            continue
+        law = channel_law(system, link, timings[link.delay])
+        named = []
+        if law.mean_loss:
+            named.append(f"packet loss ({100 * law.mean_loss:.3g} %)")
+        if law.jitter:
+            named.append("jitter")
+        if law.trace is not None:
+            named.append("recorded delays")
+        if named:
+            delay = f"{float(timings[link.delay]) * 1e3:.6g} ms"
+            notes.append(
+                f"left out: {' and '.join(named)} of {link.name}; here every packet takes the nominal "
+                f"{delay}, and apc simulate plays them"
+            )
+    return tuple(notes)
+
+
+def channel_numbers(system: CompiledSystem) -> frozenset[str]:
+    """Return the names of what links lose and delay packets by, and of all that these follow from."""
+    from apc.compiler.language.expression import names
+    from apc.compiler.language.grammar import parse_expression
+
+    text = {one.name: one.expression for one in system.parameters}
+    text |= {one.name: one.expression for one in system.timings}
+    found: set[str] = set()
+    waiting: list[str] = []
+    for link in system.links:
+        if link.channel is not None and link.channel.loss is not None:
+            loss = link.channel.loss
+            waiting += [loss.p, loss.r, loss.one_minus_h, loss.one_minus_k]
+        if link.channel is not None and link.channel.jitter is not None:
+            waiting.append(link.channel.jitter)
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        found.add(name)
+        expression = text.get(name)
+        if expression:
+            tree = parse_expression(expression, Place(name, 1, 1, expression))
+            waiting += [".".join(node.parts) for node in names(tree)]
+    return frozenset(found)
+
+
+def refuse_channel_number(system: CompiledSystem, free: Free, place: Place) -> None:
+    """Refuse to vary a number of an unreliable link.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    free
+        What is to vary.
+    place
+        Where it was asked for.
+
+    Raises
+    ------
+    ApcError
+        E896 lost or late packets depend on it, and every verdict is of the nominal network.
+    """
+    if free.name in channel_numbers(system):
+        what = (
+            f"{free.label} can't be varied: verdicts are of the nominal network, in which no packet is lost, "
+            "and all take their nominal delay"
+        )
+        value = "2 ms" if unit_of(system, free.name) == "s" else "5 %"
+        raise ApcError(Mistake("E896", place, what, hint=f'apc simulate --set {free.label}="{value}"'))

@@ -1,0 +1,249 @@
+"""Where the coefficients of a scene's equations bend as one number varies.
+
+Takes: a `BatchEvaluator` and which of its free parameters varies.
+Gives: `Bends`, `bends`.
+Guarantees: between neighbours of the points it returns, every coefficient is a cubic to `STRAIGHT` of its
+size: balls enclose its fourth derivative there. However narrow a bump or step is, it can't hide between them.
+Does not: say what the eigenvalues do (see `crossings`).
+
+A cubic through the values and slopes of both ends of a cell of width h is off by f⁗ h⁴/384 at most.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import casadi
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.runtime.frame.exact import evaluate_exact
+from apc.runtime.frame.rows import free_values
+from apc.runtime.vary.batch import BatchEvaluator
+
+if TYPE_CHECKING:
+    from apc.compiler.language.expression import Expr
+
+Floats = NDArray[np.float64]
+
+# How far a coefficient may be from the cubic of its cell, relative to its size there or at the present value:
+# the eigenvalues' own cubics are looked at beside it.
+STRAIGHT = 1e-2
+
+# Cells narrower than this, relative to the value, hold a step: they are left.
+NARROW = 1e-9
+
+# Cells looked at, at a tenth of a millisecond each: more than any smooth function asks for.
+MOST_CELLS = 4000
+
+# Of a Taylor series, as far as the fourth derivative; 64 bits lose nothing that a hundredth could show.
+TERMS, BITS = 5, 64
+
+# Operations that may make a step, or a kink, of what is straight on either side.
+_STEPS = frozenset(
+    (
+        *(casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, casadi.OP_NOT, casadi.OP_IF_ELSE_ZERO),
+        *(casadi.OP_FABS, casadi.OP_SIGN, casadi.OP_FLOOR, casadi.OP_CEIL, casadi.OP_FMIN, casadi.OP_FMAX),
+    )
+)
+
+
+class _OpenError(Exception):
+    """Not decided for a whole cell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bends:
+    """Those coefficients that are not linear in a value, as functions of it; `present` is what it is now."""
+
+    functions: tuple[Any, ...]  # casadi.Function
+    present: float
+
+    def between(self, points: Floats, least: float) -> tuple[Floats, bool]:
+        """Return points (k,) with as many more among them as the coefficients ask for.
+
+        Parameters
+        ----------
+        points
+            In order.
+        least
+            Cells are measured against the value, or against this where the value is smaller.
+
+        Returns
+        -------
+        The points in order, and whether between all of them every coefficient is known.
+        """
+        if not self.functions:
+            return points, True
+        here = self._values(self.present)
+        found = points.tolist()
+        waiting = list(itertools.pairwise(found))
+        looked = 0
+        known = {value: self._values(value) for value in found}
+        while waiting and looked < MOST_CELLS:
+            low, high = waiting.pop()
+            looked += 1
+            size = np.maximum(np.maximum(np.abs(known[low]), np.abs(known[high])), np.abs(here))
+            if self._straight(low, high, size):
+                continue
+            if high - low <= NARROW * max(abs(low), abs(high), least):
+                continue
+            middle = (low + high) / 2
+            known[middle] = self._values(middle)
+            found.append(middle)
+            waiting += [(low, middle), (middle, high)]
+        return np.sort(np.array(found)), not waiting
+
+    def _values(self, value: float) -> Floats:
+        return np.concatenate([np.asarray(one(value), dtype=np.float64).ravel() for one in self.functions])
+
+    def _straight(self, low: float, high: float, size: Floats) -> bool:
+        """Say whether every coefficient is a cubic between two values, to `STRAIGHT` of a size each."""
+        most = STRAIGHT * np.where(np.isfinite(size), size, 0.0)
+        bits, flint.ctx.prec = flint.ctx.prec, BITS
+        try:
+            middle = (flint.arb(low) + flint.arb(high)) / 2
+            around = flint.arb(middle.mid(), (flint.arb(high) - flint.arb(low)) / 2)
+            value = flint.arb_series([around, 1], prec=TERMS)
+            listed = [
+                entry
+                for one in self.functions
+                for entry in evaluate_exact(
+                    one, [[value]], number=_constant, rounded=_transcendental, rules=_RULES
+                )[0]
+            ]
+            # The fourth coefficient is f⁗/24.
+            off = [float(abs(_series(one)[TERMS - 1]).upper()) * (high - low) ** 4 / 16 for one in listed]
+        except (_OpenError, ValueError, ZeroDivisionError, OverflowError):
+            return False
+        finally:
+            flint.ctx.prec = bits
+        return bool(np.all(np.array(off) <= most))
+
+
+def bends(family: BatchEvaluator, base: Floats, column: int) -> Bends | None:
+    """Return the coefficients that bend as one of the free parameters varies, the others at `base` (m,).
+
+    None where the equations hold a loop that Newton's method solves, or a value that has no expression.
+    """
+    value = casadi.SX.sym("value")
+    free = {one: value if place == column else float(base[place]) for place, one in enumerate(family.free)}
+    functions: dict[object, Any] = {}
+    for group in family.groups:
+        built = group.jacobians
+        if not built.walkable:
+            return None
+        place, peer = family.first_peer(group)
+        vector = free_values(family.system, family.system.groups[place], peer, free, _symbolic)
+        key = (built.kind.name, tuple(one if isinstance(one, float) else None for one in vector))
+        if key not in functions:
+            functions[key] = _bending(built.function, value, casadi.vertcat(*vector))
+    found = tuple(one for one in functions.values() if one is not None)
+    return Bends(found, float(base[column]))
+
+
+def _bending(function: Any, value: Any, vector: Any) -> Any:
+    """Return what of a function's coefficients is not linear in a value, as a function of it."""
+    zeros = [casadi.SX.zeros(function.numel_in(place)) for place in range(6)]
+    (flat,) = function.call([*zeros[:4], vector, zeros[5]])
+    flat = casadi.densify(flat)
+    moved = [place for place, one in enumerate(casadi.which_depends(flat, value, 1, True)) if one]
+    if not moved:
+        return None
+    flat = flat[moved]
+    whole = casadi.Function("coefficients", [value], [flat])
+    if not any(whole.instruction_id(place) in _STEPS for place in range(whole.n_instructions())):
+        bent = [place for place, one in enumerate(casadi.which_depends(flat, value, 2, True)) if one]
+        if not bent:
+            return None
+        whole = casadi.Function("coefficients", [value], [flat[bent]])
+    return whole
+
+
+def _symbolic(tree: Expr, value_of: Callable[[str], Any]) -> Any:
+    """Return the value of an expression of parameters, some of which are CasADi's symbols."""
+    from apc.runtime.vary.symbols import compute_symbols  # few parameters follow from others
+
+    return compute_symbols(tree, value_of)
+
+
+# ---- Taylor series with balls for coefficients, as numbers ----
+
+
+def _constant(value: float) -> Any:
+    return flint.arb_series([flint.arb(value)], prec=TERMS)
+
+
+def _series(value: Any) -> Any:
+    """Return a series, of a plain number as well; refuse one that is not known at all."""
+    found = value if isinstance(value, flint.arb_series) else _constant(value)
+    if not all(found[place].is_finite() for place in range(TERMS)):
+        raise _OpenError
+    return found
+
+
+def _sign(value: Any) -> int:
+    """Return the sign of a series' value in all of the cell."""
+    ball = _series(value)[0]
+    if ball == 0:
+        return 0
+    if ball > 0 or ball < 0:
+        return 1 if ball > 0 else -1
+    raise _OpenError
+
+
+def _floor(value: Any) -> Any:
+    whole = _series(value)[0].floor()
+    if not whole.is_exact():
+        raise _OpenError
+    return _constant(float(whole))
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    ball = _series(exponent)[0]
+    fixed = ball.is_exact() and all(_series(exponent)[place] == 0 for place in range(1, TERMS))
+    if fixed and ball.is_integer():
+        whole = int(float(ball))
+        return base**whole if whole >= 0 else 1 / base**-whole
+    if _sign(base) <= 0:
+        raise _OpenError
+    return (exponent * base.log()).exp()
+
+
+def _truth(condition: Callable[[int], bool]) -> Callable[[Any, Any], Any]:
+    return lambda a, b: _constant(float(condition(_sign(a - b))))
+
+
+_RULES: dict[int, Callable[..., Any]] = {
+    casadi.OP_POW: _power,
+    casadi.OP_CONSTPOW: _power,
+    casadi.OP_FABS: lambda a: a if _sign(a) >= 0 else -a,
+    casadi.OP_SIGN: lambda a: _constant(_sign(a)),
+    casadi.OP_FLOOR: _floor,
+    casadi.OP_CEIL: lambda a: -_floor(-a),
+    casadi.OP_FMIN: lambda a, b: a if _sign(a - b) <= 0 else b,
+    casadi.OP_FMAX: lambda a, b: a if _sign(a - b) >= 0 else b,
+    casadi.OP_LT: _truth(lambda sign: sign < 0),
+    casadi.OP_LE: _truth(lambda sign: sign <= 0),
+    casadi.OP_EQ: _truth(lambda sign: sign == 0),
+    casadi.OP_NE: _truth(lambda sign: sign != 0),
+    casadi.OP_NOT: lambda a: _constant(float(_sign(a) == 0)),
+    casadi.OP_AND: lambda a, b: _constant(float(_sign(a) != 0 and _sign(b) != 0)),
+    casadi.OP_OR: lambda a, b: _constant(float(_sign(a) != 0 or _sign(b) != 0)),
+    casadi.OP_IF_ELSE_ZERO: lambda a, b: b if _sign(a) else _constant(0.0),
+}
+
+
+def _transcendental(name: str, value: Any) -> Any:
+    value = _series(value)
+    match name:
+        case "tanh":
+            return 1 - 2 / ((2 * value).exp() + 1)
+        case "sinh" | "cosh":
+            up, down = value.exp(), (-value).exp()
+            return (up - down if name == "sinh" else up + down) / 2
+    return getattr(value, name)()

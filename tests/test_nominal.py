@@ -1,0 +1,89 @@
+"""Claims about `apc.runtime.network.nominal`: what is left out is said first, and never answered for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from apc.__main__ import run
+from apc.runtime.network.nominal import channel_numbers, left_out
+from apc.runtime.vary.sensitivity import sensitivities
+from tests.lossy import unreliable
+from tests.topologies import AVERAGE, compiled
+
+
+def test_an_answer_can_say_what_it_leaves_out() -> None:
+    assert left_out(compiled(AVERAGE)) == ()
+    assert left_out(compiled(unreliable("loss: 0 %, jitter: 0 ms"))) == ()
+    [note] = left_out(compiled(unreliable("loss: {p: 1 %, r: 25 %}, jitter: 2 ms")))
+    assert note == (
+        "left out: packet loss (3.85 %) and jitter of lan; here every packet takes the nominal 8 ms, and "
+        "apc simulate plays them"
+    )
+
+
+def test_the_numbers_of_a_channel_are_those_it_names_and_what_they_follow_from() -> None:
+    text = unreliable("loss: {p: drop/2, r: 25 %}, jitter: 1 ms")
+    system = compiled(text.replace("clocks:", "parameters: {drop: 2 %, other: 3 %}\nclocks:", 1))
+    found = channel_numbers(system)
+    assert {"drop", "lan.loss.p", "lan.loss.r", "lan.jitter"} <= found
+    assert not found & {"other", "lan.delay", "coordination.stiffness"}
+    assert channel_numbers(compiled(AVERAGE)) == frozenset()
+
+
+@pytest.fixture(name="scene")
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.chdir(tmp_path)
+    Path("s.yaml").write_text(unreliable("loss: 30 %, jitter: 1 ms"), encoding="utf-8")
+    return "s.yaml"
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["critical", "lan.loss", "s.yaml"], "lan.loss", "5 %"),
+        (["critical", "links.lan.jitter", "s.yaml"], "lan.jitter", "2 ms"),
+        (["region", "s.yaml", "--x", "lan.loss=0 %:5 %"], "lan.loss", "5 %"),
+        (["sweep", "s.yaml", "--over", "lan.jitter=0,1 ms", "--out", "o.csv"], "lan.jitter", "2 ms"),
+        (["analyze", "s.yaml", "--box", "lan.loss=1 %:5 %"], "lan.loss", "5 %"),
+    ],
+)
+def test_a_question_about_lost_or_late_packets_is_refused_by_name(
+    scene: str, words: list[str], name: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(words) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert f"E896 {name} can't be varied: verdicts are of the nominal network" in said.err
+    assert f'Write: apc simulate --set {name}="{value}"' in said.err
+    assert run(["simulate", scene, "--duration", "20 ms", "--set", f"{name}={value}"]) == 0
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["analyze", "s.yaml"],
+        ["analyze", "s.yaml", "--method", "paper"],
+        ["critical", "contact.stiffness", "s.yaml"],
+        ["region", "s.yaml"],
+        ["sweep", "s.yaml", "--over", "contact.stiffness=1,2 N/m", "--out", "o.csv"],
+    ],
+)
+def test_other_questions_say_in_their_second_line_what_is_left_out(
+    scene: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(words) == 0
+    second = capsys.readouterr().out.splitlines()[1]
+    assert second.startswith("  left out: packet loss (30 %) and jitter of lan;")
+    assert run([*words, "--json"]) == 0
+    [note] = json.loads(capsys.readouterr().out)["left_out"]
+    assert note.startswith("left out: packet loss (30 %) and jitter of lan;")
+    assert scene
+
+
+def test_no_derivative_is_given_with_respect_to_what_is_left_out(scene: str) -> None:
+    names = {row.parameter for row in sensitivities(compiled(Path(scene).read_text("utf-8"))).rows}
+    assert "contact.stiffness" in names
+    assert not {name for name in names if name.startswith("lan.")}
