@@ -235,7 +235,7 @@ def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) ->
 
     still = values(at=None)
     apart = np.array([abs(values(at=j) - still - whole[:, j]) for j in range(whole.shape[1])])
-    size = abs(whole).max(axis=1, initial=Fraction(0))
+    size = np.array([max(map(abs, row), default=Fraction(0)) for row in whole], dtype=object)
     assert (apart <= COEFFICIENT_ROUNDINGS * Fraction(UNIT) * size).all(), (
         f"the slopes of {function.name()} are not what it multiplies its inputs by"
     )
