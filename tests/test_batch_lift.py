@@ -9,16 +9,21 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.runtime.frame.batch_lift import compose_rows, exponential_rows
+from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows
 from apc.runtime.frame.discretize import UNIT, discretize
+from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.frame.lift import lift
-from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of_row
+from apc.runtime.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
 from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.frame.parameters import resolve
 from apc.runtime.frame.schedule import Propagate
+from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.frame.site import every_matrix
 from apc.runtime.large.crowds import Crowd
 from tests.populations import crowded, different
 from tests.sites import MS
+from tests.test_selfcheck import STIFF
+from tests.topologies import compiled
 
 NAMES = ("p", "q", "s", "d")
 
@@ -120,3 +125,18 @@ def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
             estimate = getattr(crowd.lifted, f"{name}_error")[row]
             assert np.all(apart <= estimate)
             assert estimate.max() < 1e-8 * max(1.0, np.abs(getattr(alone, name)).max())
+
+
+@pytest.mark.parametrize("text", STIFF.values(), ids=STIFF)
+def test_an_estimate_covers_the_digits_that_an_exponential_loses(text: str) -> None:
+    system = compiled(text)
+    [site] = [jacobians(kind) for kind in system.kinds]
+    numbers = resolve(system)
+    [schedule] = build_schedules(system, numbers.timings, [site.pattern])
+    vector = numbers.parameters[0][0]
+    many = lift_rows(site, schedule, linearize_rows(site, vector[None]))
+    exact = linearize_exact(site, vector)
+    alone = lift(linearize(site, vector), schedule, exact=exact)
+    for name in NAMES:
+        apart = np.abs(getattr(many, name)[0] - getattr(alone, name))
+        assert (apart <= getattr(many, f"{name}_error")[0] + getattr(alone, f"{name}_error")).all()

@@ -144,15 +144,7 @@ class _Solver:
         pieces = smooth_pieces(sympy.Tuple(*residuals), MOST_PIECES)
         for piece in pieces or ():
             try:
-                slopes = sympy.Matrix(
-                    [
-                        [
-                            differential(one, lambda s, guess=guess: sympy.Integer(s == guess))
-                            for guess in guesses
-                        ]
-                        for one in piece
-                    ]
-                )
+                slopes = sympy.Matrix([[_slope(one, guess) for guess in guesses] for one in piece])
             except NoDerivativeError:
                 continue
             determinant = slopes.det(method="berkowitz")
@@ -170,6 +162,11 @@ class _Solver:
             f"{listed([residual.shown for residual in block])}"
         )
         self.mistakes.add("E511", block[0].equation.place, what)
+
+
+def _slope(residual: sympy.Expr, by: sympy.Symbol) -> sympy.Expr:
+    """Return the derivative of a residual. Raises NoDerivativeError if it has none."""
+    return differential(residual, lambda s: sympy.Integer(s == by))
 
 
 def _put_in(residual: sympy.Expr, inner: Sequence[Assignment]) -> sympy.Expr:

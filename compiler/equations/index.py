@@ -237,7 +237,9 @@ class _System:
         matrix: dict[int, dict[Jet, sympy.Expr]] = {}
         for row in rows:
             form = linear_form(self.residuals[row].expression, symbols.keys())
-            assert form is not None, "a derivative is linear in the highest derivatives"
+            if form is None:  # else a derivative is linear in the highest derivatives
+                self._report_condition(row, where, mistakes)
+                return None
             matrix[row] = {symbols[s]: c for s, c in form[0].items() if not is_zero(c)}
         columns: dict[Jet, dict[int, None]] = {jet: {} for jet in candidates}
         for row, entries in matrix.items():
@@ -274,6 +276,16 @@ class _System:
 
     def _moves(self, expression: sympy.Expr) -> bool:
         return TIME in expression.free_symbols or bool(self.jets.jets(expression))
+
+    def _report_condition(self, row: int, where: str, mistakes: Mistakes) -> None:
+        """Say that a branch of a constraint is chosen by what the constraint's derivatives would give."""
+        residual = self.residuals[row]
+        what = (
+            f"{where}: in the constraint {residual.shown} a condition hangs on a derivative that it ties down"
+        )
+        mistakes.add(
+            "E509", residual.equation.place, what, hint="a condition on positions, parameters or time"
+        )
 
     def _report_no_choice(
         self, matrix: dict[int, dict[Jet, sympy.Expr]], where: str, mistakes: Mistakes

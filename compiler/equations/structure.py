@@ -163,6 +163,8 @@ def sort_kind(
     partitions = [SortedPartition(CONTINUOUS, continuous.steps)]
     for clock in kind.partitions[1:]:
         own = _residuals(clock.equations, no_derivative, mistakes)
+        if len(own) < len(clock.equations):
+            continue
         unknowns = [symbol(name) for name in clock.variables]
         where = f"the equations of clock {clock.clock}"
         found = solve_blocks(own, unknowns, where, mistakes, nonzero=divisors, vanishes=vanishes)

@@ -193,7 +193,8 @@ class Writer:
         if name == "interpolate":
             return self._interpolated(*expression.args)
         if name == "if":
-            return self._chosen(*expression.args, taken)
+            condition, then, otherwise = expression.args
+            return self._chosen(condition, then, otherwise, taken)
         arguments = [self._build(argument, taken) for argument in expression.args]
         if expression.is_Add:
             return _fold(arguments, operator.add)

@@ -1,9 +1,9 @@
 """One frame, event by event with the compiled functions themselves, against the lifted map.
 
 Takes: a `CompiledSystem`. Gives: `check_frame`, `skipped`.
-Guarantees: uses neither the Jacobians nor the exponentials of `linearize` and `lift`; start values and
-constant forces cancel. Steps in rationals and balls, so that the lifted map alone is rounded: the two may
-differ by the bound that comes with it, and by nothing else.
+Guarantees: the Jacobians are what the functions multiply their inputs by, to rounding; the steps use neither
+the composition nor the exponentials of `lift`. They are taken in balls, so that the lifted map alone is
+rounded: the two may differ by the bound that comes with it, and by nothing else.
 Does not: check a site whose equations are not affine, as its lifted map holds near one point only, or one
 that hears by an edge function (see `skipped`).
 """
@@ -17,16 +17,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.frame.discretize import PRECISIONS, TOO_LARGE, UNIT
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
-from apc.runtime.frame.lift import lift
+from apc.runtime.frame.lift import COEFFICIENT_ROUNDINGS, lift
 from apc.runtime.frame.linearize import linearize, linearize_exact
 from apc.runtime.frame.parameters import Numbers, exact_numbers, resolve
 from apc.runtime.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.runtime.frame.scheduling import build_schedules
+from apc.runtime.frame.site import LinearSite
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
 
@@ -60,7 +61,8 @@ def check_frame(system: CompiledSystem) -> float:
     largest = 0.0
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         for site, schedule, parameters in _checked(system, numbers, sites, schedules):
-            lifted = lift(linearize(site, parameters), schedule, exact=linearize_exact(site, parameters))
+            exact = linearize_exact(site, parameters)
+            lifted = lift(linearize(site, parameters), schedule, exact=exact)
             z = generator.standard_normal(len(lifted.z_names))
             r = generator.standard_normal(len(schedule.heard))
             mapped = np.concatenate([lifted.p @ z + lifted.q @ r, lifted.s @ z + lifted.d @ r])
@@ -69,7 +71,7 @@ def check_frame(system: CompiledSystem) -> float:
             proven = _terms(lifted.p_error, lifted.q_error, lifted.s_error, lifted.d_error, z, r)
             if not (np.isfinite(size).all() and np.isfinite(proven).all()):
                 raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
-            stepped = _precisely_stepped(site.kind, schedule, parameters, z, r, UNIT * size + TINY)
+            stepped = _precisely_stepped(exact, schedule, parameters, z, r, UNIT * size + TINY)
             apart = np.abs(stepped - mapped)
             # What has died out to below the error of a step is measured by that error.
             different = float(np.max(apart / (size + proven / UNIT + TINY), initial=0.0))
@@ -114,7 +116,7 @@ def _checked(
 
 
 def _precisely_stepped(
-    kind: Kind, schedule: Schedule, parameters: Floats, z: Floats, r: Floats, asked: Floats
+    exact: LinearSite, schedule: Schedule, parameters: Floats, z: Floats, r: Floats, asked: Floats
 ) -> Floats:
     """Return z⁺ and s of one frame, each to the error asked for.
 
@@ -129,7 +131,7 @@ def _precisely_stepped(
     try:
         for bits in PRECISIONS:
             flint.ctx.prec = bits
-            balls = _stepped(_Stepped(kind, parameters), schedule, z, r)
+            balls = _stepped(_Stepped(exact, parameters), schedule, z, r)
             radius = np.array([float(ball.rad()) for ball in balls])
             if (radius <= asked).all():
                 return np.array([float(ball.mid()) for ball in balls])
@@ -172,14 +174,25 @@ def _stepped(site: _Stepped, schedule: Schedule, z: Floats, r: Floats) -> list[A
 
 
 class _Stepped:
-    """A site's functions less their values at zero, exactly, for steps in balls."""
+    """A site's functions less their values at zero, for steps in balls.
 
-    def __init__(self, kind: Kind, parameters: Floats) -> None:
-        self.kind = kind
-        p = exact_numbers(kind, parameters)
-        self.rates = _columns(kind.derivative, 2, p)
-        self.ticks = [_columns(clock.tick, 4, p) for clock in kind.clocks]
-        self.sends = [_columns(send.send, 2, p) for send in kind.sends]
+    They must be the Jacobians but for the roundings of these: CasADi folds their constants in floats, and a
+    rounding of a rate grows by as many turns as there are in a step. It is what the site is analysed with
+    that is stepped.
+    """
+
+    def __init__(self, exact: LinearSite, parameters: Floats) -> None:
+        self.kind = exact.kind
+        p = exact_numbers(exact.kind, parameters)
+        self.rates = _agreed(exact.kind.derivative, (exact.a, exact.b), p)
+        self.ticks = [
+            _agreed(clock.tick, (one.x, one.u, one.m, one.r), p)
+            for clock, one in zip(exact.kind.clocks, exact.ticks, strict=True)
+        ]
+        self.sends = [
+            _agreed(send.send, (one.x, one.u), p)
+            for send, one in zip(exact.kind.sends, exact.sends, strict=True)
+        ]
 
     def propagated(self, x: list[Any], u: list[Any], duration: Fraction) -> list[Any]:
         """Return x after `duration` seconds: dx/dt = A x + B u with u constant, by exp([A Bu; 0 0] T)."""
@@ -206,25 +219,29 @@ class _Stepped:
         return _times(step, [*x, flint.arb(1)])[:n]
 
 
-def _columns(function: Any, inputs: int, p: list[Fraction]) -> Any:
-    """Return what an affine function of its first inputs, parameters and time multiplies them by."""
+def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) -> Any:
+    """Return the slopes of an affine function as balls; they must be what it multiplies its inputs by."""
     import flint
 
-    sizes = [function.numel_in(place) for place in range(inputs)]
+    whole = np.hstack(slopes)
 
-    def values(*, at: int | None) -> list[Fraction]:
+    def values(*, at: int | None) -> NDArray[Any]:
         arguments, first = [], 0
-        for size in sizes:
+        for size in (one.shape[1] for one in slopes):
             arguments.append([Fraction(first + i == at) for i in range(size)])
             first += size
-        return evaluate_exact(function, [*arguments, p, [Fraction(0)]])[0]
+        found = evaluate_exact(function, [*arguments, p, [Fraction(0)]])[0]
+        return np.array([Fraction(one) for one in found], dtype=object)
 
     still = values(at=None)
-    columns = [[a - b for a, b in zip(values(at=j), still, strict=True)] for j in range(sum(sizes))]
-    entries = [columns[j][i] for i in range(len(still)) for j in range(len(columns))]
-    return flint.arb_mat(
-        len(still), len(columns), [flint.arb(flint.fmpq(one.numerator, one.denominator)) for one in entries]
+    apart = np.array([abs(values(at=j) - still - whole[:, j]) for j in range(whole.shape[1])])
+    size = np.array([max(map(abs, row), default=Fraction(0)) for row in whole], dtype=object)
+    assert (apart <= COEFFICIENT_ROUNDINGS * Fraction(UNIT) * size).all(), (
+        f"the slopes of {function.name()} are not what it multiplies its inputs by"
     )
+    rows, columns = whole.shape
+    entries = [flint.arb(flint.fmpq(one.numerator, one.denominator)) for one in whole.ravel()]
+    return flint.arb_mat(rows, columns, entries)
 
 
 def _times(matrix: Any, vector: list[Any]) -> list[Any]:

@@ -94,7 +94,7 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
         gamma = roundings * UNIT / (1 - roundings * UNIT)
         errors = gamma * z_large, gamma * s_large
         if not all(float(one.max(initial=0.0)) <= HOPELESS for one in errors):
-            errors, estimated = _perturbed(many, schedule, steps, (z, s), roundings), True
+            errors, estimated = _perturbed(many, schedule, (steps, sizes), (z, s), roundings), True
         parts.append((z, s, *errors))
     z, s, z_error, s_error = (np.concatenate(part) for part in zip(*parts, strict=True))
     return LiftedRows(
@@ -115,7 +115,7 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
 def _perturbed(
     site: LinearSite,
     schedule: Schedule,
-    steps: Mapping[int, Matrix],
+    steps: tuple[Mapping[int, Matrix], Mapping[int, Matrix]],
     frame: tuple[Matrix, Matrix],
     size: float,
 ) -> tuple[Floats, Floats]:
@@ -124,7 +124,7 @@ def _perturbed(
     Parameters
     ----------
     site, schedule, steps
-        What the frame is composed of.
+        What the frame is composed of; the steps with their sizes, see `exponential_rows`.
     frame
         The frame as it came out.
     size
@@ -132,13 +132,16 @@ def _perturbed(
     """
     random = np.random.default_rng(len(schedule.events))
 
-    def moved(matrix: Matrix) -> Matrix:
-        return np.asarray(matrix * (1 + size * UNIT * random.uniform(-1, 1, matrix.shape)))
+    def moved(matrix: Matrix, large: Matrix | None = None) -> Matrix:
+        by = matrix if large is None else large
+        return np.asarray(matrix + by * (size * UNIT * random.uniform(-1, 1, matrix.shape)))
 
     errors = [size * UNIT * np.abs(one) for one in frame]
     for _ in range(PERTURBED_FRAMES):
         other = compose_rows(
-            every_matrix(site, moved), schedule, {duration: moved(step) for duration, step in steps.items()}
+            every_matrix(site, moved),
+            schedule,
+            {duration: moved(step, steps[1][duration]) for duration, step in steps[0].items()},
         )
         errors = [np.maximum(e, SAFE * np.abs(a - b)) for e, a, b in zip(errors, frame, other, strict=True)]
     return errors[0], errors[1]

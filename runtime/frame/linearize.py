@@ -101,10 +101,11 @@ def _finite_slopes(
     if not np.isfinite(flat).all():
         matrices = iter(cut(flat, site.shapes))
         rates = [f"der({state.name})" for state in kind.states]
-        blocks = [(rates, 2), *((clock.outputs, 4) for clock in kind.clocks)]
-        for rows, count in [*blocks, *((send.channels, 2) for send in kind.sends)]:
+        blocks: list[tuple[Sequence[str], int]] = [(rates, 2), *((clock.outputs, 4) for clock in kind.clocks)]
+        blocks += [(send.channels, 2) for send in kind.sends]
+        for names, count in blocks:
             for _ in range(count):
-                _check_finite(rows, next(matrices).sum(axis=1), "the slope of ", kind.name)
+                _check_finite(names, next(matrices).sum(axis=1), "the slope of ", kind.name)
     return flat
 
 

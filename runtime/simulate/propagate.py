@@ -104,6 +104,8 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
         np.ones(n_x, dtype=bool) if type_ is casadi.MX else structural_pattern(casadi.sparsify(still))[:, 0]
     )
     flat = casadi.vec(casadi.horzcat(casadi.densify(slopes), constant))
+    if type_ is casadi.MX:  # which names the symbols of the other rows, even where no value hangs on them
+        flat = casadi.substitute([flat], [moving, t], [type_.zeros(*moving.shape), type_(0)])[0]
     own: Pattern = np.isin(np.arange(n_x), rest)
     return Rates(
         kind=kind,

@@ -127,7 +127,7 @@ class Watch:
         self.times, self.pending = times, values
 
     def _bucket(self, times: Floats, values: Floats, number: int) -> None:
-        shaped = values.reshape(number, -1, values.shape[1])
+        shaped = values.reshape(number, len(values) // number, values.shape[1])
         self.low = np.concatenate([self.low, shaped.min(axis=1)])
         self.high = np.concatenate([self.high, shaped.max(axis=1)])
         self.ends += times.reshape(number, -1)[:, -1].tolist()
@@ -136,7 +136,7 @@ class Watch:
         found = steps[1:] * steps[:-1] < 0
         if len(found):
             turned[-len(found) :] = found
-        self.turns = np.concatenate([self.turns, turned.reshape(number, -1, values.shape[1]).sum(axis=1)])
+        self.turns = np.concatenate([self.turns, turned.reshape(shaped.shape).sum(axis=1)])
         self.before = np.concatenate([self.before, values])[-2:].copy()
 
     def summary(self) -> Summary:

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+from tests.fuzz.inputs import SORTS
 from tests.fuzz.running import once, run_all, shrunk
 
 
@@ -20,6 +21,7 @@ def main() -> int:
     parser.add_argument("--scenes", type=int, default=0, help="how many valid scenes against brute force")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start", type=int, default=0, help="the first input of the seed to run")
+    parser.add_argument("--sort", choices=[name for name, _, _ in SORTS], help="inputs of this sort only")
     parser.add_argument("--out", type=Path, default=Path("fuzz-failures"), help="where failures are written")
     options = parser.parse_args()
     began = time.monotonic()
@@ -27,6 +29,7 @@ def main() -> int:
         options.inputs,
         options.seed,
         start=options.start,
+        sort=options.sort,
         progress=lambda text: print(text, file=sys.stderr, flush=True),
     )
     for outcome, number in sorted(outcomes.items()):

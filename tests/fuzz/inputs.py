@@ -18,8 +18,11 @@ from typing import Any
 
 import yaml
 
+from tests.fuzz.equations import odd_equations
+
 MODELS = Path(__file__).resolve().parents[2] / "models"
 TOPOLOGY = "scene.yaml"
+PLAYED = "equations"  # the sort that is analysed and simulated as well
 SENTINEL = "sentinel"  # the file that a run of foreign code would leave behind
 
 # A tree of YAML that can hold a key twice: mappings are lists of pairs in a `Pairs`.
@@ -111,9 +114,10 @@ LIKE = str.maketrans(
 )
 
 
-def make_input(rng: random.Random) -> Input:
-    """Return one input."""
-    sort, make, _ = rng.choices(SORTS, weights=[weight for _, _, weight in SORTS])[0]
+def make_input(rng: random.Random, sort: str | None = None) -> Input:
+    """Return one input, of a sort if one is given."""
+    wanted = [one for one in SORTS if sort in (None, one[0])]
+    sort, make, _ = rng.choices(wanted, weights=[weight for _, _, weight in wanted])[0]
     files = make(rng)
     files.setdefault("users.csv", TABLES["users.csv"].encode())
     files.setdefault("push.csv", PUSH.encode())
@@ -550,4 +554,5 @@ SORTS: tuple[tuple[str, Callable[[random.Random], dict[str, bytes]], int], ...] 
     ("component", _component, 20),
     ("table", _table, 8),
     ("bomb", _bomb, 2),
+    (PLAYED, odd_equations, 3),
 )

@@ -26,17 +26,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import apc
 from apc.compiler import pipeline
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.pipeline import run_stages
-from tests.fuzz.inputs import SENTINEL, TOPOLOGY, Input, make_input
+from tests.fuzz.inputs import MODELS, PLAYED, SENTINEL, TOPOLOGY, Input, make_input
 
-SECONDS = 5.0  # the longest an input may take
+SECONDS = 5.0  # the longest an input may take to compile
+PLAYED_SECONDS = 10.0  # and to compile, check itself, be analysed and simulated
 MEMORY = 1 << 30  # bytes an input may ask for beyond what is in use
 BATCH = 4000  # inputs a process runs before a fresh one takes over
 LONGEST_SENTENCE = 2000
-WHOLE_FILE = re.compile(r"E(10[1-8]|110|701)\Z")  # mistakes about a file as a whole may have no line
+WHOLE_FILE = re.compile(
+    r"E(10[1-8]|110|701|[89]\d\d)\Z"
+)  # mistakes about a file or scene as a whole may have no line
 
 # What no input may cause; events of Python's own audit hooks.
 _FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "os.remove",
@@ -56,9 +60,14 @@ class Failure:
 
 
 def run_all(
-    count: int, seed: int, *, start: int = 0, progress: Callable[[str], None] = lambda text: None
+    count: int,
+    seed: int,
+    *,
+    start: int = 0,
+    sort: str | None = None,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> tuple[list[Failure], Counter[str], Counter[str]]:
-    """Run inputs number `start` to `count` of a seed.
+    """Run inputs number `start` to `count` of a seed, all of one sort if one is given.
 
     Returns
     -------
@@ -76,23 +85,23 @@ def run_all(
     following = start
     shown = time.monotonic()
     while following < count:
-        for index, key, told in _worker(seed, following, min(count, following + BATCH)):
+        for index, key, told in _worker(seed, following, min(count, following + BATCH), sort):
             following = index + 1
             fine = key in ("compiled", "refused")
-            outcomes[f"{told}: {key}" if fine else f"{nth_input(seed, index).sort}: FAILED"] += 1
+            outcomes[f"{told}: {key}" if fine else f"{nth_input(seed, index, sort).sort}: FAILED"] += 1
             if not fine:
                 often[key] += 1
                 if key not in failures:
-                    failures[key] = Failure(key, told, index, nth_input(seed, index))
+                    failures[key] = Failure(key, told, index, nth_input(seed, index, sort))
             if time.monotonic() - shown > 10:
                 shown = time.monotonic()
                 progress(f"{following} inputs, {len(failures)} different failures")
     return list(failures.values()), often, outcomes
 
 
-def nth_input(seed: int, index: int) -> Input:
+def nth_input(seed: int, index: int, sort: str | None = None) -> Input:
     """Return one input of a run."""
-    return make_input(random.Random(f"{seed}/{index}"))
+    return make_input(random.Random(f"{seed}/{index}"), sort)
 
 
 class _WarmLibrary(Library):
@@ -114,12 +123,17 @@ def _warm_up() -> None:
     pipeline.Library = _WarmLibrary  # type: ignore[misc] # for the fuzzer's own processes
     importlib.import_module("numpy.ma")  # NumPy loads it when it first meets some arrays, and compiles text
     for scene in ("three-users-average", "finger", "users-table"):
-        run_stages(
-            Path(__file__).resolve().parents[2] / "models" / "scenes" / f"{scene}.yaml", until="compiled"
-        )
+        run_stages(MODELS / "scenes" / f"{scene}.yaml", until="compiled")
+    before = Path.cwd()
+    os.chdir(MODELS / "scenes")
+    for scene in ("three-users-average", "experiment-average"):
+        system = apc.compile(f"{scene}.yaml")
+        apc.analyze(system)
+        apc.simulate(system, duration="20 ms", jit=False)
+    os.chdir(before)
 
 
-def _worker(seed: int, start: int, stop: int) -> Iterator[tuple[int, str, str]]:
+def _worker(seed: int, start: int, stop: int, sort: str | None) -> Iterator[tuple[int, str, str]]:
     """Yield (index, outcome, text) of inputs run in a process of their own; ends early if that is killed.
 
     The text of an input that compiled or was refused is its sort.
@@ -127,7 +141,7 @@ def _worker(seed: int, start: int, stop: int) -> Iterator[tuple[int, str, str]]:
 
     def work(tell: Callable[[int, str, str], None]) -> None:
         for index in range(start, stop):
-            given = nth_input(seed, index)
+            given = nth_input(seed, index, sort)
             key, told = _judged(given)
             tell(index, key, told or given.sort)
 
@@ -150,14 +164,14 @@ def _watched(
         _become_worker(work, write)
     os.close(write)
     following, rest = start, b""
-    limit = SECONDS + 3  # the worker measures itself; this is for what never comes back
+    limit = PLAYED_SECONDS + 3  # the worker measures itself; this is for what never comes back
     killed = ""
     with os.fdopen(read, "rb", buffering=0) as stream:
         while following < stop:
             ready, _, _ = select.select([stream], [], [], limit)
             data = stream.read(1 << 16) if ready else b""
             if not data:
-                killed = "" if ready else f"takes more than {SECONDS:g} s"
+                killed = "" if ready else f"takes more than {PLAYED_SECONDS:g} s"
                 break
             *lines, rest = (rest + data).split(b"\0")
             for line in lines:
@@ -225,12 +239,16 @@ def _judged(given: Input) -> tuple[str, str]:
         _foreign.clear()
         started = time.monotonic()
         signal.signal(signal.SIGALRM, _too_long)
-        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        longest = PLAYED_SECONDS if given.sort == PLAYED else SECONDS
+        signal.setitimer(signal.ITIMER_REAL, longest)
         try:
             _listening = True
             try:
                 run_stages(Path(TOPOLOGY), until="compiled")
                 outcome = "compiled", ""
+                _listening = False
+                if given.sort == PLAYED:
+                    _play()
             finally:
                 _listening = False
                 signal.setitimer(signal.ITIMER_REAL, 0)
@@ -242,14 +260,21 @@ def _judged(given: Input) -> tuple[str, str]:
             outcome = _key_of(error), "".join(traceback.format_exception(error, limit=-12))[-4000:]
         finally:
             os.chdir(before)
-        if took > SECONDS and "takes more" not in outcome[0]:
-            outcome = f"takes more than {SECONDS:g} s", f"{took:.1f} s"
+        if took > longest and not outcome[0].startswith("takes"):
+            outcome = f"takes more than {longest:g} s", f"{took:.1f} s"
         if (folder / SENTINEL).exists() or _foreign:
             outcome = (
                 f"does what it may not: {_foreign[0].split()[0] if _foreign else SENTINEL}",
                 "\n".join(_foreign),
             )
         return outcome
+
+
+def _play() -> None:
+    """Compile, analyse and simulate a scene; ends the run of one that is refused with ApcError."""
+    system = apc.compile(TOPOLOGY)
+    apc.analyze(system)
+    apc.simulate(system, duration="20 ms", jit=False)
 
 
 def _memory_folder() -> str | None:
@@ -267,13 +292,13 @@ def _too_long(number: int, frame: object) -> None:
 def _key_of(error: BaseException) -> str:
     """Return the kind of an exception and the innermost line of ours."""
     frames = traceback.extract_tb(error.__traceback__)
-    ours = [frame for frame in frames if "/compiler/" in frame.filename]
+    ours = [frame for frame in frames if re.search("/(compiler|runtime)/", frame.filename)]
     where = f"{Path(ours[-1].filename).name}:{ours[-1].name}" if ours else "?"
     if isinstance(error, TooLongError):
         outer = next(
             (f"{Path(f.filename).name}:{f.name}" for f in ours if Path(f.filename).name != "pipeline.py"), ""
         )
-        return f"takes more than {SECONDS:g} s in {outer}"
+        return f"takes too long in {outer}"
     return f"{type(error).__name__} in {where}:{ours[-1].lineno if ours else 0}"
 
 
