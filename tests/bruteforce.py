@@ -15,6 +15,9 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -72,15 +75,34 @@ def frame_matrix(
     The state is every peer's (x, v, x_O, v_O), then its last computed forces, newest first, then its last
     packets, newest first: as many as any delay can ask for, so some entries may matter to nobody.
     """
-    frame = common_period(scene.haptic, scene.network)
-    force_depth = math.ceil(max(scene.comp, scene.contact_delay) / scene.haptic) + 1
-    packet_depth = math.ceil(max(scene.comm, *scene.late.values(), Fraction(0)) / scene.network) + 1
-    n = scene.peers * (4 + 3 * force_depth + 2 * packet_depth)
+    n, frame, force_depth, packet_depth = _shape(scene)
     columns = []
     for column in range(n):
         state = [number(1 if row == column else 0) for row in range(n)]
         columns.append(_one_frame(scene, state, frame, force_depth, packet_depth, number, exp))
     return [[columns[c][r] for c in range(n)] for r in range(n)]
+
+
+def frame_matrices(scene: Scene, count: int) -> NDArray[np.float64]:
+    """Return the same in floats for many scenes at once, (count, n, n): numbers may be arrays (count,).
+
+    All columns go through one frame together, as rows of numbers.
+    """
+
+    def number(value: Any) -> NDArray[np.float64]:
+        return np.asarray(value, dtype=np.float64)[..., None]
+
+    n, frame, force_depth, packet_depth = _shape(scene)
+    rows = _one_frame(scene, list(np.eye(n)), frame, force_depth, packet_depth, number, np.exp)
+    return np.stack([np.broadcast_to(row, (count, n)) for row in rows], axis=1)
+
+
+def _shape(scene: Scene) -> tuple[int, Fraction, int, int]:
+    """Return the number of states, the length of a frame, and how many forces and packets are kept."""
+    frame = common_period(scene.haptic, scene.network)
+    force_depth = math.ceil(max(scene.comp, scene.contact_delay) / scene.haptic) + 1
+    packet_depth = math.ceil(max(scene.comm, *scene.late.values(), Fraction(0)) / scene.network) + 1
+    return scene.peers * (4 + 3 * force_depth + 2 * packet_depth), frame, force_depth, packet_depth
 
 
 def common_period(one: Fraction, other: Fraction) -> Fraction:

@@ -25,7 +25,7 @@ from apc.runtime.bench.timing import timed
 from apc.runtime.threads import single_threaded
 from apc.runtime.vary.critical import Critical, critical
 from tests.bench.judge import Judge, parser_of
-from tests.bruteforce import Scene, frame_matrix
+from tests.bruteforce import Scene, frame_matrices
 from tests.topologies import compiled, library
 
 Floats = NDArray[np.float64]
@@ -170,20 +170,15 @@ def _spread(present: float) -> Floats:
 def radii(scan: Draw, values: Floats) -> Floats:
     """Return the largest magnitude of any motion but the common translation, at values (k,)."""
     if scan.one_by_one:
-        return np.array([_radii(scan.at(scan.scene, Fraction(float(one))), 1)[0] for one in values])  # type: ignore[arg-type] # an exact time
+        times = [Fraction(float(one)) for one in values]
+        return np.array([_radii(scan.at(scan.scene, one), 1)[0] for one in times])  # type: ignore[arg-type] # an exact time
     return _radii(scan.at(scan.scene, values), len(values))
 
 
 def _radii(scene: Scene, count: int) -> Floats:
-    def number(value: object) -> Floats:
-        return np.asarray(value, dtype=np.float64)
-
-    rows = frame_matrix(scene, number=number, exp=np.exp)
-    matrix = np.array([[np.broadcast_to(entry, count) for entry in row] for row in rows]).transpose(2, 0, 1)
-    values = np.linalg.eigvals(matrix)
-    rigid = np.argmin(np.abs(values - 1), axis=1)
+    values = np.linalg.eigvals(frame_matrices(scene, count))
     sizes = np.abs(values)
-    sizes[np.arange(count), rigid] = 0.0
+    sizes[np.arange(count), np.argmin(np.abs(values - 1), axis=1)] = 0.0
     return np.asarray(sizes.max(axis=1))
 
 
