@@ -37,11 +37,12 @@ def counted(number: int, noun: str, form: str = "d") -> str:
 def measured(value: float, error: float, unit: str = "1") -> str:
     """Return a number with its error, to the digit that the error stands in, as "0.25 ± 3e-02 m".
 
-    The error is rounded up, and holds what rounding the number takes away as well.
+    The error is rounded up, and holds what rounding the number takes away as well; both are taken as the
+    shortest decimals that mean them.
     """
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{with_unit(f'{value:.6g}', unit)} ± {error:.0e}"
-    exact, off = Decimal(value), Decimal(error)
+    exact, off = Decimal(repr(value)), Decimal(repr(error))
     place = max(off.adjusted(), exact.adjusted() - _DIGITS) if error else exact.adjusted() - _DIGITS
     while True:
         shown = exact.quantize(Decimal((0, (1,), place)), context=_WIDE)

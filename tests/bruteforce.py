@@ -15,10 +15,16 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 @dataclass(frozen=True)
 class Scene:
     """Everything about the scene, times in exact seconds; `users` overrides values a user.
+
+    `comp` is the delay of every computed force, `contact_comp` another one of the contact's. A number may be
+    an array as well, of as many scenes at once.
 
     `weights` are those of (sender, receiver) pairs, all others are not heard; None is 1 for every pair.
     `late` are delays of pairs other than `comm`. With `pairs`, the stiffness between (receiver, sender), F_T
@@ -38,6 +44,7 @@ class Scene:
     comp: Fraction = Fraction(1, 1000)
     comm: Fraction = Fraction(8, 1000)
     own_delay: bool = False
+    contact_comp: Fraction | None = None
     haptic: Fraction = Fraction(1, 1000)
     network: Fraction = Fraction(8, 1000)
     haptic_phase: Fraction = Fraction(0)
@@ -46,6 +53,11 @@ class Scene:
     weights: dict[tuple[int, int], float] | None = None
     late: dict[tuple[int, int], Fraction] = field(default_factory=dict)
     pairs: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    @property
+    def contact_delay(self) -> Fraction:
+        """The delay of the contact's force."""
+        return self.comp if self.contact_comp is None else self.contact_comp
 
     def hears(self, receiver: int) -> list[tuple[int, float]]:
         """Return whom a peer hears, with weights."""
@@ -63,15 +75,34 @@ def frame_matrix(
     The state is every peer's (x, v, x_O, v_O), then its last computed forces, newest first, then its last
     packets, newest first: as many as any delay can ask for, so some entries may matter to nobody.
     """
-    frame = common_period(scene.haptic, scene.network)
-    force_depth = math.ceil(scene.comp / scene.haptic) + 1
-    packet_depth = math.ceil(max(scene.comm, *scene.late.values(), Fraction(0)) / scene.network) + 1
-    n = scene.peers * (4 + 3 * force_depth + 2 * packet_depth)
+    n, frame, force_depth, packet_depth = _shape(scene)
     columns = []
     for column in range(n):
         state = [number(1 if row == column else 0) for row in range(n)]
         columns.append(_one_frame(scene, state, frame, force_depth, packet_depth, number, exp))
     return [[columns[c][r] for c in range(n)] for r in range(n)]
+
+
+def frame_matrices(scene: Scene, count: int) -> NDArray[np.float64]:
+    """Return the same in floats for many scenes at once, (count, n, n): numbers may be arrays (count,).
+
+    All columns go through one frame together, as rows of numbers.
+    """
+
+    def number(value: Any) -> NDArray[np.float64]:
+        return np.asarray(value, dtype=np.float64)[..., None]
+
+    n, frame, force_depth, packet_depth = _shape(scene)
+    rows = _one_frame(scene, list(np.eye(n)), frame, force_depth, packet_depth, number, np.exp)
+    return np.stack([np.broadcast_to(row, (count, n)) for row in rows], axis=1)
+
+
+def _shape(scene: Scene) -> tuple[int, Fraction, int, int]:
+    """Return the number of states, the length of a frame, and how many forces and packets are kept."""
+    frame = common_period(scene.haptic, scene.network)
+    force_depth = math.ceil(max(scene.comp, scene.contact_delay) / scene.haptic) + 1
+    packet_depth = math.ceil(max(scene.comm, *scene.late.values(), Fraction(0)) / scene.network) + 1
+    return scene.peers * (4 + 3 * force_depth + 2 * packet_depth), frame, force_depth, packet_depth
 
 
 def common_period(one: Fraction, other: Fraction) -> Fraction:
@@ -119,6 +150,7 @@ def _one_frame(
     instants = {Fraction(0), frame}
     for start, period, delay in (
         (haptic_0, scene.haptic, scene.comp),
+        (haptic_0, scene.haptic, scene.contact_delay),
         (haptic_0, scene.haptic, Fraction(0)),
         (network_0, scene.network, Fraction(0)),
     ):
@@ -166,13 +198,12 @@ def _one_frame(
         for i in range(scene.peers):
             p = value[i]
             delayed = newest(forces[i], now, scene.comp)
+            contact = newest(forces[i], now, scene.contact_delay)[1]
             at_once = newest(forces[i], now, Fraction(0))
             pull = delayed[2] + (at_once if scene.own_delay else delayed)[3]
             x, v, x_o, v_o = motion[i]
-            x, v = _coast(x, v, -delayed[1], p["device"], p["device_damping"], duration, number, exp)
-            x_o, v_o = _coast(
-                x_o, v_o, delayed[1] - pull, p["cube"], p["cube_damping"], duration, number, exp
-            )
+            x, v = _coast(x, v, -contact, p["device"], p["device_damping"], duration, number, exp)
+            x_o, v_o = _coast(x_o, v_o, contact - pull, p["cube"], p["cube_damping"], duration, number, exp)
             motion[i] = [x, v, x_o, v_o]
 
     result: list[Any] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from fractions import Fraction
+from pathlib import Path
 
 import mpmath
 import numpy as np
@@ -16,9 +17,10 @@ from apc.runtime.analysis.analysis import analyze
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.critical import critical
 from apc.runtime.vary.crossings import scan, scan_lines
+from apc.runtime.vary.margins import margins
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, LIMITS
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 TEXTS = {"AP": AVERAGE, "VC": MESH}
 NONE = {"contact.delay": "0", "coordination.delay": "0", "lan.delay": "0"}
@@ -309,3 +311,104 @@ def test_where_a_contact_begins_to_push_is_found_from_either_number_of_free_moti
     assert found.enters
     assert found.value == pytest.approx(-0.02, abs=1e-12)
     assert found.scanned[0] < -0.03, "a negative value is within what is scanned"
+
+
+@pytest.mark.parametrize("b", ["0", "2"])
+def test_a_stiffness_that_vanishes_is_no_crossing(b: str) -> None:
+    """With the received part at once, what the own force holds follows the stiffness, down to nothing."""
+    found = critical(scene("AP", delays="own", b=b), "coordination.stiffness")
+    [only] = found.crossings
+    assert only.proof.startswith("proved")
+    assert only.stable_side == "below"
+    assert found.scanned[0] == 0.0
+    assert found.verdict == ""
+
+
+DELAYS = ("contact.delay", "coordination.delay", "lan.delay")
+
+
+@pytest.mark.parametrize("name", DELAYS)
+@pytest.mark.parametrize("times", [("0.13 ms", "1 ms", "8 ms"), ("1.37 ms", "0.61 ms", "7.19 ms")])
+def test_a_scan_of_a_delay_goes_beyond_the_present_value(name: str, times: tuple[str, str, str]) -> None:
+    """However many decimals the other times have: events don't coincide at every common divisor of all."""
+    contact, coordination, link = times
+    text = replaced(
+        AVERAGE,
+        (
+            "stiffness: 1000 N/m, clock: haptic, delay: 1 ms",
+            f"stiffness: 1000 N/m, clock: haptic, delay: {contact}",
+        ),
+        (
+            "stiffness: 500 N/m, clock: haptic, delay: 1 ms",
+            f"stiffness: 500 N/m, clock: haptic, delay: {coordination}",
+        ),
+        ("delay: 8 ms", f"delay: {link}"),
+    )
+    system = compiled(text)
+    found = critical(system, name)
+    assert found.scanned[0] == 0.0
+    assert found.scanned[1] >= 2 * found.present
+    for one in found.crossings[:1]:
+        for way in (-1, 1):
+            value = Fraction(one.value) * (1 + way * Fraction(1, 10**7))
+            stable = analyze(apply(system, [Override(name, None, value)])).stable
+            assert stable is ((way < 0) == (one.stable_side == "below"))
+
+
+def test_a_delay_that_stands_in_a_force_moves_the_force_as_well(tmp_path: Path) -> None:
+    part = (
+        "component: Late\nabout: A spring, stiffer the later it is.\nconnectors: {a: Flange, b: Flange}\n"
+        "parameters: {stiffness: {unit: N/m}, rate: {unit: N/m/s}, clock: clock, delay: {unit: s, min: 0}}\n"
+        "equations:\n  - f = (stiffness + rate*delay)*(sample(a.x) - sample(b.x))\n  - a.f = hold(f, delay)\n"
+        "  - b.f = -a.f\n"
+    )
+    text = (
+        "topology: late\nclocks: {haptic: 1 ms}\npeers: {user: {count: 1}}\n"
+        "masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}}\n"
+        "couplers: {c: {type: Late, a: device, b: ground, stiffness: 100 N/m, rate: 1e6 N/m/s, clock: haptic,"
+        " delay: 1 ms}}\n"
+    )
+    system = compiled(text, library(tmp_path, part))
+    found = critical(system, "c.delay")
+    [only] = found.crossings
+    assert only.proof.startswith("proved")
+    for way, stable in ((-1, True), (1, False)):
+        value = Fraction(only.value) * (1 + way * Fraction(1, 10**9))
+        assert analyze(apply(system, [Override("c.delay", None, value)])).stable is stable
+
+
+def test_a_present_value_on_a_jump_is_on_the_side_of_its_own_verdict() -> None:
+    """A packet that comes with a tick is seen by it: 8 ms is one with what is below, and may grow no more."""
+    system = compiled(AVERAGE)
+    whole = critical(
+        with_values(system, {"coordination.stiffness": "690", "contact.stiffness": "100"}), "lan.delay"
+    )
+    jump = whole.crossings[0]
+    assert jump.kind == "jump"
+    assert jump.stable_side == "below"
+    there = {"coordination.stiffness": "690", "contact.stiffness": "100", "lan.delay": repr(jump.value)}
+    moved = with_values(system, there)
+    assert analyze(moved).stable
+    assert critical(moved, "lan.delay").value == jump.value
+    row = next(one for one in margins(moved).rows if one.parameter == "lan.delay")
+    assert (row.value, row.factor, row.kind) == (jump.value, 1.0, "jump")
+
+
+@pytest.mark.parametrize(
+    ("words", "got", "line"),
+    [
+        (["scene.yaml", "lan.delay"], "scene.yaml, then lan.delay", "apc critical lan.delay scene.yaml"),
+        (["scene.yaml"], "scene.yaml alone", "apc critical contact.stiffness scene.yaml"),
+    ],
+)
+def test_a_scene_before_its_parameter_is_told_the_order(
+    words: list[str], got: str, line: str, tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["critical", *words]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    wanted = "E841 the command wants a parameter or delay, then the scene"
+    assert said.err == f"apc critical: {wanted}, got {got}. Write: {line}\n"
+    assert run(line.split()[1:]) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from fractions import Fraction
 
 from apc.runtime.analysis.analysis import analyze
@@ -39,3 +40,23 @@ def test_the_table_fits_80_columns() -> None:
     text = margins_report(margins(compiled(AVERAGE)))
     assert max(map(len, text.splitlines())) <= 80
     assert "no limit up to" in text
+
+
+def test_a_delay_that_is_scanned_is_scanned_far_enough_or_said_not_to_be() -> None:
+    text = replaced(
+        AVERAGE,
+        (
+            "stiffness: 1000 N/m, clock: haptic, delay: 1 ms",
+            "stiffness: 1000 N/m, clock: haptic, delay: 0.13 ms",
+        ),
+    )
+    for one in margins(compiled(text)).rows:
+        assert one.value is not None or one.scanned >= 1.5 * one.present
+        assert one.note == ""
+    # 0.99 ms and 1 ms meet at every hundredth of a millisecond.
+    slow = replaced(text, ("network: 8 ms", "network: 0.99 ms"))
+    found = margins(compiled(slow))
+    row = next(one for one in found.rows if one.parameter == "lan.delay")
+    assert row.value is None
+    assert re.fullmatch(r"\d+ orders of events up to 0\.012\d* s", row.note)
+    assert f"not looked for: {row.note}" in margins_report(found)

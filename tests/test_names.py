@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.names import Free, find, parameter_of, unit_of
+from apc.runtime.analysis.analysis import analyze
+from apc.runtime.frame.names import Free, find, is_named, named_times, parameter_of, unit_of
+from apc.runtime.frame.overrides import Override, apply
+from apc.runtime.vary.evaluator import free_parameters
+from apc.runtime.vary.margins import margins
+from apc.runtime.vary.sensitivity import sensitivities
 from tests.sites import grouped, paper
+from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 
 @pytest.mark.parametrize(
@@ -38,3 +46,34 @@ def test_a_free_parameter_is_its_groups_own_if_the_group_sets_it() -> None:
         assert parameter_of(system, Free("contact.stiffness", group)).value == value
     assert Free("contact.stiffness", "left").label == "left.contact.stiffness"
     assert (unit_of(system, "contact.stiffness"), unit_of(system, "lan.delay")) == ("N/m", "s")
+
+
+def test_what_the_compiler_counts_or_adds_is_nobody_s_to_set() -> None:
+    """A hold without delay, one by an expression, and how many are heard have names that mean nothing."""
+    own = compiled(replaced(AVERAGE, ("link: lan}", "link: lan, delays: own}")))
+    star = compiled(replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: star}")))
+    for system in (own, star):
+        names = [one.name for one in (*system.parameters, *system.timings)]
+        unnamed = [name for name in names if not is_named(name)]
+        assert unnamed
+        for name in unnamed:
+            with pytest.raises(ApcError, match="E622"):
+                find(system, name)
+        assert all(is_named(one.name) for one in (*free_parameters(system), *named_times(system)))
+        rows = [one.parameter for one in margins(system).rows]
+        rows += [one.parameter for one in sensitivities(system).rows]
+        assert rows
+        assert all(is_named(name) for name in rows)
+
+
+def test_the_derivatives_of_a_star_are_those_of_its_radius() -> None:
+    """Of a scene whose peers hear different numbers of others, by differences of the radius itself."""
+    star = compiled(replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: star}")))
+    rows = {one.parameter: one for one in sensitivities(star).rows}
+    for name in ("coordination.stiffness", "contact.stiffness", "device.mass"):
+        value = parameter_of(star, Free(name)).value
+        ends = [
+            analyze(apply(star, [Override(name, None, Fraction(value * (1 + way * 1e-5)))])).spectral_radius
+            for way in (1, -1)
+        ]
+        assert rows[name].derivative == pytest.approx((ends[0] - ends[1]) / (2e-5 * value), rel=1e-4)

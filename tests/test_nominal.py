@@ -9,6 +9,8 @@ import pytest
 
 from apc.__main__ import run
 from apc.runtime.network.nominal import channel_numbers, left_out
+from apc.runtime.region.axes import parse_axes
+from apc.runtime.region.region import region
 from apc.runtime.vary.sensitivity import sensitivities
 from tests.lossy import unreliable
 from tests.topologies import AVERAGE, compiled
@@ -87,3 +89,10 @@ def test_no_derivative_is_given_with_respect_to_what_is_left_out(scene: str) -> 
     names = {row.parameter for row in sensitivities(compiled(Path(scene).read_text("utf-8"))).rows}
     assert "contact.stiffness" in names
     assert not {name for name in names if name.startswith("lan.")}
+
+
+def test_a_picture_says_it_too(scene: str) -> None:
+    system = compiled(Path(scene).read_text("utf-8"))
+    spans = ("contact.stiffness=100 N/m:3000 N/m", "coordination.stiffness=100 N/m:2000 N/m")
+    title = region(system, parse_axes(system, *spans), cells=4).plot().get_title()
+    assert " ".join(title.split()).startswith("left out: packet loss (30 %) and jitter of lan;")

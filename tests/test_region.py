@@ -262,3 +262,15 @@ def test_a_scene_without_studies_asks_for_axes() -> None:
 def test_regions_of_saved_models_are_those_of_fresh_ones(average: CompiledSystem, tmp_path: Path) -> None:
     apc.save(average, tmp_path / "model.apc")
     assert apc.load(tmp_path / "model.apc").region == average.region
+
+
+def test_a_stiffness_that_holds_another_force_has_a_region_from_nothing_on() -> None:
+    """With the received part at once the translation follows the stiffness: both start at 0."""
+    system = compiled(replaced(AVERAGE, ("link: lan}", "link: lan, delays: own}")))
+    spans = ("contact.stiffness=0 N/m:5000 N/m", "coordination.stiffness=0 N/m:1500 N/m")
+    found = region(system, parse_axes(system, *spans))
+    assert len(found.curves) == 1
+    random = np.random.default_rng(5)
+    for x, y in random.uniform([1, 1], [5000, 1500], (12, 2)).tolist():
+        overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
+        assert found.contains(x, y) == analyze(apply(system, overrides)).stable

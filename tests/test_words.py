@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import math
+from fractions import Fraction
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apc.compiler.words import WIDTH, counted, with_unit, wrapped
+from apc.compiler.words import WIDTH, counted, known_digits, measured, with_unit, wrapped
 
 
 @pytest.mark.parametrize(("number", "expected"), [(0, "0 peers"), (1, "1 peer"), (2, "2 peers")])
@@ -45,3 +47,41 @@ def test_a_hyphen_is_no_place_to_break_a_name() -> None:
 def test_a_word_that_can_not_be_broken_keeps_its_width() -> None:
     assert wrapped("a" * (WIDTH + 5)) == ["a" * (WIDTH + 5)]
     assert wrapped("") == []
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "expected"),
+    [
+        (1096.4108683656437, 1.2e-10, "1096.4108683656 ± 2e-10 N/m"),
+        (0.957171389624963, 4.4e-13, "0.9571713896250 ± 5e-13 N/m"),
+        (0.00178074101228953, 1.7e-16, "0.0017807410122895 ± 2e-16 N/m"),
+        (1234.5, 20.0, "1230 ± 3e+01 N/m"),
+        (9.96, 0.06, "9.96 ± 6e-02 N/m"),
+        (9.996, 0.096, "10.0 ± 1e-01 N/m"),
+        (-0.5, 0.25, "-0.5 ± 3e-01 N/m"),
+        (2.5e-9, 1e-12, "2.500e-09 ± 1e-12 N/m"),
+        (0.0, 1e-3, "0.000 ± 1e-03 N/m"),
+        (1.0, math.inf, "1 ± inf N/m"),
+    ],
+)
+def test_a_number_ends_with_the_digit_its_error_stands_in(value: float, error: float, expected: str) -> None:
+    number, unit = expected.rsplit(" ", 1)
+    shown, mark, off = number.partition(" ± ")
+    assert measured(value, error, unit) == f"{shown} {unit}{mark}{off}"
+
+
+@given(st.floats(-1e12, 1e12), st.floats(1e-30, 1e9))
+def test_what_is_shown_holds_whatever_the_error_holds(value: float, error: float) -> None:
+    shown, _, off = measured(value, error).partition(" ± ")
+    assert abs(Fraction(shown) - Fraction(repr(value))) + Fraction(repr(error)) <= Fraction(off)
+    digit = Fraction(10) ** math.floor(math.log10(float(off)) + 1e-9)
+    assert Fraction(off) <= 2 * Fraction(error) + Fraction(digit) or Fraction(off) < Fraction(
+        1, 10**10
+    ) * abs(Fraction(value))
+
+
+def test_digits_that_an_error_leaves_open_are_not_shown() -> None:
+    assert known_digits(1645.3530049, 1e-9, 7) == "1645.353"
+    assert known_digits(1645.3530049, 0.2, 7) == "1645"
+    assert known_digits(1645.3530049, 3e3, 7) == "2e+03"
+    assert known_digits(0.25, 0.0, 7) == "0.25"

@@ -12,6 +12,7 @@ A cubic through the values and slopes of both ends of a cell of width h is off b
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -30,9 +31,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# How far a coefficient may be from the cubic of its cell, relative to its size there or at the present value:
-# the eigenvalues' own cubics are looked at beside it.
-STRAIGHT = 1e-2
+# How far a coefficient may be from the cubic of its cell, relative to its size there: the eigenvalues' own
+# cubics are looked at beside it. What is so much smaller than it gets elsewhere decides nothing.
+STRAIGHT, NOTHING = 1e-2, 1e-6
 
 # Cells narrower than this, relative to the value, hold a step: they are left.
 NARROW = 1e-9
@@ -79,31 +80,34 @@ class Bends:
         """
         if not self.functions:
             return points, True
-        here = self._values(self.present)
         found = points.tolist()
-        waiting = list(itertools.pairwise(found))
-        looked = 0
         known = {value: self._values(value) for value in found}
+        largest = np.max([*known.values(), self._values(self.present)], axis=0)
+        # The widest first: what is largest is met soon.
+        waiting = deque(itertools.pairwise(found))
+        looked = 0
         while waiting and looked < MOST_CELLS:
-            low, high = waiting.pop()
+            low, high = waiting.popleft()
             looked += 1
-            size = np.maximum(np.maximum(np.abs(known[low]), np.abs(known[high])), np.abs(here))
+            size = np.maximum(np.maximum(known[low], known[high]), NOTHING * largest)
             if self._straight(low, high, size):
                 continue
             if high - low <= NARROW * max(abs(low), abs(high), least):
                 continue
             middle = (low + high) / 2
             known[middle] = self._values(middle)
+            largest = np.maximum(largest, known[middle])
             found.append(middle)
             waiting += [(low, middle), (middle, high)]
         return np.sort(np.array(found)), not waiting
 
     def _values(self, value: float) -> Floats:
-        return np.concatenate([np.asarray(one(value), dtype=np.float64).ravel() for one in self.functions])
+        """Return the sizes of all coefficients, 0 where one has none."""
+        listed = [np.asarray(one(value), dtype=np.float64).ravel() for one in self.functions]
+        return np.abs(np.nan_to_num(np.concatenate(listed), posinf=0.0, neginf=0.0))
 
     def _straight(self, low: float, high: float, size: Floats) -> bool:
         """Say whether every coefficient is a cubic between two values, to `STRAIGHT` of a size each."""
-        most = STRAIGHT * np.where(np.isfinite(size), size, 0.0)
         bits, flint.ctx.prec = flint.ctx.prec, BITS
         try:
             middle = (flint.arb(low) + flint.arb(high)) / 2
@@ -122,7 +126,7 @@ class Bends:
             return False
         finally:
             flint.ctx.prec = bits
-        return bool(np.all(np.array(off) <= most))
+        return bool(np.all(np.array(off) <= STRAIGHT * size))
 
 
 def bends(family: BatchEvaluator, base: Floats, column: int) -> Bends | None:
@@ -242,8 +246,20 @@ def _transcendental(name: str, value: Any) -> Any:
     value = _series(value)
     match name:
         case "tanh":
-            return 1 - 2 / ((2 * value).exp() + 1)
+            return _tanh(value)
         case "sinh" | "cosh":
             up, down = value.exp(), (-value).exp()
             return (up - down if name == "sinh" else up + down) / 2
     return getattr(value, name)()
+
+
+def _tanh(value: Any) -> Any:
+    """Return T(x₀ + h) by T′ = 1 − T²: far out, where e^x is beyond every ball, T is next to ±1."""
+    terms = [value[0].tanh()]
+    for k in range(TERMS - 1):
+        product = sum((terms[i] * terms[k - i] for i in range(k + 1)), flint.arb(0))
+        terms.append(((1 if k == 0 else 0) - product) / (k + 1))
+    step, found = value - value[0], _constant(0.0)
+    for one in reversed(terms):
+        found = found * step + one
+    return found

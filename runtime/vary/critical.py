@@ -135,7 +135,7 @@ def critical(
     lower, upper
         Quantities between which to look, such as "5000 N/m". Without `lower`, from the least value allowed,
         or 0 (of a negative value, from `SPAN` times it); without `upper`, up to `SPAN` times the present
-        value (of a delay, over `PIECES` pieces).
+        value (of a delay, as far as `search.delay_reach` says).
     told
         Is told how far the search is.
 

@@ -225,7 +225,7 @@ def _sample(courses: Courses, lines: Integers, points: Floats, *, ends: bool = F
     courses, lines, points
         The matrices, and where.
     ends
-        Whether the first and last point of each line are ends, which may lie on the circle (`_off_circle`).
+        Whether the first and last point of each line may lie on the circle, see `_off_circle`.
     """
     pairs = courses(lines, points)
     sound = np.ones(len(points), dtype=bool)

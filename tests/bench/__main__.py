@@ -60,6 +60,7 @@ PARTS = (
     Part("hard", "Hard cases", ("apc", "bench", "--hard", "tests/hard"), timed=False),
     Part("scale", "More peers", ("apc", "bench", AVERAGE, "--scale", "3,30,300,3000,30000,1e6"), timed=False),
     Part("random", "Random scenes", _own("random_scenes"), _own("random_scenes", "--points", "200")),
+    Part("scans", "Random scans", _own("random_scans"), _own("random_scans", "--points", "40")),
     Part("comparison", "Other programs", _own("comparison")),
     Part("work_precision", "Methods of simulation", _own("work_precision")),
     Part("simulate", "Simulation", _own("simulate"), _own("simulate", "--quick")),

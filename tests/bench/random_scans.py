@@ -1,0 +1,290 @@
+# ruff: noqa: E501 -- scenes are written by long lines
+"""Random scans of a parameter or delay against a fine grid: `python -m tests.bench.random_scans`.
+
+Stiffnesses, delays and settings that stiffnesses follow by a narrow bump are scanned in scenes with clocks,
+delays and gains at random. The truth is the matrix of all peers (see `tests.bruteforce`), whose eigenvalues
+are looked at on a grid and on either side of every crossing that is claimed: none may be invented or missed.
+"""
+
+from __future__ import annotations
+
+import random
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.runtime.bench.timing import timed
+from apc.runtime.threads import single_threaded
+from apc.runtime.vary.critical import Critical, critical
+from tests.bench.judge import Judge, parser_of
+from tests.bruteforce import Scene, frame_matrices
+from tests.topologies import compiled, library
+
+Floats = NDArray[np.float64]
+
+# A radius nearer to 1 than this tells no side: the rounding of some fifty eigenvalues in floats.
+UNSURE = 1e-10
+
+# How far beside a claimed crossing, relatively, its sides are looked at.
+BESIDE = 1e-5
+
+# Points of the grid over a parameter, and over a delay, whose every value is a schedule of its own.
+GRID, DELAYS = 400, 24
+
+# Scans that could not clear every cell, and crossings that were not proved: an eigenvalue that follows the
+# circle is a draw's luck.
+MOST_OPEN = 2e-2
+
+BUMP = """\
+component: Bump
+about: A spring and damper whose stiffness has a bump over a setting.
+connectors: {a: Flange, b: Flange}
+parameters:
+  low: {unit: N/m, min: 0}
+  high: {unit: N/m}
+  setting: {unit: 1, min: 0}
+  middle: {unit: 1}
+  width: {unit: 1, above: 0}
+  damping: {unit: N*s/m, min: 0, default: 0}
+  clock: clock
+  delay: {unit: s, min: 0, default: 0}
+equations:
+  - k = low + high/(1 + ((setting - middle)/width)^4)
+  - f = k*(sample(a.x) - sample(b.x)) + damping*(sample(der(a.x)) - sample(der(b.x)))
+  - a.f = hold(f, delay)
+  - b.f = -a.f
+"""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """A scan: the scene as text and as numbers, what varies, and the numbers of a scene with another value."""
+
+    text: str
+    scene: Scene
+    name: str
+    present: float
+    at: Callable[[Scene, Floats], Scene]
+    grid: Floats
+    one_by_one: bool = False
+
+
+def draw(generator: random.Random) -> Draw:
+    """Return a scan at random."""
+    pick = generator.choice
+
+    def decades(low: float, high: float) -> float:
+        return float(f"{10 ** generator.uniform(low, high):.3g}")
+
+    tick = pick([Fraction(1), Fraction(1), Fraction(1, 2), Fraction(2)])
+    period = tick * pick([1, 2, 4, 4, Fraction(5, 2)])
+    late, contact = (_late(generator, tick) for _ in range(2))
+    packets = pick([Fraction(0), period, period, 2 * period, Fraction(generator.randint(1, 1500), 100)])
+    own = generator.random() < 0.6
+    operator = pick(["mean", "sum"])
+    scene = Scene(
+        operator=operator,
+        peers=generator.randint(2, 3),
+        kt=decades(1.5, 3.3),
+        bt=pick([0.0, decades(-1, 1)]),
+        kc=decades(2, 3.5),
+        bc=pick([0.0, decades(-1, 1)]),
+        comp=late / 1000,
+        contact_comp=contact / 1000,
+        comm=packets / 1000,
+        own_delay=own,
+        haptic=tick / 1000,
+        network=period / 1000,
+    )
+    kind = pick(["stiffness", "stiffness", "delay", "bump"])
+    spring = f"type: SampledSpringDamper, stiffness: {scene.kc!r} N/m"
+    if kind == "bump":
+        middle, width = decades(1, 3), decades(-2, -0.5)
+        high, present = decades(2.5, 4), decades(1, 3)
+        width = float(f"{width * middle:.3g}")
+        spring = f"type: Bump, low: {scene.kc!r} N/m, high: {high!r} N/m, setting: {present!r}, middle: {middle!r}, width: {width!r}"
+    text = (
+        f"topology: scan\nclocks: {{haptic: {tick} ms, network: {period} ms}}\npeers: {{user: {{count: {scene.peers}}}}}\n"
+        "masses:\n  device: {mass: 0.1 kg, damping: 5 N*s/m}\n"
+        f"  cube: {{mass: {scene.cube * scene.peers!r} kg, damping: 5 N*s/m, shared: true}}\n"
+        "couplers:\n"
+        f"  contact: {{{spring}, a: device, b: cube, damping: {scene.bc!r} N*s/m, clock: haptic, delay: {contact} ms}}\n"
+        f"  coordination: {{type: {'AveragePosition' if operator == 'mean' else 'FullMesh'}, object: cube, stiffness: {scene.kt!r} N/m,"
+        f" damping: {scene.bt!r} N*s/m, clock: haptic, delay: {late} ms, link: lan, delays: {'own' if own else 'all'}}}\n"
+        f"links:\n  lan: {{clock: network, delay: {packets} ms}}\n"
+    )
+    if kind == "bump":
+        low = scene.kc
+        grid = np.concatenate([_spread(present), middle + width * np.linspace(-6, 6, GRID // 2)])
+
+        def bumped(one: Scene, value: Floats) -> Scene:
+            return replace(one, kc=low + high / (1 + ((value - middle) / width) ** 4))  # type: ignore[arg-type] # an array
+
+        return Draw(text, scene, "contact.setting", present, bumped, grid[grid > 0])
+    if kind == "stiffness":
+        field_of = pick([("contact.stiffness", "kc"), ("coordination.stiffness", "kt")])
+        return Draw(
+            text,
+            scene,
+            field_of[0],
+            getattr(scene, field_of[1]),
+            _with(field_of[1]),
+            _spread(getattr(scene, field_of[1])),
+        )
+    name, attribute, now = pick(
+        [
+            ("contact.delay", "contact_comp", contact),
+            ("coordination.delay", "comp", late),
+            ("lan.delay", "comm", packets),
+        ]
+    )
+    present = float(now) / 1000
+    # None of them a time at which events coincide.
+    grid = (max(present, float(tick) / 1000) * 3) * (np.arange(DELAYS) + np.pi / 8) / DELAYS
+    return Draw(text, scene, name, present, _with(attribute), grid, one_by_one=True)
+
+
+def _late(generator: random.Random, tick: Fraction) -> Fraction:
+    """Return a computational delay at random, in ms: none, a tick, or what a processor takes."""
+    return generator.choice([Fraction(0), tick, tick, Fraction(generator.randint(1, 250), 100)])
+
+
+def _with(name: str) -> Callable[[Scene, Floats], Scene]:
+    return lambda scene, value: replace(scene, **{name: value})
+
+
+def _spread(present: float) -> Floats:
+    """Return a grid from next to nothing to far beyond the present value, evenly about it."""
+    return np.concatenate(
+        [np.geomspace(1e-9 * present, 900 * present, GRID // 2), np.linspace(0, 6 * present, GRID // 2)[1:]]
+    )
+
+
+def radii(scan: Draw, values: Floats) -> Floats:
+    """Return the largest magnitude of any motion but the common translation, at values (k,)."""
+    if scan.one_by_one:
+        times = [Fraction(float(one)) for one in values]
+        return np.array([_radii(scan.at(scan.scene, one), 1)[0] for one in times])  # type: ignore[arg-type] # an exact time
+    return _radii(scan.at(scan.scene, values), len(values))
+
+
+def _radii(scene: Scene, count: int) -> Floats:
+    values = np.linalg.eigvals(frame_matrices(scene, count))
+    sizes = np.abs(values)
+    sizes[np.arange(count), np.argmin(np.abs(values - 1), axis=1)] = 0.0
+    return np.asarray(sizes.max(axis=1))
+
+
+def check(scan: Draw, found: Critical) -> str:
+    """Return what is wrong with a scan, "" if nothing is."""
+    low, high = found.scanned
+    if not low <= scan.present <= high:
+        return f"the present value {scan.present!r} is not in what was scanned, {found.scanned}"
+    edges = np.array([one.value for one in found.crossings])
+    errors = np.array([one.error for one in found.crossings])
+    values = [scan.grid[(scan.grid > low) & (scan.grid < high)]]
+    for way in (-1, 1):
+        beside = edges + way * (BESIDE * np.abs(edges) + 2 * errors)
+        values.append(beside[(beside > low) & (beside < high)])
+    points = np.concatenate(values)
+    # Nearer to a crossing than its error nothing is claimed; nearer to another than the cell, neither.
+    apart = np.abs(points[:, None] - edges[None]).min(axis=1, initial=np.inf)
+    points = points[apart > 1.5 * errors.max(initial=0.0)]
+    radius = radii(scan, points)
+    if not len(found.crossings):
+        claimed = np.full(len(points), found.verdict.startswith("stable"))
+    else:
+        sides = [found.crossings[0].stable_side == "below"]
+        sides += [one.stable_side == "above" for one in found.crossings]
+        claimed = np.array(sides)[np.searchsorted(edges, points)]
+    wrong = (np.abs(radius - 1) > UNSURE) & (claimed != (radius < 1))
+    if not wrong.any():
+        return ""
+    place = int(np.argmax(wrong))
+    side = "stable" if claimed[place] else "unstable"
+    return (
+        f"{side} is claimed at {points[place]!r}, the radius is {radius[place]!r}; crossings {edges.tolist()}"
+    )
+
+
+@dataclass
+class Tally:
+    """What came out."""
+
+    scans: int = 0
+    crossings: int = 0
+    estimated: int = 0
+    open: int = 0
+    seconds: float = 0.0
+    kinds: Counter[str] = field(default_factory=Counter)
+    wrong: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        """Return a few lines."""
+        words = ", ".join(f"{count} of {name}" for name, count in sorted(self.kinds.items()))
+        return (
+            f"{self.scans} scans: {words}\n{self.crossings} crossings, {self.estimated} of them without a proof; "
+            f"{self.open} scans with an eigenvalue that follows the circle; {len(self.wrong)} wrong; "
+            f"{self.seconds / max(self.scans, 1):.2f} s a scan"
+        )
+
+
+def run(points: int, *, seed: int = 0) -> Tally:
+    """Scan so many random scenes.
+
+    Parameters
+    ----------
+    points
+        How many.
+    seed
+        Of what is drawn.
+    """
+    generator, tally = random.Random(seed), Tally()
+    with single_threaded(), tempfile.TemporaryDirectory() as folder:
+        parts = library(Path(folder), BUMP)
+        for _ in range(points):
+            scan = draw(generator)
+            tally.kinds[scan.name] += 1
+            tally.scans += 1
+            system: CompiledSystem = compiled(scan.text, parts)
+            try:
+                taken, found = timed(lambda system=system, name=scan.name: critical(system, name))  # type: ignore[misc] # bound at once
+                fault = check(scan, found)
+            except (ApcError, AssertionError, ArithmeticError, IndexError, ValueError) as error:
+                tally.wrong.append(f"{scan.name}: {error!r}\n{scan.text}")
+                continue
+            tally.seconds += taken
+            tally.crossings += len(found.crossings)
+            tally.estimated += sum(one.proof.startswith("estimated") for one in found.crossings)
+            tally.open += not found.whole
+            if fault:
+                tally.wrong.append(f"{scan.name}: {fault}\n{scan.text}")
+    return tally
+
+
+def main() -> None:
+    """Print what came out, and every scan that is wrong."""
+    parser = parser_of("random_scans", __doc__)
+    parser.add_argument("--points", type=int, default=600)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    judge = Judge(given.strict)
+    tally = run(given.points, seed=given.seed)
+    print(tally)
+    for one in tally.wrong:
+        judge.right(one, holds=False)
+    judge.within("crossings without a proof", tally.estimated, MOST_OPEN * tally.crossings)
+    judge.within("scans left open", tally.open, MOST_OPEN * tally.scans)
+    judge.end()
+
+
+if __name__ == "__main__":
+    main()
