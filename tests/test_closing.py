@@ -24,9 +24,7 @@ def test_a_common_state_of_equal_peers_moves_as_each_of_them_does() -> None:
     )
     # And so does what they hear.
     for heard in whole.heard:
-        np.testing.assert_allclose(
-            heard @ np.tile(state, 3), common.heard[0] @ state, rtol=1e-11, atol=1e-13
-        )
+        np.testing.assert_allclose(heard @ np.tile(state, 3), common.heard[0] @ state, rtol=1e-11, atol=1e-13)
 
 
 def test_a_packet_on_its_way_grows_older_frame_by_frame() -> None:

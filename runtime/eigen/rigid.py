@@ -20,7 +20,7 @@ It makes a generalized eigenvector, a Jordan pair.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.graph_modes import QUICK_PRIME
-from apc.runtime.eigen.loop import Loop
+from apc.runtime.eigen.loop import Coupling, Loop
 from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.frame.schedule import Act, Propagate, Send, Tick, Value
 from apc.runtime.frame.site import LinearSite
@@ -93,7 +93,9 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     )
 
 
-def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bool:
+def stays_rigid(
+    system: ClosedSystem | Loop, others: Sequence[LinearSite], *, coupling: Coupling | None = None
+) -> bool:
     """Say whether the directions of a system's rigid modes are rigid with other matrices of its sites, too.
 
     Parameters
@@ -102,11 +104,14 @@ def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bo
         The closed system.
     others
         Matrices of each site, over rationals or quotients of polynomials: then for all values of these.
+    coupling
+        What the sites hear of each other then, where that is another, too.
     """
+    other = system if coupling is None else replace(system, coupling=coupling)
     numbering = _Numbering(system.sites)
     exact = [group.exact for group in system.sites]
     for solution in _standing_solutions(system, exact, numbering):
-        if any(_value(form, solution) for form in _standing(system, others, numbering)):
+        if any(_value(form, solution) for form in _standing(other, others, numbering)):
             return False
         moved = zip(
             _standing_state(system, others, numbering, solution),
