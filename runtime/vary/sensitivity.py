@@ -239,7 +239,8 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
     if len(active) > 1:
         notes.append(f"{len(active)} eigenvalues share the radius: the largest of their changes decides")
     if untied:
-        notes.append(f"{' and '.join(untied)} would tie or move what was left out, and is not among these")
+        are = "are" if len(untied) > 1 else "is"
+        notes.append(f"{', '.join(untied)} would move what was left out, and {are} not among these")
     rows.sort(key=lambda row: (-abs(row.relative), row.parameter, row.mode))
     return Sensitivities(radius, tuple(active), tuple(rows), "; ".join(notes))
 
