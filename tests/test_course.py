@@ -93,7 +93,7 @@ links:
 
 
 def test_a_point_of_the_boundary_has_the_frequency_of_its_motion() -> None:
-    """A continuous spring of 300 Hz, made unstable by a slow tick's force; half a frame's rate is 62 Hz."""
+    """A continuous spring of 300 Hz, shaken by a slow tick's force: half the frame's rate is 62.5 Hz."""
     text = """\
 topology: boundary
 clocks: {haptic: 8 ms}

@@ -57,7 +57,7 @@ def test_what_the_compiler_counts_or_adds_is_nobody_s_to_set() -> None:
         unnamed = [name for name in names if not is_named(name)]
         assert unnamed
         for name in unnamed:
-            with pytest.raises(ApcError, match="E622"):
+            with pytest.raises(ApcError, match="E623" if name.startswith("count(") else "E622"):
                 find(system, name)
         assert all(is_named(one.name) for one in (*free_parameters(system), *named_times(system)))
         rows = [one.parameter for one in margins(system).rows]
@@ -77,3 +77,12 @@ def test_the_derivatives_of_a_star_are_those_of_its_radius() -> None:
             for way in (1, -1)
         ]
         assert rows[name].derivative == pytest.approx((ends[0] - ends[1]) / (2e-5 * value), rel=1e-4)
+
+
+@pytest.mark.parametrize("written", ["count(lan)", "user.count(lan)"])
+def test_how_many_peers_are_heard_is_no_parameter_to_set(written: str) -> None:
+    with pytest.raises(
+        ApcError,
+        match=r"E623 .* how many peers are heard, by their weights",
+    ):
+        find(compiled(MESH), written)

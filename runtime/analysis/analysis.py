@@ -21,9 +21,18 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.runtime.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.runtime.eigen.closing import close_loop
 from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.peer_group import PeerGroup, states_of
-from apc.runtime.eigen.peers import peer_groups
-from apc.runtime.eigen.spectrum import Mode, Spectrum, finite, solve_spectrum
+from apc.runtime.eigen.peer_group import PeerGroup, states_of, used_ways
+from apc.runtime.eigen.peers import group_of_row, peer_groups
+from apc.runtime.eigen.rigid import LENGTHS, what_stands
+from apc.runtime.eigen.spectrum import (
+    DRIFTS,
+    STABLE_TRANSLATING,
+    Mode,
+    Spectrum,
+    finite,
+    judge,
+    solve_spectrum,
+)
 from apc.runtime.frame.discretize import TOO_LARGE
 from apc.runtime.frame.exchange import Exchange, build_exchange
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
@@ -56,7 +65,8 @@ class Analysis:
     `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `plan.METHODS`.
     `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
     say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided;
-    `left_out` says what of the scene the answer does not look at.
+    `left_out` says what of the scene the answer does not look at. Of the rigid modes `translations` move
+    something; the others are of what `unfelt` names, memories that nothing reads at these values.
     """
 
     topology: str
@@ -74,6 +84,8 @@ class Analysis:
     notes: tuple[str, ...]
     proof: str = ""
     left_out: tuple[str, ...] = ()
+    unfelt: tuple[str, ...] = ()
+    translations: int = 0
 
     def __str__(self) -> str:
         """Return the verdict in words, the numbers, and the modes as a table."""
@@ -111,6 +123,8 @@ class Analysis:
             "notes": list(self.notes),
             "proof": self.proof,
             "left_out": list(self.left_out),
+            "translations": self.translations,
+            "unfelt": list(self.unfelt),
         }
 
 
@@ -177,6 +191,14 @@ def analyze(
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
         linearized = not all(prepared.jacobians[group.kind].affine for group in system.groups)
+        crowd = () if plan.loops else plan.groups or _representatives(system, prepared, numbers, exchange)
+        translations, drifts, unfelt = _what_stands(spectrum, plan.loops, crowd)
+        verdict, stable = spectrum.verdict, spectrum.stable
+        if unfelt and verdict in (STABLE_TRANSLATING, DRIFTS):
+            verdict, stable = judge([True], translations, drifts)
+        proof = spectrum.proof if verdict == DRIFTS else spectrum.proof.replace("to drift", "stable")
+        if proof and linearized:
+            proof += ", of the linearization"
     return Analysis(
         topology=system.name,
         peers=exchange.peers,
@@ -186,17 +208,64 @@ def analyze(
             for schedule, group in zip(prepared.schedules, system.groups, strict=True)
         ),
         method=plan.method,
-        verdict=spectrum.verdict,
-        stable=spectrum.stable,
+        verdict=verdict,
+        stable=stable,
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,
         rigid_modes=spectrum.rigid_modes,
         modes=spectrum.modes,
         linearized=linearized,
         notes=(*plan.notes, *notes, *spectrum.notes),
-        proof=f"{spectrum.proof}, of the linearization" if spectrum.proof and linearized else spectrum.proof,
+        proof=proof,
         left_out=left_out(system),
+        unfelt=unfelt,
+        translations=translations,
     )
+
+
+def _what_stands(
+    spectrum: Spectrum, loops: Sequence[Loop], crowd: Sequence[PeerGroup]
+) -> tuple[int, int, tuple[str, ...]]:
+    """Return how many translations and drifts there are, and what else neither grows nor dies out.
+
+    Where the loops are not at hand, of a large population, what is not felt is that of peers by themselves.
+    """
+    drifts = spectrum.drifts
+    if not spectrum.rigid_modes or not any(
+        map(_remembers, (*crowd, *(g for one in loops for g in one.sites)))
+    ):
+        return spectrum.rigid_modes, drifts, ()
+    listed: Sequence[tuple[Loop, int]] = [(loop, loop.multiplicity) for loop in loops]
+    for group in crowd:
+        anyhow = {way: ((Fraction(-1, 3),),) for way in used_ways([group.schedule])}
+        listed = [*listed, (Loop(group.name, 1, (group,), anyhow), group.count)]
+    found = [(what_stands(loop, with_drifts=bool(drifts and loops)), many) for loop, many in listed]
+    names = tuple(dict.fromkeys(name for one, _ in found for name in one.names))
+    if loops:
+        drifts = sum(one.drifts * many for one, many in found)
+        return sum(one.translations * many for one, many in found), drifts, names
+    return spectrum.rigid_modes - sum(one.unfelt * many for one, many in found), drifts, names
+
+
+def _remembers(group: PeerGroup) -> bool:
+    """Say whether peers keep more than lengths and angles with their rates."""
+    kind = group.jacobians.kind
+    return any(one.memories for one in kind.clocks) or any(
+        state.unit.partition("/")[0] not in LENGTHS for state in kind.states
+    )
+
+
+def _representatives(
+    system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange
+) -> list[PeerGroup]:
+    """Return the first peer of each group, as many as there are peers in it."""
+    return [
+        group_of_row(
+            *(prepared.jacobians[group.kind], numbers.parameters[place][0], prepared.schedules[place]),
+            *(exchange, place, group.count),
+        )
+        for place, group in enumerate(system.groups)
+    ]
 
 
 def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: bool) -> Spectrum:

@@ -158,6 +158,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,
         rigid_modes=spectrum.rigid_modes,
+        translations=spectrum.rigid_modes,
         modes=spectrum.modes,
         linearized=False,
         notes=(

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 16
 DECIMALS = 6  # of a magnitude
+MOST_UNFELT = 4  # names of what is left out beside the translations
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
 LARGE = 1e4  # a larger magnitude needs another notation to fit its column
 MOVES_WIDTH = 30  # columns at most of what a mode moves, at least of what it is cut to
@@ -122,8 +123,8 @@ def analysis_report(result: Analysis) -> str:
         words = f"{NEAR_THE_START}\n{words}"
     lines += [f"  {line}" for line in words.splitlines()]
     removed = ""
-    if result.rigid_modes:
-        removed = f", {counted(result.rigid_modes, 'translation')} left out"
+    if result.translations:
+        removed = f", {counted(result.translations, 'translation')} left out"
     lines += [
         "",
         f"  spectral radius  {measured(result.spectral_radius, result.spectral_radius_error)}"
@@ -133,6 +134,10 @@ def analysis_report(result: Analysis) -> str:
     ]
     if result.proof:
         lines.append(f"  proof            {result.proof}")
+    if result.unfelt:
+        names = f"{', '.join(result.unfelt[:MOST_UNFELT])}{', …' if len(result.unfelt) > MOST_UNFELT else ''}"
+        told = f"{names}, which nothing that moves reads at these values"
+        lines += wrapped(told, "  left out         ", " " * 19)
     lines += ["", _mode_table(result.modes)]
     for note in result.notes:
         lines += _note(note)
@@ -155,15 +160,34 @@ def answer_report(found: Answer) -> str:
 
 def _mode_table(modes: tuple[Mode, ...]) -> str:
     # What can't be told from zero is counted only: its rounding differs from machine to machine.
-    alive = [mode for mode in modes if mode.magnitude > max(mode.error, LEAST_MAGNITUDE)]
+    alive = [mode for mode in modes if _is_alive(mode)]
     rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
     shown = rows[:MOST_ROWS]
-    left = len(modes) - len(alive) + len(rows) - len(shown)
-    if not shown:
-        rest = f"{counted(left, 'mode')} die{'s' if left == 1 else ''} out within a frame (--json lists all)"
-        return f"  {rest}" if left else "  nothing moves but that"
-    text = "\n".join(_table_lines([HEADINGS, *(_cells(mode) for mode in shown)]))
-    return f"{text}\n  and {left} faster-dying ones (--json lists all)" if left else text
+    dead = [mode for mode in modes if not _is_alive(mode)]
+    rest = [*dead, *rows[MOST_ROWS:]]
+    # A mode not told from zero may be any size up to its error.
+    least = max(shown[-1].magnitude if shown else 0.0, 2 * LEAST_MAGNITUDE)
+    unsure = sum(not mode.magnitude + mode.error <= least for mode in dead)
+    text = "\n".join(_table_lines([HEADINGS, *(_cells(mode) for mode in shown)])) if shown else ""
+    if not rest:
+        return text or "  nothing moves but that"
+    if unsure:
+        many = "all" if unsure == len(rest) > 1 else str(unsure)
+        told = f"{counted(len(rest), 'mode')} {'more' if shown else ''} (--json lists all),"
+        told += (
+            f" {many} of them known too roughly to say how fast {'it dies' if unsure == 1 else 'they die'}"
+        )
+    elif shown:
+        told = f"{len(rest)} faster-dying {'one' if len(rest) == 1 else 'ones'} (--json lists all)"
+    else:
+        ends = "dies" if len(rest) == 1 else "die"
+        told = f"{counted(len(rest), 'mode')} {ends} out within a frame (--json lists all)"
+    return "\n".join([*text.splitlines(), *_note(f"and {told}" if shown else told)])
+
+
+def _is_alive(mode: Mode) -> bool:
+    """Say whether a mode is told from zero."""
+    return mode.magnitude > max(mode.error, LEAST_MAGNITUDE)
 
 
 def _cells(mode: Mode) -> tuple[str, ...]:

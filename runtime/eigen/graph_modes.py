@@ -2,8 +2,8 @@
 
 Takes: a `Graph` of a link and the number of its peers.
 Gives: `GraphMode`, `Surd`, `graph_modes`, `ring_mode`, `ring_values`; `QUICK_PRIME`.
-Guarantees: an eigenvalue that equal row sums make exact is exact, with its multiplicity proven; any other
-comes with a bound on its error.
+Guarantees: an eigenvalue that equal row sums make exact, or that is a simple fraction, is exact, with its
+multiplicity proven; any other comes with a bound on its error.
 Does not: know what is sent over the graph, or close a loop (see `graph_loops`).
 """
 
@@ -35,6 +35,10 @@ WORST_CONDITION = 1e6
 # Beyond so many peers, a repeated row sum is not proven an eigenvalue of that multiplicity in exact
 # rationals.
 MOST_EXACT = 300
+
+# An eigenvalue that may be a fraction with no larger a denominator, such as −1 of two peers or −1/2 of three,
+# is asked whether it is one.
+MOST_DENOMINATOR = 12
 
 # A prime for the quick look: the null space modulo a prime is at least as large as the true one.
 QUICK_PRIME = 2**61 - 1
@@ -162,6 +166,10 @@ def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...]
             modes.append(
                 GraphMode(exact_sum, Fraction(0), len(cluster), 0.0 if found else spread, common=True)
             )
+        elif (simple := _simple(centre, spread)) is not None and _is_exact(
+            graph, n, simple, len(cluster), mean=mean
+        ):
+            modes.append(GraphMode(simple, Fraction(0), len(cluster), 0.0, common=False))
         elif abs(centre.imag) <= spread:
             modes.append(
                 GraphMode(Fraction(centre.real), Fraction(0), len(cluster), spread + abs(centre.imag), False)
@@ -169,6 +177,12 @@ def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...]
         elif centre.imag > 0:  # its conjugate has a cluster of its own
             modes.append(GraphMode(Fraction(centre.real), Fraction(centre.imag), len(cluster), spread, False))
     return tuple(sorted(modes, key=lambda mode: (not mode.common, -mode.real, mode.imaginary)))
+
+
+def _simple(value: complex, off: float) -> Fraction | None:
+    """Return the one simple fraction that an eigenvalue may be, None if there is none."""
+    found = Fraction(value.real).limit_denominator(MOST_DENOMINATOR)
+    return found if abs(value - float(found)) <= off else None
 
 
 def _clusters(values: NDArray[np.complex128], doubt: float) -> list[Integers]:

@@ -1,8 +1,8 @@
 """The motions that nothing holds back, found in exact arithmetic.
 
 Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
-Gives: `RigidModes`, `find_rigid_modes`; `stays_rigid`; `independent_places`, `relative_places`,
-`relative_coordinates`.
+Gives: `RigidModes`, `find_rigid_modes`; `Standing`, `what_stands`; `stays_rigid`; `independent_places`,
+`relative_places`, `relative_coordinates`.
 Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
 a stiffness of exactly zero frees what it held.
 Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
@@ -20,8 +20,9 @@ It makes a generalized eigenvector, a Jordan pair.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from operator import mul
 from typing import Any
 
 import flint
@@ -30,12 +31,15 @@ from numpy.typing import NDArray
 
 from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.graph_modes import QUICK_PRIME
-from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.peer_group import PeerGroup
+from apc.runtime.eigen.loop import Coupling, Loop
+from apc.runtime.eigen.peer_group import PeerGroup, states_of
 from apc.runtime.frame.schedule import Act, Propagate, Send, Tick, Value
 from apc.runtime.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
+
+# The units of what moves.
+LENGTHS = ("m", "rad")
 
 # A linear form in the unknowns, sparse.
 Form = dict[int, Fraction]
@@ -80,7 +84,7 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     numbering = _Numbering(system.sites)
     still = _standing_solutions(system, exact, numbering)
     vectors = [_standing_state(system, exact, numbering, solution) for solution in still]
-    pairs = _drifts(system, exact, numbering, still) if still and with_drifts else []
+    pairs = [state for _, state in _drifts(system, exact, numbering, still)] if still and with_drifts else []
     n = len(system.names)
     return RigidModes(
         directions=_columns(vectors, n),
@@ -93,7 +97,87 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     )
 
 
-def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bool:
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What neither grows nor dies out: `translations` of what moves, `drifts` of that, and the rest.
+
+    `unfelt` are directions in which nothing moves: what a memory keeps that nothing reads, and what it adds
+    up. `names` says what these are of.
+    """
+
+    translations: int
+    drifts: int
+    unfelt: int
+    names: tuple[str, ...]
+
+
+def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Standing:
+    """Tell the rigid modes that move something from those that do not.
+
+    Something moves where a length or an angle does that changes between the ticks. What a memory that nothing
+    reads adds up while peers stand aside grows, too, and is no drift.
+
+    Parameters
+    ----------
+    system
+        The closed system.
+    with_drifts
+        Whether to look for drifts, which is most of the work.
+    """
+    exact = [group.exact for group in system.sites]
+    numbering = _Numbering(system.sites)
+    still = _standing_solutions(system, exact, numbering)
+    vectors = [_standing_state(system, exact, numbering, solution) for solution in still]
+    moving = _moving_places(system.sites, len(system.names))
+    basis: dict[int, list[Fraction]] = {}
+    unfelt = [left for vector in vectors if (left := _beyond(basis, vector, moving)) is not None]
+    rates: dict[int, list[Fraction]] = {}
+    for weights, state in _drifts(system, exact, numbering, still) if still and with_drifts else []:
+        rate = [sum(map(mul, weights, column), Fraction(0)) for column in zip(*vectors, strict=True)]
+        # Behind the rate, as one vector, what drifts at it: to be told apart by the rate alone.
+        left = _beyond(rates, [*rate, *state], moving)
+        if left is not None and (rest := _beyond(basis, left[len(rate) :], moving)) is not None:
+            unfelt.append(rest)
+    places = {place for vector in unfelt for place, entry in enumerate(vector) if entry}
+    return Standing(
+        translations=len(basis),
+        drifts=len(rates),
+        unfelt=len(unfelt),
+        names=tuple(dict.fromkeys(system.names[place].partition("(")[0] for place in sorted(places))),
+    )
+
+
+def _moving_places(sites: Sequence[PeerGroup], n: int) -> list[int]:
+    """Return where in the state the lengths and angles are that change between the ticks."""
+    found, start = [], 0
+    ends = [states_of(group.schedule, group.jacobians) for group in sites]
+    for group, size in zip(sites, ends, strict=True):
+        states = group.jacobians.kind.states
+        found += [start + place for place, state in enumerate(states) if state.unit in LENGTHS]
+        start += size
+    assert start == n
+    return found
+
+
+def _beyond(
+    basis: dict[int, list[Fraction]], vector: Sequence[Fraction], moving: Sequence[int]
+) -> list[Fraction] | None:
+    """Add what of a vector moves beyond a basis to it; return the vector less that where nothing does."""
+    left = list(vector)
+    for pivot, other in basis.items():
+        if left[pivot]:
+            times = left[pivot]
+            left = [entry - times * more for entry, more in zip(left, other, strict=True)]
+    place = next((place for place in moving if left[place]), None)
+    if place is None:
+        return left
+    basis[place] = [entry / left[place] for entry in left]
+    return None
+
+
+def stays_rigid(
+    system: ClosedSystem | Loop, others: Sequence[LinearSite], *, coupling: Coupling | None = None
+) -> bool:
     """Say whether the directions of a system's rigid modes are rigid with other matrices of its sites, too.
 
     Parameters
@@ -102,11 +186,14 @@ def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bo
         The closed system.
     others
         Matrices of each site, over rationals or quotients of polynomials: then for all values of these.
+    coupling
+        What the sites hear of each other then, where that is another, too.
     """
+    other = system if coupling is None else replace(system, coupling=coupling)
     numbering = _Numbering(system.sites)
     exact = [group.exact for group in system.sites]
     for solution in _standing_solutions(system, exact, numbering):
-        if any(_value(form, solution) for form in _standing(system, others, numbering)):
+        if any(_value(form, solution) for form in _standing(other, others, numbering)):
             return False
         moved = zip(
             _standing_state(system, others, numbering, solution),
@@ -375,8 +462,11 @@ def _drifts(
     exact: Sequence[LinearSite],
     number: _Numbering,
     still: Sequence[Sequence[Fraction]],
-) -> list[list[Fraction]]:
-    """Return the states at the start of a frame of the ramps on top of the standing solutions `still`."""
+) -> list[tuple[list[Fraction], list[Fraction]]]:
+    """Return the ramps on top of the standing solutions `still`.
+
+    Of each the weights of these in its rate, and the state at the start of a frame.
+    """
     ramp = _Ramp(system, exact, number, still)
     sent = [ramp.sends(g) for g in range(len(exact))]
     states = []
@@ -390,7 +480,7 @@ def _drifts(
                     now, growth = sent[g][0][packet.row], sent[g][1][packet.row]
                     before = _combine([(1, now), (-packet.lag * ramp.frame, growth)])
                     state.append(_value(before, solution))
-        states.append(state)
+        states.append((list(solution[: len(still)]), state))
     return states
 
 

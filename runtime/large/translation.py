@@ -14,14 +14,15 @@ every peer, modulo two primes.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.weights import sum_weights
+from apc.compiler.weights import exact_weight
 from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.modes import complete_loops
 from apc.runtime.eigen.peer_group import PeerGroup, states_of, used_ways
@@ -36,6 +37,7 @@ from apc.runtime.frame.site import LinearSite
 from apc.runtime.large.crowds import Crowd
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 
 def representatives(listed: Sequence[Crowd], exchange: Exchange) -> list[PeerGroup]:
@@ -117,10 +119,9 @@ def free_motions(listed: Sequence[Crowd], exchange: Exchange) -> FreeMotions | N
     those of one peer of each crowd, each hearing all. Motions that stand still whatever the weights of what
     is heard are those of single peers.
     """
-    loops = _standing_loops(listed, exchange)
-    if loops is None or not all(hold_for_all(loop, listed) for loop in loops):
+    together, apart = _standing_loops(listed, exchange)
+    if not hold_for_all(apart, listed) or not hold_for_all(together, listed, exchange=exchange):
         return None
-    together, apart = loops
     groups = together.sites
     ends = np.cumsum([0, *(states_of(group.schedule, group.jacobians) for group in groups)]).tolist()
     single = find_rigid_modes(apart, with_drifts=False).exact
@@ -146,7 +147,7 @@ def free_motions(listed: Sequence[Crowd], exchange: Exchange) -> FreeMotions | N
 
 
 def may_drift(listed: Sequence[Crowd], exchange: Exchange) -> bool:
-    """Say whether nothing brakes some motion of the first peers, alone or together; True if it can't be told.
+    """Say whether nothing brakes some motion of the first peers, alone or together.
 
     Parameters
     ----------
@@ -155,67 +156,79 @@ def may_drift(listed: Sequence[Crowd], exchange: Exchange) -> bool:
     exchange
         The links.
     """
-    loops = _standing_loops(listed, exchange)
-    return loops is None or any(find_rigid_modes(loop).drifts for loop in loops)
+    return any(find_rigid_modes(loop).drifts for loop in _standing_loops(listed, exchange))
 
 
-def _standing_loops(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Loop, Loop] | None:
+def _standing_loops(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Loop, Loop]:
     """Return the first peers of all crowds hearing as if all moved alike, and hearing anyhow."""
     groups = representatives(listed, exchange)
-    totals = _totals(listed, exchange)
-    if totals is None:
-        return None
     ways = used_ways(group.schedule for group in groups)
-    alike = {way: _alike(groups, exchange, way, totals) for way in ways}
-    anyhow = {way: _anyhow(groups, exchange, way, totals) for way in ways}
+    shares = {way: _shares(groups, exchange, way) for way in ways}
+    first = {way.link: _first_totals(listed, exchange, way.link) for way in ways if way.operator == "sum"}
+    alike = {
+        way: _weighed(rows, first[way.link]) if way.operator == "sum" else rows
+        for way, rows in shares.items()
+    }
+    # Weights that nothing about the scene explains, so that only what moves nobody else stands.
+    anyhow = {
+        way: tuple(
+            tuple(Fraction(-1, 3 + g * len(row) + h) if share else share for h, share in enumerate(row))
+            for g, row in enumerate(rows)
+        )
+        for way, rows in shares.items()
+    }
     return Loop("common", 1, tuple(groups), alike), Loop("own", 1, tuple(groups), anyhow)
 
 
-# What each crowd's peers hear in all over each link: the weights of their senders.
-Totals = Sequence[Mapping[str, Fraction]]
+def _shares(groups: Sequence[PeerGroup], exchange: Exchange, way: Way) -> tuple[tuple[Fraction, ...], ...]:
+    """Return what each crowd hears of each on a way, as if it heard as much of every crowd that it hears.
 
-
-def _alike(
-    groups: Sequence[PeerGroup], exchange: Exchange, way: Way, totals: Totals
-) -> tuple[tuple[Fraction, ...], ...]:
-    """Return what each crowd hears of each on a way, as if it heard as much of every crowd that it hears."""
+    In shares of all that it hears.
+    """
     sending = [one.sends(way.link) for one in groups]
     rows = []
     for g, group in enumerate(groups):
-        total = Fraction(1) if way.operator == "mean" else totals[g].get(way.link, Fraction(0))
         heard = exchange.hears(way.link, g, sending)
         late = [exchange.delay(way.link, one.role, group.role) == way.delay for one in groups]
-        shares = (total / len(heard) if h in heard and late[h] else Fraction(0) for h in range(len(groups)))
-        rows.append(tuple(shares))
+        rows.append(
+            tuple(
+                Fraction(1, len(heard)) if h in heard and late[h] else Fraction(0) for h in range(len(groups))
+            )
+        )
     return tuple(rows)
 
 
-def _anyhow(
-    groups: Sequence[PeerGroup], exchange: Exchange, way: Way, totals: Totals
+def _weighed(
+    rows: Sequence[Sequence[Fraction]], totals: Sequence[Fraction]
 ) -> tuple[tuple[Fraction, ...], ...]:
-    """Return weights that nothing about the scene explains, so that only what moves nobody else stands."""
-    alike = _alike(groups, exchange, way, totals)
-    n = len(groups)
-    return tuple(
-        tuple(Fraction(-1, 3 + g * n + h) if weight else weight for h, weight in enumerate(row))
-        for g, row in enumerate(alike)
-    )
+    """Return shares as parts of totals."""
+    return tuple(tuple(total * share for share in row) for row, total in zip(rows, totals, strict=True))
 
 
-def _totals(listed: Sequence[Crowd], exchange: Exchange) -> list[dict[str, Fraction]] | None:
-    """Return what all peers of each crowd hear over each link of a sum; None when they differ."""
-    found: list[dict[str, Fraction]] = [{} for _ in listed]
-    for link in {way.link for way in used_ways(one.schedule for one in listed) if way.operator == "sum"}:
-        pairs, weights = exchange.arcs(link)
-        sends = np.repeat([crowd.sends(link) for crowd in listed], [len(crowd.rows) for crowd in listed])
-        heard = sends[pairs[:, 0]]
-        sums = sum_weights(pairs[heard, 1], weights[heard], exchange.peers)
-        for crowd, totals in zip(listed, found, strict=True):
-            start = int(exchange.starts[crowd.group])
-            if not sums.alike(start, start + len(crowd.rows)):
-                return None
-            totals[link] = sums.of(start)
-    return found
+def _heard_arcs(listed: Sequence[Crowd], exchange: Exchange, link: str) -> tuple[Integers, Floats]:
+    """Return who hears something over a link, arc by arc, and the weights."""
+    pairs, weights = exchange.arcs(link)
+    sends = np.repeat([crowd.sends(link) for crowd in listed], [len(crowd.rows) for crowd in listed])
+    heard = sends[pairs[:, 0]]
+    return pairs[heard, 1], weights[heard]
+
+
+def _first_totals(listed: Sequence[Crowd], exchange: Exchange, link: str) -> list[Fraction]:
+    """Return what the first peer of each crowd hears over a link in all: the weights of its senders."""
+    receivers, weights = _heard_arcs(listed, exchange, link)
+    return [
+        sum(map(exact_weight, weights[receivers == exchange.starts[crowd.group]].tolist()), Fraction(0))
+        for crowd in listed
+    ]
+
+
+def _all_totals(listed: Sequence[Crowd], exchange: Exchange, link: str, prime: int) -> Integers:
+    """Return what each peer hears over a link in all, modulo a prime (N,)."""
+    receivers, weights = _heard_arcs(listed, exchange, link)
+    found = np.zeros(exchange.peers, np.int64)
+    exact = [exact_weight(weight) for weight in np.unique(weights).tolist()]
+    np.add.at(found, receivers, residues_of_rounded(weights, exact, prime).column)
+    return found % prime
 
 
 def _echelon(vectors: Sequence[Sequence[Fraction]]) -> dict[int, list[Fraction]]:
@@ -247,7 +260,7 @@ def _columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
     return np.array([[float(entry) for entry in one] for one in vectors], np.float64).reshape(-1, n).T
 
 
-def hold_for_all(loop: Loop, listed: Sequence[Crowd]) -> bool:
+def hold_for_all(loop: Loop, listed: Sequence[Crowd], *, exchange: Exchange | None = None) -> bool:
     """Say whether the rigid modes of a loop of representatives are those of every peer of their crowds.
 
     Parameters
@@ -256,26 +269,42 @@ def hold_for_all(loop: Loop, listed: Sequence[Crowd]) -> bool:
         Its sites are the representatives.
     listed
         The crowd of each site.
+    exchange
+        The links, where a sum over one is as large as what each peer hears itself; else all hear what their
+        representative does.
     """
+    sums = [way for way in loop.coupling if way.operator == "sum"]
+    shares = {way: _shares(loop.sites, exchange, way) for way in sums} if exchange else {}
     try:
         for prime in PRIMES:
+            links = dict.fromkeys(way.link for way in shares)
+            totals = [_all_totals(listed, exchange, link, prime) for link in links] if exchange else []
             for place, crowd in enumerate(listed):
+                # Its peers, each once that differ in their numbers or in what they hear.
+                first = int(exchange.starts[crowd.group]) if exchange else 0
+                own = [one[first : first + len(crowd.rows)] for one in totals]
+                rows, *heard = np.unique(np.stack([crowd.rows, *own]), axis=1)
+                total_of = {link: Residues(one, prime) for link, one in zip(links, heard, strict=True)}
                 sites = [group.exact for group in loop.sites]
-                sites[place] = _all_peers(crowd, prime)
-                if not stays_rigid(loop, sites):
+                sites[place] = _all_peers(crowd, rows, prime)
+                coupling: dict[Way, Any] = dict(loop.coupling)
+                for way, listed_shares in shares.items():
+                    weights = tuple(total_of[way.link] * share for share in listed_shares[place])
+                    coupling[way] = (*coupling[way][:place], weights, *coupling[way][place + 1 :])
+                if not stays_rigid(loop, sites, coupling=coupling):
                     return False
     except (TypeError, ValueError, ZeroDivisionError):  # an operation that is none of a field
         return False
     return True
 
 
-def _all_peers(crowd: Crowd, prime: int) -> LinearSite:
-    """Return the matrices of all different peers of a crowd, each entry a column modulo a prime."""
+def _all_peers(crowd: Crowd, rows: Integers, prime: int) -> LinearSite:
+    """Return the matrices of some of a crowd's different peers, each entry a column modulo a prime."""
     built = crowd.jacobians
-    columns = [residues_of(column, prime) for column in crowd.parameters.T]
+    columns = [residues_of(column, prime) for column in crowd.parameters[rows].T]
     for place, rationals in built.kind.rounded:
-        columns[place] = residues_of_rounded(crowd.parameters[:, place], rationals, prime)
-    zero = Residues(np.zeros(len(crowd.parameters), np.int64), prime)
+        columns[place] = residues_of_rounded(crowd.parameters[rows, place], rationals, prime)
+    zero = Residues(np.zeros(len(rows), np.int64), prime)
     arguments = [[zero] * built.function.numel_in(argument) for argument in range(4)]
 
     def number(value: float) -> Residues:

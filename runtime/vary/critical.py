@@ -44,7 +44,9 @@ class Critical:
     whether the equations are enclosed between the `looked` values that were looked at, so that only crossings
     nearer than `cell` to one another can hide. `enters` says whether
     anything that decides depends on the parameter: on a start value of a linear scene nothing does.
-    `left_out` says what of the scene the answer does not look at.
+    `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
+    (None where their peers differ) of a parameter that is set for all groups though they have not all the
+    same.
     """
 
     topology: str
@@ -63,6 +65,7 @@ class Critical:
     enters: bool
     verdict: str
     left_out: tuple[str, ...] = ()
+    groups: tuple[tuple[str, float | None], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer as plain data, ready for JSON."""
@@ -83,6 +86,7 @@ class Critical:
             "enters": self.enters,
             "verdict": self.verdict,
             "left_out": list(self.left_out),
+            "groups": dict(self.groups),
         }
 
     def __str__(self) -> str:
@@ -90,6 +94,13 @@ class Critical:
         low, high = (with_unit(f"{one:.6g}", self.unit) for one in self.scanned)
         present = with_unit(f"{self.present:.6g}", self.unit)
         lines = [f"{self.topology}: {self.parameter} is {present}"]
+        if self.groups:
+            own = [
+                f"{'several values' if value is None else with_unit(f'{value:.6g}', self.unit)} at {group}"
+                for group, value in self.groups
+            ]
+            lines = [f"{self.topology}: {self.parameter}, one value for all groups"]
+            lines += wrapped(f"now {', '.join(own)}", "  ", "    ")
         for note in self.left_out:
             lines += wrapped(note, "  ", "    ")
         lines.append("")
@@ -189,6 +200,19 @@ def critical(
         enters=found.enters,
         verdict="" if chosen else verdict,
         left_out=left_out(system, linear=linear),
+        groups=_by_group(system, known) if group is None else (),
+    )
+
+
+def _by_group(system: CompiledSystem, name: str) -> tuple[tuple[str, float | None], ...]:
+    """Return what each group has of a parameter, where not all have everybody's."""
+    several = {group.name for group in system.groups if name in {one.name for one in group.columns}}
+    own = {group.name for group in system.groups if name in {one.name for one in group.values}}
+    if not several | own:
+        return ()
+    return tuple(
+        (group.name, None if group.name in several else parameter_of(system, Free(name, group.name)).value)
+        for group in system.groups
     )
 
 
