@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from apc.compiler.errors import ApcError, Mistake, Place
 
 # What Python's math module and CasADi's Newton solver say of a point where a function has no value.
-_NO_VALUE = ("math domain error", "rootfinder", "Evaluation failed", "Newton")
+_NO_VALUE = ("math domain error", "rootfinder", "Evaluation failed", "Newton", "cannot convert NaN")
 
 
 @contextmanager

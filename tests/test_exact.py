@@ -73,3 +73,25 @@ def test_what_is_rounded_over_rationals_is_told() -> None:
     assert not is_rational(_function(lambda x: casadi.sqrt(x[0]) + x[1]))
     x = casadi.MX.sym("x", 2)
     assert not is_rational(casadi.Function("f", [x], [x * x]))
+
+
+def _squared(x: Any, times: int) -> Any:
+    return x if times == 0 else _squared(x * x, times - 1)
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda x: _squared(x[0], 40),
+        lambda x: _squared(casadi.floor(x[1]), 40),
+        lambda x: x[0] ** (10.0**9 * x[1]),
+    ],
+)
+def test_a_number_of_digits_without_end_is_no_number(build: Any) -> None:
+    with pytest.raises(OverflowError, match="a number of more than 1048576 bits"):
+        evaluate_exact(_function(build), [[Fraction(1, 3), Fraction(2)]])
+
+
+def test_one_to_any_power_is_one() -> None:
+    f = _function(lambda x: x[0] ** (10.0**9 * x[1]))
+    assert evaluate_exact(f, [[Fraction(-1), Fraction(2)]]) == [[Fraction(1)]]

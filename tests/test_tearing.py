@@ -55,7 +55,7 @@ def values(text: str, unknowns: str, **numbers: float) -> dict[str, float]:
     given = casadi.SX.sym("given", len(numbers))
     writer = _writer({symbol(name): given[place] for place, name in enumerate(numbers)}, definitions)
     written = writer.column(writer.write(symbol(name)) for name in unknowns.split())
-    function = writer.function("f", {"given": given}, "found", written, loops=True)
+    function = writer.function("f", {"given": given}, "found", written)
     found = np.asarray(function(list(numbers.values()))).ravel()
     return dict(zip(unknowns.split(), map(float, found), strict=True))
 
@@ -177,7 +177,7 @@ def test_the_derivative_of_a_loop_is_that_of_the_implicit_function() -> None:
     assert isinstance(block, ImplicitBlock)
     given, x = casadi.SX.sym("x"), casadi.MX.sym("x")
     writer = _writer({symbol("x"): given}, {symbol("y"): block})
-    function = writer.function("f", {"x": given}, "y", writer.write(symbol("y")), loops=True)
+    function = writer.function("f", {"x": given}, "y", writer.write(symbol("y")))
     slope = casadi.Function("slope", [x], [casadi.jacobian(function(x), x)])
     assert float(slope(10.0)) == pytest.approx(1 / (1 + 3 * 4.0), rel=1e-12)
     assert Name(("y",)) == parse_equation("y = 1", PLACE).left
@@ -195,12 +195,28 @@ def test_a_kind_with_a_loop_is_linearized_through_it() -> None:
         (State("x", "m", "x"),),
         (),
         ("x",),
-        writer.function("derivative", inputs, "dx", -y, loops=True),
+        writer.function("derivative", inputs, "dx", -y),
         (),
-        (SendPartition("lan", ("y",), ("m",), writer.function("send", inputs, "s", y, loops=True)),),
+        (SendPartition("lan", ("y",), ("m",), writer.function("send", inputs, "s", y)),),
     )
     built = jacobians(kind)
     site = linearize(built, np.array([10.0]))
     assert not built.affine
     assert site.a[0, 0] == pytest.approx(-1 / 13, rel=1e-12)
     assert site.sends[0].x[0, 0] == pytest.approx(1 / 13, rel=1e-12)
+
+
+def test_only_what_needs_a_loop_solves_it() -> None:
+    [block], _ = solve("y + y^3 = x", "y")
+    x = casadi.SX.sym("x")
+    writer = _writer({symbol("x"): x}, {symbol("y"): block})
+    y = writer.write(symbol("y"))
+    assert writer.function("f", {"x": x}, "y", 2 * x).is_a("SXFunction")
+    assert writer.function("f", {"x": x}, "y", 2 * y).is_a("MXFunction")
+
+
+def test_a_loop_that_needs_another_is_solved_after_it() -> None:
+    found = values("y + y^3 = x\nz + z^5 = 2*y\nw = z - y", "y z w", x=10.0)
+    assert found["y"] == pytest.approx(2.0, abs=1e-12)
+    assert found["z"] + found["z"] ** 5 == pytest.approx(4.0, abs=1e-12)
+    assert found["w"] == found["z"] - found["y"]

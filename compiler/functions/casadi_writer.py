@@ -88,21 +88,21 @@ class Writer:
         more.torn = list(self.torn)
         return more
 
-    def function(self, name: str, inputs: Mapping[str, Any], output: str, value: Any, *, loops: bool) -> Any:
+    def function(self, name: str, inputs: Mapping[str, Any], output: str, value: Any) -> Any:
         """Return the CasADi function of some columns that gives a value written in them.
 
-        An SX function, unless it is one of a kind with `loops`: then an MX function that calls SX functions,
-        with Newton's iteration for each loop that the value needs.
+        An SX function, unless the value needs a loop: then an MX function that calls SX functions, with
+        Newton's iteration for each loop.
         """
         words, columns = list(inputs), list(inputs.values())
-        if not loops:
-            return casadi.Function(name, columns, [value], words, [output])
         needed: list[_Torn] = []
         wanted = value
         for one in reversed(self.torn):
             if casadi.depends_on(wanted, one.z):
                 needed.insert(0, one)
                 wanted = casadi.vertcat(wanted, one.begin, one.q)
+        if not needed:
+            return casadi.Function(name, columns, [value], words, [output])
         solved = []
         for place, one in enumerate(needed):
             found = [before.z for before in needed[:place]]

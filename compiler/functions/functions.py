@@ -2,8 +2,8 @@
 
 Takes: `SortedSystem`. Gives: `CompiledSystem`.
 Guarantees: a kind's functions hold only what its states, its samples and what it sends depend on; what the
-scene named but nothing reads is listed in `dropped`. They are SX functions, unless the kind has a nonlinear
-loop: then they are MX functions that call SX functions, with a Newton solver for each loop between them.
+scene named but nothing reads is listed in `dropped`. One is an SX function, unless it needs a nonlinear loop:
+then it is an MX function that calls SX functions, with a Newton solver for each loop between them.
 Does not: write files, or put numbers in the place of parameters.
 """
 
@@ -214,7 +214,7 @@ class _KindBuilder:
     ) -> Any:
         """Return a function of what all take and, between the held values and the parameters, of more."""
         columns = {"x": inputs.x, "u": inputs.u, **(between or {}), "p": inputs.p, "t": inputs.t}
-        return writer.function(name, columns, output, value, loops=bool(self.reached.loops))
+        return writer.function(name, columns, output, value)
 
     def _unit(self, name: str) -> str:
         variable = next(v for v in self.kind.clocked.flat.variables if v.name == name)

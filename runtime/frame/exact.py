@@ -20,6 +20,8 @@ import casadi
 # Functions whose instructions are kept: an analysis walks the same few of a scene's kinds many times, and to
 # ask CasADi for them takes longer than the arithmetic.
 KEPT = 16
+# Of a numerator or denominator: what a thousand factors of 53 bits, each divided by as many, stay well below.
+BITS = 2**20
 
 _UNARY: dict[int, Callable[[Any], Any]] = {
     casadi.OP_ASSIGN: lambda a: a,
@@ -96,6 +98,8 @@ def evaluate_exact(
     ------
     ValueError
         The function holds an operation this walk does not know.
+    OverflowError
+        A rational number takes more than BITS bits.
     """
     work: list[Any] = [None] * function.sz_w()
     results: list[list[Any]] = [[number(0.0)] * function.nnz_out(i) for i in range(function.n_out())]
@@ -115,13 +119,13 @@ def evaluate_exact(
         elif code in own:
             work[outputs[0]] = own[code](*(work[place] for place in inputs))
         elif code == casadi.OP_DIV:
-            work[outputs[0]] = _quotient(work[inputs[0]], work[inputs[1]])
+            work[outputs[0]] = _short(_quotient(work[inputs[0]], work[inputs[1]]))
         elif code in (casadi.OP_POW, casadi.OP_CONSTPOW):
             work[outputs[0]] = _power(work[inputs[0]], work[inputs[1]], number)
         elif code in _UNARY:
-            work[outputs[0]] = _UNARY[code](work[inputs[0]])
+            work[outputs[0]] = _short(_UNARY[code](work[inputs[0]]))
         elif code in _BINARY:
-            work[outputs[0]] = _BINARY[code](work[inputs[0]], work[inputs[1]])
+            work[outputs[0]] = _short(_BINARY[code](work[inputs[0]], work[inputs[1]]))
         elif code in _ROUNDED:
             work[outputs[0]] = transcendental(code, work[inputs[0]])
         else:
@@ -165,9 +169,24 @@ def _quotient(above: Any, below: Any) -> Any:
     return Fraction(above, below) if isinstance(above, int) and isinstance(below, int) else above / below
 
 
+def _short(value: Any) -> Any:
+    """Return a value, unless it is a rational number of digits without end: a square squared and so on."""
+    if _bits(value) > BITS:
+        raise OverflowError(f"a number of more than {BITS} bits")
+    return value
+
+
+def _bits(value: Any) -> int:
+    if not isinstance(value, int | Fraction):
+        return 0
+    return max(value.numerator.bit_length(), value.denominator.bit_length())
+
+
 def _power(base: Any, exponent: Any, number: Callable[[float], Any]) -> Any:
     """Return base**exponent, exactly when the exponent is whole."""
     if exponent == int(exponent):
+        if _bits(base) * abs(int(exponent)) > BITS and abs(base) != 1:
+            raise OverflowError(f"a number of more than {BITS} bits")
         return base ** int(exponent)
     if base < 0:
         raise ValueError("math domain error")  # as of math.sqrt; Python's own power is complex

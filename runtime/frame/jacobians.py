@@ -81,8 +81,8 @@ def jacobians(kind: Kind) -> SiteJacobians:
         E807 a nonlinear loop in a kind that also looks at each sender by itself.
     """
     _refuse_loop_with_edges(kind)
-    # A kind with a nonlinear loop has MX functions; their Jacobians come by the implicit function theorem.
-    plain = kind.derivative.is_a("SXFunction")
+    # What needs a nonlinear loop is an MX function; its Jacobian comes by the implicit function theorem.
+    plain = all(function.is_a("SXFunction") for function in _functions(kind))
     symbol: Any = casadi.SX.sym if plain else casadi.MX.sym
     x, u = symbol("x", len(kind.states)), symbol("u", len(kind.holds))
     p, t = symbol("p", len(kind.parameters)), symbol("t")
@@ -154,12 +154,16 @@ def _depends(expression: Any, symbols: Any) -> bool:
     return bool(expression.numel() and casadi.depends_on(expression, symbols))
 
 
+def _functions(kind: Kind) -> list[Any]:
+    """Return the functions that a linearization is of, but for edges."""
+    return [kind.derivative, *(one.tick for one in kind.clocks), *(one.send for one in kind.sends)]
+
+
 def _refuse_loop_with_edges(kind: Kind) -> None:
     """Refuse what neither the scalar walk nor the implicit function theorem covers yet."""
-    functions = [kind.derivative, *(one.tick for one in kind.clocks), *(one.send for one in kind.sends)]
     receives = [receive for partition in kind.clocks for receive in partition.receives]
     edges = [receive.edge for receive in receives if receive.edge is not None]
-    if edges and not all(function.is_a("SXFunction") for function in (*functions, *edges)):
+    if edges and not all(function.is_a("SXFunction") for function in (*_functions(kind), *edges)):
         what = (
             "has a nonlinear loop and a reduction that looks at each sender by itself; "
             "together they can't be linearized"

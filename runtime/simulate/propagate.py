@@ -96,6 +96,9 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
         still[row] = at_rest[row]
     kept = casadi.diag(casadi.DM([float(row in rest) for row in range(n_x)]))
     slopes = casadi.sparsify(kept) @ slopes
+    if type_ is casadi.MX:  # the same wherever they are taken, but a loop's solution is of somewhere
+        at = casadi.Function("slopes", [moving, p, t], [slopes])
+        slopes = at(type_.zeros(moving.numel()), p, 0)
     timed = bool(still.numel() and casadi.depends_on(still, t))
     constant = type_.zeros(*still.shape) if timed else still
     structure = structural_pattern(slopes)

@@ -156,6 +156,8 @@ class PointEvaluator:
         for system in systems:
             free = find_rigid_modes(system, with_drifts=False)
             reduced = _reduced(system, free)
+            if not np.isfinite(reduced[0]).all():
+                return NOTHING
             if free.names and np.abs(np.linalg.eigvals(reduced[0]) - 1).min(initial=np.inf) < DRIFT:
                 reduced = _reduced(system, find_rigid_modes(system))
             found.append(reduced)

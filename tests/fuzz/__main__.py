@@ -11,13 +11,15 @@ import time
 from pathlib import Path
 
 from tests.fuzz.inputs import SORTS
-from tests.fuzz.running import once, run_all, shrunk
+from tests.fuzz.models import FILE, forge
+from tests.fuzz.running import once, run_all, run_models, shrunk
 
 
 def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=2000, help="how many hostile inputs (default 2000)")
+    parser.add_argument("--models", type=int, default=0, help="how many forged compiled models")
     parser.add_argument("--scenes", type=int, default=0, help="how many valid scenes against brute force")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start", type=int, default=0, help="the first input of the seed to run")
@@ -48,12 +50,30 @@ def main() -> int:
         (folder / "told.txt").write_text(text, encoding="utf-8")
         print(f"\n{folder}: {text}")
     wrong = bool(failures)
+    if options.models:
+        wrong |= _forged(options.models, options.seed, options.out)
     if options.scenes:
         from tests.test_properties import check_scenes
 
         check_scenes(options.scenes)
         print(f"{options.scenes} scenes agree with brute force")
     return int(wrong)
+
+
+def _forged(count: int, seed: int, out: Path) -> bool:
+    """Run forged models, tell what came of them, and return whether anything was wrong."""
+    failures, outcomes = run_models(count, seed)
+    for outcome, number in sorted(outcomes.items()):
+        print(f"{number:8d}  model: {outcome}")
+    print(f"{count} forged models")
+    for number, (key, (index, told)) in enumerate(failures.items(), start=1):
+        folder = out / f"model-{number:02d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / FILE).write_bytes(forge(f"{seed}/{index}").content)
+        text = f"{key}\nseed {seed}, model {index}\n\n{told}\n"
+        (folder / "told.txt").write_text(text, encoding="utf-8")
+        print(f"\n{folder}: {text}")
+    return bool(failures)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""Runs inputs through the compiler under a watchdog, and says what is wrong with what came out.
+"""Runs inputs through the compiler and forged models through the program, under a watchdog.
 
-Takes: inputs. Gives: `Failure`, `run_all`, `shrunk`.
+Takes: inputs, forged models. Gives: `Failure`, `run_all`, `run_models`, `shrunk`.
 Guarantees: one input can't bring the run down, whether it crashes, hangs or eats memory.
 Does not: make inputs.
 
 An input may compile, or be refused with `ApcError` whose mistakes each have a code, a sentence of one line
-and a place that exists, in the order of the file, none twice. Anything else is a failure.
+and a place that exists, in the order of the file, none twice. A forged model may be refused as damaged, or
+what is asked of it answered or refused. Anything else is a failure, and is told.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,10 +32,13 @@ from apc.compiler import pipeline
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.pipeline import run_stages
+from tests.fuzz import models
 from tests.fuzz.inputs import MODELS, PLAYED, SENTINEL, TOPOLOGY, Input, make_input
 
-SECONDS = 5.0  # the longest an input may take to compile
+SECONDS = 5.0  # of processor time, the longest an input may take to compile
 PLAYED_SECONDS = 10.0  # and to compile, check itself, be analysed and simulated
+QUESTIONS = 60.0  # the same for all that is asked of a forged model
+PATIENCE = 300.0  # seconds until a process that says nothing is taken to hang, on however busy a machine
 MEMORY = 1 << 30  # bytes an input may ask for beyond what is in use
 BATCH = 4000  # inputs a process runs before a fresh one takes over
 LONGEST_SENTENCE = 2000
@@ -43,8 +47,9 @@ WHOLE_FILE = re.compile(
 )  # mistakes about a file or scene as a whole may have no line
 
 # What no input may cause; events of Python's own audit hooks.
-_FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "os.remove",
-            "os.rename", "os.mkdir", "shutil.rmtree", "exec", "compile")  # fmt: skip
+_FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect",
+            "os.remove", "os.rename", "os.mkdir", "shutil.rmtree", "ctypes.dlopen", "exec",
+            "compile")  # fmt: skip
 
 _MODULE = re.compile(r'<code object <module> .*\.py", line 1>')  # what runs when a module is loaded
 
@@ -148,6 +153,47 @@ def _worker(seed: int, start: int, stop: int, sort: str | None) -> Iterator[tupl
     return _watched(work, start, stop)
 
 
+def run_models(count: int, seed: int) -> tuple[dict[str, tuple[int, str]], Counter[str]]:
+    """Run forged models number 0 to `count` of a seed.
+
+    Returns
+    -------
+    failures
+        Of each cause, the number of the first and what is told of it.
+    outcomes
+        How many models of each sort came to what.
+    """
+    with tempfile.TemporaryDirectory() as name:  # load everything once
+        for document, members in models.bases():
+            path = Path(name) / models.FILE
+            path.write_bytes(models.packed(document, members))
+            assert models.ask(path, everything=True) == "answered"
+    failures: dict[str, tuple[int, str]] = {}
+    outcomes: Counter[str] = Counter()
+
+    following = 0
+
+    def work(tell: Callable[[int, str, str], None]) -> None:
+        for index in range(following, count):
+            forged = models.forge(f"{seed}/{index}")
+            key, told = _traced(((models.FILE, forged.content),), _asked, QUESTIONS)
+            tell(index, key, told or forged.sort)
+
+    while following < count:
+        for index, key, told in _watched(work, following, count):
+            following = index + 1
+            if key in ("answered", "refused"):
+                outcomes[f"{told}: {key}"] += 1
+            else:
+                outcomes[f"{models.forge(f'{seed}/{index}').sort}: FAILED"] += 1
+                failures.setdefault(key, (index, told))
+    return failures, outcomes
+
+
+def _asked() -> tuple[str, str]:
+    return models.ask(Path(models.FILE)), ""
+
+
 def once(given: Input) -> tuple[str, str]:
     """Return the outcome and text of one input, run in a process of its own."""
     [(_, key, told)] = list(_watched(lambda tell: tell(0, *_judged(given)), 0, 1))
@@ -164,14 +210,13 @@ def _watched(
         _become_worker(work, write)
     os.close(write)
     following, rest = start, b""
-    limit = PLAYED_SECONDS + 3  # the worker measures itself; this is for what never comes back
     killed = ""
     with os.fdopen(read, "rb", buffering=0) as stream:
         while following < stop:
-            ready, _, _ = select.select([stream], [], [], limit)
+            ready, _, _ = select.select([stream], [], [], PATIENCE)
             data = stream.read(1 << 16) if ready else b""
             if not data:
-                killed = "" if ready else f"takes more than {PLAYED_SECONDS:g} s"
+                killed = "" if ready else "takes for ever"
                 break
             *lines, rest = (rest + data).split(b"\0")
             for line in lines:
@@ -228,40 +273,51 @@ def _listen(event: str, arguments: tuple[object, ...]) -> None:
 
 def _judged(given: Input) -> tuple[str, str]:
     """Run one input in this process: "compiled", "refused", or the key and text of what is wrong."""
+
+    def run() -> tuple[str, str]:
+        global _listening
+        try:
+            run_stages(Path(TOPOLOGY), until="compiled")
+            _listening = False
+            if given.sort == PLAYED:
+                _play()
+        except ApcError as error:
+            return _fault_of(error, dict(given.files)) or ("refused", "")
+        return "compiled", ""
+
+    return _traced(given.files, run, PLAYED_SECONDS if given.sort == PLAYED else SECONDS)
+
+
+def _traced(
+    files: Sequence[tuple[str, bytes]], run: Callable[[], tuple[str, str]], seconds: float = SECONDS
+) -> tuple[str, str]:
+    """Return what `run` gives in a folder of some files, or the key and text of what it does wrong."""
     global _listening
     with tempfile.TemporaryDirectory(prefix="apc-fuzz-", dir=_memory_folder()) as name:
         folder = Path(name)
-        for file, data in given.files:
+        for file, data in files:
             (folder / file).parent.mkdir(exist_ok=True)
             (folder / file).write_bytes(data)
         before = Path.cwd()
         os.chdir(folder)
         _foreign.clear()
-        started = time.monotonic()
-        signal.signal(signal.SIGALRM, _too_long)
-        longest = PLAYED_SECONDS if given.sort == PLAYED else SECONDS
-        signal.setitimer(signal.ITIMER_REAL, longest)
+        started = time.process_time()
+        signal.signal(signal.SIGPROF, _too_long)
+        signal.setitimer(signal.ITIMER_PROF, seconds)
         try:
             _listening = True
             try:
-                run_stages(Path(TOPOLOGY), until="compiled")
-                outcome = "compiled", ""
-                _listening = False
-                if given.sort == PLAYED:
-                    _play()
+                outcome = run()
             finally:
                 _listening = False
-                signal.setitimer(signal.ITIMER_REAL, 0)
-                took = time.monotonic() - started
-        except ApcError as error:
-            fault = _fault_of(error, dict(given.files))
-            outcome = fault or ("refused", "")
+                signal.setitimer(signal.ITIMER_PROF, 0)
+                took = time.process_time() - started
         except BaseException as error:  # whatever it is, it is what we are looking for
             outcome = _key_of(error), "".join(traceback.format_exception(error, limit=-12))[-4000:]
         finally:
             os.chdir(before)
-        if took > longest and not outcome[0].startswith("takes"):
-            outcome = f"takes more than {longest:g} s", f"{took:.1f} s"
+        if took > seconds and not outcome[0].startswith("takes"):
+            outcome = f"takes more than {seconds:g} s", f"{took:.1f} s"
         if (folder / SENTINEL).exists() or _foreign:
             outcome = (
                 f"does what it may not: {_foreign[0].split()[0] if _foreign else SENTINEL}",

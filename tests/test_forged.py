@@ -1,0 +1,244 @@
+"""A compiled model from somebody else is data: opening it runs nothing, and it stands for no topology."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from apc.__main__ import run
+from apc.compiler import cache, seal, store
+from apc.compiler.cache import MEMBER, SEAL
+from tests.fuzz.models import packed, zipped
+from tests.topologies import AVERAGE, ROOT, compiled, replaced, told
+
+MODEL = Path("scene.apc")
+BY_NAME = ("analyze", "critical contact.stiffness", "simulate --duration 20ms --no-jit", "region")
+BESIDE = ("analyze", "simulate --duration 20ms --no-jit", "compile")
+# Any command that a file names leaves this behind.
+PWNED = "PWNED"
+JIT = {"jit": True, "compiler": "shell", "jit_options": {"compiler": f"echo > {PWNED}; cc", "verbose": False}}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "cache")
+    return tmp_path
+
+
+def opened() -> tuple[Any, dict[str, bytes]]:
+    """Return the document and the arrays of the model."""
+    with zipfile.ZipFile(MODEL) as archive:
+        document = json.loads(archive.read(MEMBER))
+        return document, {name: archive.read(name) for name in document["members"]}
+
+
+def sealing() -> bytes:
+    with zipfile.ZipFile(MODEL) as archive:
+        return archive.read(SEAL)
+
+
+# ---- code in a file ----
+
+
+@pytest.fixture(scope="module")
+def serialized(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a function in CasADi's serialization that calls a command when CasADi reads it."""
+    if shutil.which("cc") is None:
+        pytest.skip("there is no C compiler, without which CasADi makes no such function")
+    where = tmp_path_factory.mktemp("made")
+    make = (
+        "import casadi, sys\n"
+        "x, u, p, t = (casadi.SX.sym(*one) for one in (('x', 4), ('u', 2), ('p', 9), ('t', 1)))\n"
+        f"f = casadi.Function('derivative', [x, u, p, t], [-x], ['x', 'u', 'p', 't'], ['dx'], {JIT!r})\n"
+        "open('function', 'w').write(f.serialize())\n"
+    )
+    subprocess.run([sys.executable, "-c", make], cwd=where, check=True, capture_output=True)
+    (where / PWNED).unlink()
+    read = "import casadi\ncasadi.Function.deserialize(open('function').read())"
+    subprocess.run([sys.executable, "-c", read], cwd=where, check=True, capture_output=True)
+    assert (where / PWNED).exists(), "the attack is none"
+    return (where / "function").read_text(encoding="utf-8")
+
+
+def attacks(text: str) -> list[Callable[[Any, dict[str, bytes]], None]]:
+    """Return ways to have a function of CasADi's read: what each does to a document and its members."""
+
+    def of_the_old_format(document: Any, members: dict[str, bytes]) -> None:
+        document["format"] = 5
+        in_a_member(document, members)
+
+    def in_a_member(document: Any, members: dict[str, bytes]) -> None:
+        members["function0.casadi"] = text.encode()
+        document["system"]["kinds"][0]["derivative"] = "function0.casadi"
+
+    def in_place_of_a_function(document: Any, members: dict[str, bytes]) -> None:
+        document["system"]["kinds"][0]["derivative"] = text
+
+    def as_a_name(document: Any, members: dict[str, bytes]) -> None:
+        document["system"]["kinds"][0]["derivative"]["name"] = text
+
+    def as_an_operation(document: Any, members: dict[str, bytes]) -> None:
+        document["system"]["kinds"][0]["derivative"]["operations"][0][0] = "call"
+
+    def with_options(document: Any, members: dict[str, bytes]) -> None:
+        document["system"]["kinds"][0]["derivative"]["options"] = JIT
+        document["system"]["kinds"][0]["derivative"]["loops"] = [[JIT, JIT]]
+
+    def as_a_library(document: Any, members: dict[str, bytes]) -> None:
+        document["system"]["kinds"][0]["derivative"] = {"external": f"./{PWNED}.so", **JIT}
+
+    return [
+        of_the_old_format,
+        in_a_member,
+        in_place_of_a_function,
+        as_a_name,
+        as_an_operation,
+        with_options,
+        as_a_library,
+    ]
+
+
+@pytest.mark.parametrize("which", range(7))
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_function_that_calls_a_command_is_never_read(
+    which: int, beside: bool, serialized: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    store.save(compiled(AVERAGE), MODEL)
+    document, members = opened()
+    attacks(serialized)[which](document, members)
+    MODEL.write_bytes(packed(document, members))
+    if not beside:
+        Path("scene.yaml").unlink()
+    for command in BESIDE if beside else BY_NAME:
+        words = [*command.split(), "scene.yaml" if beside else "scene.apc"]
+        assert run(words) == (0 if beside else 1)
+        error = capsys.readouterr().err
+        assert beside or "scene.apc: E604 is damaged" in error or "scene.apc: E603 has format" in error
+        assert not list(Path().rglob(f"{PWNED}*"))
+
+
+def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
+    """Each is opened and asked in a process that notes commands, libraries, sockets and files written."""
+    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "0", "--models", "300", "--seed", "7"]
+    ran = subprocess.run(
+        [*command, "--out", str(Path.cwd() / "failures")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "300 forged models" in ran.stdout
+
+
+# ---- what stands for a topology ----
+
+
+def forged_seal(document: Any, members: dict[str, bytes]) -> dict[str, bytes]:
+    """Return the seal that the file had."""
+    return {SEAL: sealing()}
+
+
+def no_seal(document: Any, members: dict[str, bytes]) -> dict[str, bytes]:
+    return {}
+
+
+def digest_for_a_seal(document: Any, members: dict[str, bytes]) -> dict[str, bytes]:
+    return {SEAL: hashlib.sha256(json.dumps(document).encode()).hexdigest().encode()}
+
+
+@pytest.mark.parametrize("sealed", [forged_seal, no_seal, digest_for_a_seal])
+def test_what_a_topology_says_is_never_taken_from_a_model_somebody_else_wrote(
+    sealed: Callable[[Any, dict[str, bytes]], dict[str, bytes]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["compile", "scene.yaml"]) == 0
+    honest = MODEL.read_bytes()
+    assert run(["analyze", "scene.yaml", "--json"]) == 0
+    verdict = capsys.readouterr().out.partition("{")[2]
+    document, members = opened()
+    [stiffness] = [one for one in document["system"]["parameters"] if one["name"] == "contact.stiffness"]
+    stiffness |= {"value": 9000.0, "exact": "9000"}
+    mark = sealed(document, members)
+    MODEL.write_bytes(zipped({MEMBER: json.dumps(document).encode(), **members, **mark}))
+    assert run(["analyze", "scene.apc", "--json"]) == 0  # what the file says, as it is asked by its name
+    assert capsys.readouterr().out.partition("{")[2] != verdict
+    assert run(["analyze", "scene.yaml", "--json"]) == 0
+    assert capsys.readouterr().out.partition("{")[2] == verdict
+    assert run(["compile", "scene.yaml"]) == 0
+    assert "unchanged" not in capsys.readouterr().out
+    assert MODEL.read_bytes() == honest
+
+
+def test_a_model_of_another_user_is_compiled_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["compile"]) == 0
+    assert run(["compile"]) == 0
+    assert "unchanged" in capsys.readouterr().out
+    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "other")
+    assert run(["compile"]) == 0
+    assert "unchanged" not in capsys.readouterr().out
+
+
+def test_without_a_folder_of_ones_own_everything_is_compiled_and_works(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "file" / "cache")
+    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    for _ in range(2):
+        assert run(["compile"]) == 0
+        assert "unchanged" not in capsys.readouterr().out
+    assert run(["analyze", "scene.apc"]) == 0
+
+
+# ---- size ----
+
+
+def damage(**members: bytes) -> str:
+    MODEL.write_bytes(zipped({MEMBER: b"{}", **members}))
+    return told(store.load, MODEL)[0]
+
+
+@pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_file_that_is_packed_otherwise_is_refused_before_it_is_unpacked(kind: int) -> None:
+    MODEL.write_bytes(zipped({MEMBER: b"{}" * 10}, kind=kind))
+    assert "E604 is damaged: it is not what apc compile writes" in told(store.load, MODEL)[0]
+
+
+@pytest.mark.parametrize("piece", [b"[],", b"{},", b"0,", b"[[["])
+def test_a_document_of_more_values_than_a_model_has_is_refused_before_it_is_read(
+    piece: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(json, "loads", lambda text: pytest.fail("it is read"))
+    MODEL.write_bytes(zipped({MEMBER: b"[" + piece * cache.MOST_VALUES + b"0]"}))
+    assert MODEL.stat().st_size < 10**6
+    assert f"E604 is damaged: it holds more than {cache.MOST_VALUES} values" in told(store.load, MODEL)[0]
+
+
+def test_a_function_larger_than_its_model_is_refused_before_it_is_built() -> None:
+    store.save(compiled(AVERAGE), MODEL)
+    document, members = opened()
+    document["system"]["kinds"][0]["derivative"]["inputs"][0][1] = 10**12
+    MODEL.write_bytes(packed(document, members))
+    assert "E604 is damaged" in told(store.load, MODEL)[0]
+
+
+def test_an_honest_model_packed_anew_is_read() -> None:
+    """What the tests above change is what is refused, not how they write it."""
+    store.save(compiled(replaced(AVERAGE, ("count: 3", "count: 4"))), MODEL)
+    MODEL.write_bytes(packed(*opened()))
+    assert store.load(MODEL).peers == 4
