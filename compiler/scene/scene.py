@@ -17,8 +17,9 @@ from pathlib import Path
 
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Settable
-from apc.compiler.components.library import Library
+from apc.compiler.components.library import SUFFIX, Library
 from apc.compiler.errors import Mistakes, Place
+from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.values import (
     Value,
 )
@@ -115,10 +116,19 @@ def library_folders(source: Source) -> tuple[Path, ...]:
         text = read_text(item, "library", mistakes, hint="library: ./parts")
         if text is not None:
             folder = _folder_of(source) / text
-            if _is_folder(folder):
-                found.append(folder)
+            try:
+                if not _is_folder(folder):
+                    raise RefusedError("missing", "does not exist")
+                files_below(folder, SUFFIX)
+            except RefusedError as refused:
+                mistakes.add(
+                    "E214",
+                    item.place,
+                    f"the library folder {brief(text)} {refused.words}",
+                    hint="library: ./parts" if refused.why == "large" else "",
+                )
             else:
-                mistakes.add("E214", item.place, f"the library folder {brief(text)} does not exist")
+                found.append(folder)
     mistakes.raise_if_any()
     return tuple(found)
 

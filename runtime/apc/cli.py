@@ -22,6 +22,7 @@ from apc.cli_region import region_command
 from apc.cli_simulate import simulate_command
 from apc.cli_sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import write_file
 from apc.compiler.words import counted
 from apc.runtime.threads import start_single_threaded
 
@@ -243,10 +244,8 @@ def _print_or_write(text: str, out: Path | None) -> None:
     if out is None:
         click.echo(text)
         return
-    from apc.compiler.store import write_atomically
-
     def write(temporary: Path) -> None:
         temporary.write_bytes(f"{text}\n".encode())
 
-    write_atomically(out, write)
+    write_file(out, write)
     click.echo(f"{out} is written")

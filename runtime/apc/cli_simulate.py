@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import click
 
 from apc.compiler.errors import ApcError
+from apc.compiler.files import partial_name
 from apc.options import json_option, print_document, print_result, set_option
 from apc.progress import progress_bar
 
@@ -196,18 +197,20 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
     keeper = Keeper(simulation) if kept.plot is not None else None
     comparison = compare_with(simulation, signals=kept.signals) if kept.error else None
     sinks = [sink for sink in (keeper, comparison) if sink is not None]
-    summary, interrupted = _play_into(simulation, kept.out, sinks)
+    summary, interrupted, out = _play_into(simulation, kept.out, sinks)
     estimate = comparison.estimate() if comparison is not None else None
-    if kept.plot is not None and keeper is not None:
+    plot = kept.plot
+    if plot is not None and keeper is not None:
         from apc.runtime.simulate.figures import save
 
-        save(trajectory_of(simulation, keeper, summary, interrupted), kept.plot)
+        plot = partial_name(plot) if interrupted else plot
+        save(trajectory_of(simulation, keeper, summary, interrupted), plot)
     provenance = provenance_of(simulation)
     if as_json:
         print_document(result_document(system.name, summary, provenance, interrupted, estimate))
     else:
         click.echo(result_text(system.name, summary, provenance, estimate))
-        for written in (kept.out, kept.plot, kept.still):
+        for written in (out, plot, kept.still):
             if written is not None:
                 click.echo(f"  {written} is written")
     if interrupted:
@@ -216,8 +219,13 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
         raise click.Abort
 
 
-def _play_into(simulation: Simulation, out: Path | None, sinks: Sequence[Sink]) -> tuple[Summary, bool]:
-    """Play a simulation into sinks and a file; what was done is in the file even if the run can't go on."""
+def _play_into(
+    simulation: Simulation, out: Path | None, sinks: Sequence[Sink]
+) -> tuple[Summary, bool, Path | None]:
+    """Play a simulation into sinks and a file, whose name is returned with what `play` returns.
+
+    What was done is in the file even if the run can't go on.
+    """
     from apc.runtime.simulate.length import size_note
     from apc.runtime.simulate.recording import open_recording
     from apc.runtime.simulate.trajectory import play
@@ -229,15 +237,17 @@ def _play_into(simulation: Simulation, out: Path | None, sinks: Sequence[Sink]) 
     try:
         with progress_bar("simulate", "s") as show:
             every = sinks if recording is None else [recording, *sinks]
-            found = play(simulation, every, progress=lambda done: show(done, total))
+            summary, interrupted = play(simulation, every, progress=lambda done: show(done, total))
         if recording is not None:
-            recording.close()
+            recording.close(partial=interrupted)
     except ApcError:  # the run can't go on: what was done is kept
         if recording is not None:
-            recording.close()
+            recording.close(partial=True)
+            if recording.path != out:
+                click.echo(f"{recording.path} holds what was done; {out} is as it was", err=True)
         raise
     except BaseException:
         if recording is not None:
             recording.discard()
         raise
-    return found
+    return summary, interrupted, recording.path if recording is not None else None

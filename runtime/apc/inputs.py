@@ -8,13 +8,15 @@ Does not: compile.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.cache import Record, changed, read_record
+from apc.compiler.cache import LARGEST, Record, changed, read_record
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import RefusedError, check_file, is_bounded, read_file
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -60,21 +62,19 @@ def _is_topology(path: Path) -> bool:
     )
 
     try:
-        if not path.is_file():
-            return False
-        with path.open("rb") as file:
-            return _TOPOLOGY.search(file.read(MAX_BYTES)) is not None
-    except OSError:
-        return False
+        return _TOPOLOGY.search(read_file(path, MAX_BYTES)) is not None
+    except RefusedError as refused:
+        return refused.why == "large"  # which is told of when it is read
 
 
 def load_fresh(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
     from apc.compiler.store import load
 
+    _check_model(path)
     system = load(path)
     record = Record(system.origin.topology, system.origin.texts)
-    now = changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
+    now = _changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
     if now:
         what = f"is stale: {now} has changed since it was compiled"
         hint = f"apc compile {path.with_name(system.origin.topology)}"
@@ -97,7 +97,7 @@ def load_or_compile(path: Path) -> CompiledSystem:
 
     if path.suffix == ".apc":
         return load_fresh(path)
-    if path.is_file() and compiled_already(path):
+    if compiled_already(path):
         try:
             return load(path.with_suffix(".apc"))
         except ApcError:
@@ -135,5 +135,27 @@ def open_scene(file: str | None, settings: Sequence[str]) -> CompiledSystem:
 
 def compiled_already(topology: Path) -> bool:
     """Return whether the compiled model beside a topology is what compiling it now would give."""
-    record = read_record(topology.with_suffix(".apc"))
-    return record is not None and record.topology == topology.name and not changed(record, topology.parent)
+    model = topology.with_suffix(".apc")
+    if not (is_bounded(topology, LARGEST, "") and is_bounded(model, LARGEST, "")):
+        return False
+    record = read_record(model)
+    return record is not None and record.topology == topology.name and not _changed(record, topology.parent)
+
+
+def _check_model(path: Path) -> None:
+    """Refuse what is no file before it is opened: ApcError E602."""
+    try:
+        check_file(path, LARGEST)
+    except RefusedError as refused:
+        hint = "apc compile" if refused.why == "missing" else ""
+        other = ", not a compiled model" if refused.why in ("folder", "special") else ""
+        raise ApcError(Mistake("E602", Place(str(path)), f"{refused.words}{other}", hint=hint)) from None
+
+
+def _changed(record: Record, folder: Path) -> str:
+    """Return the name of the first text that is different now, or is no file or folder that would be read."""
+    for name, _ in record.texts:
+        path = folder / name
+        if os.path.lexists(path) and not is_bounded(path, LARGEST, ".yaml"):
+            return name.removeprefix("./")
+    return changed(record, folder)

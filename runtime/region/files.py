@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.store import write_atomically
+from apc.compiler.files import write_file
 from apc.runtime.optional import need
 from apc.runtime.region.figure import draw_panels
 from apc.runtime.region.panels import Panels
@@ -75,7 +75,7 @@ def write_panels(path: Path, found: Panels) -> None:
         write_table(path, headings(first), [kind for _, kind in COLUMNS], rows, made)
     else:
         text = json.dumps(found.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
-        write_atomically(path, lambda temporary: _write_text(temporary, text))
+        write_file(path, lambda temporary: _write_text(temporary, text))
 
 
 def _write_text(path: Path, text: str) -> None:

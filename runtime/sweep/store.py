@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.store import write_atomically
+from apc.compiler.files import write_file
 from apc.runtime.sweep.quantities import Row
 
 SUFFIX = ".parts"
@@ -45,7 +45,7 @@ class Parts:
         """Keep the rows of a part. Raises ApcError E601 if they can't be written."""
         body = json.dumps({"part": part, "rows": rows}, ensure_ascii=False, allow_nan=False).encode()
         digest = hashlib.sha256(body).hexdigest().encode()
-        write_atomically(self._path(part), lambda path: _fill(path, digest + b"\n" + body))
+        write_file(self._path(part), lambda path: _fill(path, digest + b"\n" + body))
 
     def read(self, part: int) -> tuple[Row, ...] | None:
         """Return the rows of a part, or None if the part is damaged or isn't there."""
@@ -130,7 +130,7 @@ def _claim(folder: Path, target: Path, description: Mapping[str, Any]) -> None:
         theirs = json.loads(manifest.read_bytes())
     except FileNotFoundError:
         text = json.dumps(description, ensure_ascii=False, indent=1)
-        write_atomically(manifest, lambda path: _fill(path, f"{text}\n".encode()))
+        write_file(manifest, lambda path: _fill(path, f"{text}\n".encode()))
         return
     except OSError as error:
         raise _unwritable(folder, error) from error

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.store import write_atomically
+from apc.compiler.files import write_file
 from apc.runtime.sweep.quantities import Cell, Row
 
 SUFFIXES = (".csv", ".parquet")
@@ -68,9 +68,9 @@ def write_table(
         E601 the file can't be written.
     """
     if path.suffix.lower() == ".csv":
-        write_atomically(path, lambda temporary: _write_csv(temporary, headings, rows))
+        write_file(path, lambda temporary: _write_csv(temporary, headings, rows))
     else:
-        write_atomically(path, _parquet_writer(headings, kinds, rows, metadata))
+        write_file(path, _parquet_writer(headings, kinds, rows, metadata))
 
 
 def _write_csv(path: Path, headings: Sequence[str], rows: Iterable[Row]) -> None:
