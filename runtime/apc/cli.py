@@ -215,9 +215,10 @@ def show(file: str | None, format_: str | None, out: Path | None) -> None:
     long what it computes is held, and which packets are on their way.
     """
     from apc.api import show as shown
-    from apc.inputs import find_input
+    from apc.inputs import check_topology_outputs, find_input
 
     path = Path(file) if file else find_input(compiled_too=False)
+    check_topology_outputs(path, {"--out": out})
     wanted = format_ or (FORMATS.get(out.suffix, "text") if out else "text")
     _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
 

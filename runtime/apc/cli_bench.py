@@ -82,7 +82,7 @@ def bench_command(
             raise click.UsageError("--hard has scenes of its own: no FILE, --set, --plot or --scale with it")
         _hard(folder, as_json)
         return
-    from apc.inputs import find_input, load_or_compile
+    from apc.inputs import find_input, open_scene
 
     if counts is not None:
         if settings or plot:
@@ -97,11 +97,7 @@ def bench_command(
 
         _check_folder(plot)
         check_format(plot)
-    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
-    if settings:
-        from apc.runtime.frame.overrides import apply, parse_override
-
-        system = apply(system, [parse_override(system, text) for text in settings])
+    system = open_scene(file, settings, {"--plot": plot})
     found = bench(system)
     _print(found.to_dict(), bench_report(found), as_json)
     if plot is not None:

@@ -96,7 +96,7 @@ def region_command(
         what = "--vary and --panel both say what the panels are: one of them is enough"
         raise ApcError(Mistake("E907", Place("region"), what))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
-    systems = [open_scene(one, settings) for one in (file, *compare)]
+    systems = [open_scene(one, settings, {"--out": out}) for one in (file, *compare)]
     with status_line() as told:
         found = compare_regions(
             systems, x=x, y=y, panels=listed, overlays=overlays, normalize=normalize, cells=cells, told=told

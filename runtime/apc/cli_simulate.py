@@ -130,7 +130,7 @@ def simulate_command(
     chosen = parse_method(method) if method is not None else DEFAULT
     asked = parse_duration(duration) if duration is not None else None
     _check_pictures(plot, still)
-    system = open_scene(file, settings)
+    system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still})
     seconds = duration_of(system, asked)
     check_length(system, seconds, runs=runs or 1)
     if still is not None:

@@ -80,7 +80,7 @@ def sweep_command(
     from apc.runtime.sweep.sweep import sweep
 
     values = _values(over)
-    system = open_scene(file, settings)
+    system = open_scene(file, settings, {"--out": out})
     with _progress(out) as progress:
         result = sweep(system, values, of=of, out=out, jobs=jobs, cluster=cluster, progress=progress)
     print_result(result, as_json=as_json)

@@ -1,8 +1,9 @@
 """Which file a command means, and whether a compiled model still matches what it was made from.
 
-Takes: paths. Gives: the topology or compiled model to work on.
+Takes: paths. Gives: the topology or compiled model to work on; `check_outputs`.
 Guarantees: a compiled model is used only while its topology, every text the topology names and the program
-are those it was made from, by their content; a model that has no topology beside it speaks for itself.
+are those it was made from, by their content; a model that has no topology beside it speaks for itself; nothing
+is written where a command reads.
 Does not: compile.
 """
 
@@ -10,17 +11,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from apc.compiler.cache import LARGEST, Record, changed, read_record
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, check_file, is_bounded, read_file
+from apc.compiler.files import RefusedError, check_file, is_bounded, read_file, same_file
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
 
+LIBRARY_SUFFIX = ".yaml"  # of the files in a folder of components
 _TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
 
 
@@ -110,7 +112,9 @@ def load_or_compile(path: Path) -> CompiledSystem:
     return system
 
 
-def open_scene(file: str | None, settings: Sequence[str]) -> CompiledSystem:
+def open_scene(
+    file: str | None, settings: Sequence[str], outputs: Mapping[str, Path | None] | None = None
+) -> CompiledSystem:
     """Return the compiled model that a command means.
 
     Parameters
@@ -119,18 +123,74 @@ def open_scene(file: str | None, settings: Sequence[str]) -> CompiledSystem:
         A topology or compiled model; the only one of the working folder if not given.
     settings
         Parameters to change, each `NAME=QUANTITY`.
+    outputs
+        What the command will write, by the option that says so: see `check_outputs`.
 
     Raises
     ------
     ApcError
-        As `find_input`, `load_or_compile`, `overrides.parse_override` and `overrides.apply`.
+        As `find_input`, `load_or_compile`, `check_outputs`, `overrides.parse_override` and `overrides.apply`.
     """
-    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
+    path = Path(file) if file else find_input(compiled_too=True)
+    system = load_or_compile(path)
+    check_outputs(path, (name for name, _ in system.origin.texts), outputs or {})
     if not settings:
         return system
     from apc.runtime.frame.overrides import apply, parse_override
 
     return apply(system, [parse_override(system, text) for text in settings])
+
+
+def check_topology_outputs(path: Path, outputs: Mapping[str, Path | None]) -> None:
+    """As `check_outputs`, for a command that reads a topology and not its model."""
+    if any(output is not None and output.exists() for output in outputs.values()):
+        from apc.compiler.pipeline import run_stages
+        from apc.compiler.scene.scene import Scene, library_folders
+        from apc.compiler.source.source import read_source
+
+        scene = run_stages(path, until="scene")
+        assert isinstance(scene, Scene)
+        folders = (str(folder.resolve()) for folder in library_folders(read_source(path)))
+        check_outputs(path, (*(name for name, _ in scene.texts), *folders), outputs)
+
+
+def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path | None]) -> None:
+    """Refuse to write to a file that the command reads, or to one file twice.
+
+    Parameters
+    ----------
+    path
+        The topology or compiled model.
+    texts
+        What it names, from its folder: files, and folders of components.
+    outputs
+        What will be written, by the option that says so; None is nothing.
+
+    Raises
+    ------
+    ApcError
+        E616 one of them is read, or given twice.
+    """
+    named = [path, path.with_suffix(".yaml"), *(path.parent / text for text in texts)]
+    given = [(option, output) for option, output in outputs.items() if output is not None]
+    for place, (option, output) in enumerate(given):
+        hint = f"{option} {output.with_name(f'{output.stem}-result{output.suffix}')}"
+        for other, before in given[:place]:
+            if output.absolute() == before.absolute() or same_file(output, before):
+                what = f"is given to {other} and to {option}: the second would replace the first"
+                raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
+        if not output.is_file():
+            continue
+        if any(same_file(output, one) or _is_below(output, one) for one in named):
+            what = f"is read by this command: {option} would replace it"
+            raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
+
+
+def _is_below(file: Path, folder: Path) -> bool:
+    """Return whether a file is one that a folder of components is read for."""
+    return (
+        file.suffix == LIBRARY_SUFFIX and folder.is_dir() and file.resolve().is_relative_to(folder.resolve())
+    )
 
 
 def compiled_already(topology: Path) -> bool:
@@ -156,6 +216,6 @@ def _changed(record: Record, folder: Path) -> str:
     """Return the name of the first text that is different now, or is no file or folder that would be read."""
     for name, _ in record.texts:
         path = folder / name
-        if os.path.lexists(path) and not is_bounded(path, LARGEST, ".yaml"):
+        if os.path.lexists(path) and not is_bounded(path, LARGEST, LIBRARY_SUFFIX):
             return name.removeprefix("./")
     return changed(record, folder)
