@@ -1,6 +1,6 @@
 """What is read from disk and written to it, whoever named the file.
 
-Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `is_bounded`; `write_file`, and for what is
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `is_bounded`; `write_file`, `check_target`, and for what is
 written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`; `same_file`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is waited
 for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a link stays
@@ -184,10 +184,22 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
     except (OSError, ValueError) as error:
         if isinstance(error, ValueError) and temporary is not None:
             raise  # not of the name: of what `write` does
-        raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}")) from error
+        raise _unwritable(path, error) from error
     finally:
         if temporary is not None:
             drop_file(temporary)
+
+
+def check_target(path: Path) -> None:
+    """Refuse a place where nothing can be written, before what is to be written is computed: ApcError E601."""
+    try:
+        drop_file(begin_file(path))
+    except (OSError, ValueError) as error:
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path: Path, error: OSError | ValueError) -> ApcError:
+    return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}"))
 
 
 def begin_file(path: Path) -> Path:

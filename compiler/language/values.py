@@ -29,7 +29,8 @@ PEERS = ("peers",)
 # A quantity starts with a number; what follows is nothing, a unit, or a ratio such as 1/90 s. An operator
 # behind the number makes it an expression.
 _QUANTITY = re.compile(
-    r"[+-]?\s*(\d|\.\d)[\d.]*([eE][+-]?\d+)?(\s*/\s*\d[\d.]*)?\s*([^\W\d_].*|[°%µΩ].*)?\Z", re.DOTALL
+    r"[+-]?\s*([0-9]|\.[0-9])[0-9.]*([eE][+-]?[0-9]+)?(\s*/\s*[0-9][0-9.]*)?\s*([^\W\d_].*|[°%µΩ].*)?\Z",
+    re.DOTALL,
 )
 _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 

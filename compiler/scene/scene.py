@@ -18,7 +18,7 @@ from pathlib import Path
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Settable
 from apc.compiler.components.library import SUFFIX, Library
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.values import (
     Value,
@@ -153,8 +153,8 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     if root is None:
         return None
     root = check_keys(root, KEYS, "a topology", mistakes)
-    title = read_text(_required(root, "topology", "my-scene", mistakes), "topology", mistakes) or ""
-    about = read_text(root.get("about"), "about", mistakes) or ""
+    title = visible(read_text(_required(root, "topology", "my-scene", mistakes), "topology", mistakes) or "")
+    about = visible(read_text(root.get("about"), "about", mistakes) or "")
     peers = _required(root, "peers", "{user: {count: 3}}", mistakes)
     _required(root, "masses", "{device: {mass: 0.1 kg}}", mistakes)
     bodies = read_counts(peers, folder, mistakes, texts)

@@ -17,7 +17,7 @@ import click
 
 from apc.compiler.errors import ApcError
 from apc.compiler.files import partial_name
-from apc.options import json_option, print_document, print_result, set_option
+from apc.options import WholeNumber, json_option, print_document, print_result, set_option, tell
 from apc.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -64,19 +64,19 @@ if TYPE_CHECKING:
 @click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
 @click.option(
     "--seed",
-    type=click.IntRange(0, 2**63 - 1),
+    type=WholeNumber(0, 2**63 - 1),
     metavar="NUMBER",
     help="Of packets that get lost or come late; the experiment's if not given.",
 )
 @click.option(
     "--runs",
-    type=click.IntRange(1, 10_000_000),
+    type=WholeNumber(1, 10_000_000),
     metavar="NUMBER",
     help="Play it so often, with other packets each time, and say what that amounts to.",
 )
 @click.option(
     "--jobs",
-    type=click.IntRange(1, 1024),
+    type=WholeNumber(1, 1024),
     default=1,
     show_default=True,
     metavar="NUMBER",
@@ -209,13 +209,13 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
     if as_json:
         print_document(result_document(system.name, summary, provenance, interrupted, estimate))
     else:
-        click.echo(result_text(system.name, summary, provenance, estimate))
+        tell(result_text(system.name, summary, provenance, estimate))
         for written in (out, plot, kept.still):
             if written is not None:
-                click.echo(f"  {written} is written")
+                tell(f"  {written} is written")
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
-        click.echo(f"stopped at {until}; what was done is kept", err=True)
+        tell(f"stopped at {until}; what was done is kept", err=True)
         raise click.Abort
 
 
@@ -232,7 +232,7 @@ def _play_into(
 
     recording = open_recording(out, simulation) if out is not None else None
     if out is not None and (note := size_note(simulation, decimal=out.suffix.lower() == ".csv")):
-        click.echo(f"{out} {note}", err=True)
+        tell(f"{out} {note}", err=True)
     total = float(simulation.settings.duration)
     try:
         with progress_bar("simulate", "s") as show:
@@ -244,7 +244,7 @@ def _play_into(
         if recording is not None:
             recording.close(partial=True)
             if recording.path != out:
-                click.echo(f"{recording.path} holds what was done; {out} is as it was", err=True)
+                tell(f"{recording.path} holds what was done; {out} is as it was", err=True)
         raise
     except BaseException:
         if recording is not None:

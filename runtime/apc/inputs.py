@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING
 
 from apc.compiler.cache import LARGEST, Record, changed, read_record
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, check_file, is_bounded, read_file, same_file
+from apc.compiler.files import RefusedError, check_file, check_target, is_bounded, read_file, same_file
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
 
+YAML_SUFFIXES = (".yaml", ".yml")
 LIBRARY_SUFFIX = ".yaml"  # of the files in a folder of components
 _TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
 
@@ -141,9 +142,25 @@ def open_scene(
     return apply(system, [parse_override(system, text) for text in settings])
 
 
+def check_model_name(topology: Path) -> None:
+    """Refuse a topology beside another whose compiled model would have the same name: ApcError E617."""
+    for suffix in YAML_SUFFIXES:
+        other = topology.parent / f"{topology.stem}{suffix}"
+        if other.name != topology.name and not same_file(other, topology) and _is_topology(other):
+            what = f"and {other.name} would both be compiled to {topology.stem}.apc"
+            raise ApcError(Mistake("E617", Place(str(topology)), what, hint=_renaming(topology)))
+
+
+def _renaming(topology: Path) -> str:
+    return f"mv {topology} {topology.with_name(f'{topology.stem}-2{topology.suffix}')}"
+
+
 def check_topology_outputs(path: Path, outputs: Mapping[str, Path | None]) -> None:
     """As `check_outputs`, for a command that reads a topology and not its model."""
-    if any(output is not None and output.exists() for output in outputs.values()):
+    given = [output for output in outputs.values() if output is not None]
+    for output in given:
+        check_target(output)
+    if any(output.exists() for output in given):
         from apc.compiler.pipeline import run_stages
         from apc.compiler.scene.scene import Scene, library_folders
         from apc.compiler.source.source import read_source
@@ -169,11 +186,12 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
     Raises
     ------
     ApcError
-        E616 one of them is read, or given twice.
+        E601 one of them can't be written; E616 one is read, or given twice.
     """
     named = [path, path.with_suffix(".yaml"), *(path.parent / text for text in texts)]
     given = [(option, output) for option, output in outputs.items() if output is not None]
     for place, (option, output) in enumerate(given):
+        check_target(output)
         hint = f"{option} {output.with_name(f'{output.stem}-result{output.suffix}')}"
         for other, before in given[:place]:
             if output.absolute() == before.absolute() or same_file(output, before):
@@ -195,8 +213,10 @@ def _is_below(file: Path, folder: Path) -> bool:
 
 def compiled_already(topology: Path) -> bool:
     """Return whether the compiled model beside a topology is what compiling it now would give."""
-    model = topology.with_suffix(".apc")
-    if not (is_bounded(topology, LARGEST, "") and is_bounded(model, LARGEST, "")):
+    try:
+        check_file(topology, LARGEST)
+        check_file(model := topology.with_suffix(".apc"), LARGEST)
+    except RefusedError:
         return False
     record = read_record(model)
     return record is not None and record.topology == topology.name and not _changed(record, topology.parent)

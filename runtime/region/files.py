@@ -10,14 +10,13 @@ Does not: compute.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import write_file
+from apc.compiler.files import check_target, write_file
 from apc.runtime.optional import need
 from apc.runtime.region.figure import draw_panels
 from apc.runtime.region.panels import Panels
@@ -39,17 +38,14 @@ def check_region_path(path: Path) -> None:
     Raises
     ------
     ApcError
-        E908 the suffix, E601 the folder, E887 or E875 a library that is missing.
+        E908 the suffix, E601 the place, E887 or E875 a library that is missing.
     """
     suffix = path.suffix.lower()
     known = (*FORMATS, *SUFFIXES, ".json")
     if suffix not in known:
         got = suffix or "no suffix"
         raise ApcError(Mistake("E908", Place(str(path)), "--out", f"one of {', '.join(known)}", got))
-    folder = path.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        why = "the folder does not exist" if not folder.is_dir() else "the folder allows no new files"
-        raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {why}"))
+    check_target(path)
     if suffix in SUFFIXES:
         check_table_path(path)
     elif suffix in FORMATS:

@@ -143,11 +143,11 @@ def _remove(folder: Path) -> None:
 
 def _manifest(folder: Path) -> dict[str, Any] | None:
     """Return what a folder says it was made for, None if `apc sweep` did not make it."""
-    if folder.is_symlink() or not folder.is_dir():
-        return None
     try:
+        if folder.is_symlink() or not folder.is_dir():
+            return None
         found = json.loads(read_file(folder / _MANIFEST, _LARGEST))
-    except (RefusedError, ValueError):
+    except (RefusedError, OSError, ValueError):
         return None
     return found if isinstance(found, dict) and found.items() >= _MARK.items() else None
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import write_file
+from apc.compiler.files import check_target, write_file
 from apc.runtime.sweep.quantities import Cell, Row
 
 SUFFIXES = (".csv", ".parquet")
@@ -27,9 +27,7 @@ METADATA = b"apc"  # the key of what made a table, in a Parquet file's own metad
 
 
 def check_table_path(path: Path) -> None:
-    """Raise ApcError if no table can be written there: E887 by its suffix, E601 a folder is in the way."""
-    if path.is_dir():
-        raise ApcError(Mistake("E601", Place(str(path)), "can't be written: it is a folder"))
+    """Raise ApcError if no table can be written there: E887 by its suffix, E601 by its place."""
     if path.suffix.lower() not in SUFFIXES:
         got = path.suffix or "no suffix"
         raise ApcError(Mistake("E887", Place(str(path)), "a table", " or ".join(SUFFIXES), got))
@@ -40,6 +38,7 @@ def check_table_path(path: Path) -> None:
             what = "is a Parquet file, which needs pyarrow; without it, --out can end in .csv"
             hint = "pip install 'apc[data]'"
             raise ApcError(Mistake("E887", Place(str(path)), what, hint=hint)) from None
+    check_target(path)
 
 
 def write_table(
