@@ -1,13 +1,14 @@
 """What a user is told when the input is at fault.
 
-Takes: nothing. Gives: `Place` and `place_in`, `Mistake`, `ApcError` and the collector `Mistakes`.
-Guarantees: mistakes of one file come out together, in file order, each once.
+Takes: nothing. Gives: `Place` and `place_in`, `Mistake`, `ApcError` and the collector `Mistakes`; `visible`.
+Guarantees: mistakes of one file come out together, in file order, each once; no control character is told as it is.
 Does not: print, or decide exit codes.
 """
 
 from __future__ import annotations
 
 import difflib
+import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -25,11 +26,29 @@ class Place:
 
     def __str__(self) -> str:
         """Return `file:line:column`, or the file alone when no line is known."""
-        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        file = visible(self.file.replace("\n", "\\n"))
+        return f"{file}:{self.line}:{self.column}" if self.line else file
 
     def shifted(self, columns: int) -> Place:
         """Return the place `columns` further right on the same line."""
         return Place(self.file, self.line, self.column + columns, self.source_line)
+
+
+def visible(text: str) -> str:
+    """Return a text in which no character acts on a terminal: what isn't printed stands as JSON's `\\u001b`.
+
+    Line breaks, tabs and spaces stay. So a JSON document stays one.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        c if c.isprintable() or c in "\n\t" or unicodedata.category(c) == "Zs" else _escaped(c) for c in text
+    )
+
+
+def _escaped(character: str) -> str:
+    digits = character.encode("utf-16-be", "surrogatepass").hex()
+    return "".join(f"\\u{digits[at : at + 4]}" for at in range(0, len(digits), 4))
 
 
 def place_in(place: Place, text: str, offset: int) -> Place:
@@ -83,7 +102,7 @@ class Mistake:
             text += "."
         if self.hint:
             text += f" Write: {self.hint}"
-        return "".join(c if c.isprintable() else " " for c in text)  # one line, whatever was got
+        return visible("".join(" " if c.isspace() else c for c in text))  # one line, whatever was got
 
 
 class ApcError(Exception):

@@ -21,13 +21,11 @@ import functools
 import hashlib
 import json
 import math
-import os
 import re
-import tempfile
 import types
 import typing
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -35,37 +33,15 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.cache import DAMAGE, FORMAT, MEMBER, SEAL, Archive, DamageError, read_archive
+from apc.compiler.cache import DAMAGE, FORMAT, LARGEST, MEMBER, SEAL, Archive, DamageError, read_archive
 from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import RefusedError, check_file, write_file
 from apc.compiler.plain import PlainFunction, plain, read_function
 from apc.compiler.seal import seal
 
 FOREIGN = "it is not what apc compile writes"
 _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[0-9]{1,4000})?\Z")
-
-
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it. Raises ApcError if it can't."""
-    temporary: Path | None = None
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        os.close(handle)
-        temporary = Path(name)
-        write(temporary)
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        temporary.replace(path)
-    except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-        reason = error.strerror or str(error)
-        raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {reason}")) from error
-    except BaseException:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-        raise
 
 
 def save(system: CompiledSystem, path: Path, *, sealed: bool = False) -> None:
@@ -83,18 +59,18 @@ def save(system: CompiledSystem, path: Path, *, sealed: bool = False) -> None:
                 # A fixed date: the same model gives the same bytes.
                 archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
 
-    write_atomically(path, write)
+    write_file(path, write)
 
 
 def load(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if the file is missing, damaged or of another version."""
     try:
-        if path.exists() and not path.is_file():  # a named pipe that nobody writes to would block for ever
-            kind = "a folder" if path.is_dir() else "no ordinary file"
-            raise ApcError(Mistake("E602", Place(str(path)), f"is {kind}, not a compiled model"))
+        check_file(path, LARGEST)
         return unpacked(read_archive(path), path)
-    except FileNotFoundError as error:
-        raise ApcError(Mistake("E602", Place(str(path)), "does not exist", hint="apc compile")) from error
+    except RefusedError as refused:
+        hint = "apc compile" if refused.why == "missing" else ""
+        other = ", not a compiled model" if refused.why in ("folder", "special") else ""
+        raise ApcError(Mistake("E602", Place(str(path)), f"{refused.words}{other}", hint=hint)) from None
     except OSError as error:
         if error.strerror is None:  # a decompressor's
             raise _damaged(path, FOREIGN) from error

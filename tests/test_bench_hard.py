@@ -113,7 +113,7 @@ def test_the_report_fits_a_terminal(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "can't be read"),
+        (None, "does not exist"),
         ("{", "is not JSON"),
         ("[]", "the truths wants spectral_radius"),
         ('{"a": {"spectral_radius": "much"}}', "a wants spectral_radius"),

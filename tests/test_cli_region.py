@@ -150,7 +150,7 @@ def test_the_drawn_outline_encloses_the_stable_area() -> None:
             ["--out", "region.bmp"],
             "region.bmp: E908 --out wants one of .png, .svg, .pdf,",
         ),
-        (["--out", "nowhere/region.csv"], "E601 can't be written: the folder does not exist"),
+        (["--out", "nowhere/region.csv"], "E601 can't be written: No such file or directory"),
         (["--vary", "lan.delay"], "--vary: E907 --vary wants NAME=VALUE,VALUE,…"),
         (["--panel", "lan.delay"], "--panel: E907 a panel wants NAME=VALUE, …"),
         (["--vary", "lan.delay=0,8 ms", "--panel", "lan.delay=0 ms"], "E907 --vary and --panel both say"),

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from apc.compiler import cache, store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.compiler.files import write_file
 from tests.topologies import AVERAGE, MESH, compiled, replaced, told
 
 TWO_KINDS = replaced(
@@ -151,7 +152,7 @@ def test_an_interrupted_write_leaves_the_old_file(model: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        store.write_atomically(model, stop)
+        write_file(model, stop)
     assert model.read_bytes() == before
     assert [file.name for file in model.parent.iterdir()] == ["scene.apc"]
 

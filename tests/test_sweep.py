@@ -266,7 +266,7 @@ def _read(terminal: int) -> bytes:
         ),
         (
             ("--over", "it.stiffness=1,2 N/m", "--out", "nowhere/r.csv", "--jobs", "1"),
-            "nowhere/r.csv.parts: E601 can't be written: No such file or directory.",
+            "nowhere/r.csv: E601 can't be written: No such file or directory.",
         ),
     ],
 )

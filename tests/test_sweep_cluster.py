@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
@@ -11,8 +13,9 @@ import pytest
 
 from apc.compiler.errors import ApcError, Place
 from apc.runtime.sweep import cluster as sweep_cluster
+from apc.runtime.sweep import sweep as sweep_module
 from apc.runtime.sweep import work as sweep_work
-from apc.runtime.sweep.sweep import sweep
+from apc.runtime.sweep.sweep import Patience, sweep
 from tests.sweeping import CHEAP, parts
 from tests.topologies import compiled, told
 
@@ -152,3 +155,29 @@ def test_a_missing_distributed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         "tcp://host:1: E888 a cluster needs Dask's distributed, here and on its workers. "
         "Write: pip install '.[cluster]'  (in the folder of apc's own pyproject.toml)"
     ]
+
+
+def test_an_address_that_wants_a_certificate_is_told() -> None:
+    assert told(lambda: sweep(MODEL, OVER, cluster="tls://127.0.0.1:8786")) == [
+        "tls://127.0.0.1:8786: E888 Dask has no certificate for it (distributed.comm.tls in its own "
+        "configuration). Write: --cluster tcp://HOST:8786"
+    ]
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no process can be frozen here")
+def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_module, "SILENCE", 0.1)
+    heard: list[str] = []
+    with distributed.LocalCluster(n_workers=1, processes=True, dashboard_address=":0") as frozen:
+        (worker,) = (one.process.process.pid for one in frozen.workers.values())
+        os.kill(worker, signal.SIGSTOP)
+        try:
+            patience = Patience(0.3, heard.append)
+            (message,) = told(lambda: sweep(MODEL, OVER, cluster=frozen.scheduler_address, patience=patience))
+        finally:
+            os.kill(worker, signal.SIGCONT)
+    assert heard == [f"nothing has come from those who compute for {s} s; still waiting" for s in (0.1, 0.2)]
+    assert message == (
+        "sweep: E889 nothing has come from those who compute for 0.3 s: they are stuck, or a part takes longer. "
+        'Write: --patience "0.6 s"'
+    )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -63,7 +65,7 @@ def test_parts_of_another_sweep_are_never_mixed_in(tmp_path: Path) -> None:
     ]
     (tmp_path / "r.csv.parts" / "manifest.json").write_bytes(b"{")
     (message,) = told(claim, target, MINE)
-    assert "E885 holds unfinished work of another sweep: different are its model, over." in message
+    assert "E885 is there and was not made by apc sweep" in message
     assert (tmp_path / "r.csv.parts" / "part-0.json").is_file(), "nothing of it is lost"
 
 
@@ -90,8 +92,7 @@ def test_what_a_killed_process_left_half_written_goes(tmp_path: Path) -> None:
     with open_parts(target, MINE) as parts:
         parts.write(0, ROWS)
     (tmp_path / "r.csv.parts" / ".part-1.json.abc").write_bytes(b"half")
-    (tmp_path / ".r.csv.finished").mkdir()
-    (tmp_path / ".r.csv.finished" / "part-0.json").write_bytes(b"old")
+    shutil.copytree(tmp_path / "r.csv.parts", tmp_path / ".r.csv.finished")
     with open_parts(target, MINE):
         names = sorted(path.name for path in (tmp_path / "r.csv.parts").iterdir())
         assert names == ["lock", "manifest.json", "part-0.json"]
@@ -121,4 +122,70 @@ def test_a_full_disk_keeps_the_finished_parts(tmp_path: Path, monkeypatch: pytes
         part = tmp_path / "r.csv.parts" / "part-1.json"
         assert told(parts.write, 1, ROWS) == [f"{part}: E601 can't be written: No space left on device."]
         assert parts.there() == {0}
+        assert parts.read(0) == ROWS
+
+
+def test_a_folder_that_no_sweep_made_is_refused_and_stays(tmp_path: Path) -> None:
+    target = tmp_path / "w.csv"
+    folder, finished = tmp_path / "w.csv.parts", tmp_path / ".w.csv.finished"
+    for one in (folder, finished):
+        one.mkdir()
+        (one / "part-0.json").write_text("thesis", encoding="utf-8")
+    (message,) = told(claim, target, MINE)
+    assert message.startswith(f"{folder}: E885 is there and was not made by apc sweep")
+    (folder / "manifest.json").write_text('{"name": "a page of the web"}', encoding="utf-8")
+    assert told(claim, target, MINE) == [message]
+    assert [(one / "part-0.json").read_text() for one in (folder, finished)] == ["thesis", "thesis"]
+
+
+def test_an_empty_folder_that_no_sweep_made_stays(tmp_path: Path) -> None:
+    (tmp_path / "w.csv.parts").mkdir()
+    assert len(told(claim, tmp_path / "w.csv", MINE)) == 1
+    assert (tmp_path / "w.csv.parts").is_dir()
+
+
+def test_what_others_put_into_a_folder_of_parts_stays_when_the_sweep_is_done(tmp_path: Path) -> None:
+    target = tmp_path / "w.csv"
+    with open_parts(target, MINE) as parts:
+        parts.write(0, ROWS)
+        (parts.folder / "notes.txt").write_text("mine", encoding="utf-8")
+        (parts.folder / ".hidden").write_text("mine", encoding="utf-8")
+        remove_parts(target)
+    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} == {"notes.txt", ".hidden"}
+
+
+def test_a_link_in_the_place_of_the_folder_is_refused_and_what_it_leads_to_stays(tmp_path: Path) -> None:
+    target, other = tmp_path / "w.csv", tmp_path / "other.csv"
+    with open_parts(other, MINE) as parts:
+        parts.write(0, ROWS)
+    (tmp_path / "w.csv.parts").symlink_to("other.csv.parts")
+    (tmp_path / ".w.csv.finished").symlink_to("other.csv.parts")
+    assert len(told(claim, target, MINE)) == 1
+    assert (tmp_path / "other.csv.parts" / "part-0.json").is_file()
+
+
+def test_a_finished_folder_of_somebody_elses_does_not_stop_the_tidying_up(tmp_path: Path) -> None:
+    target = tmp_path / "w.csv"
+    (tmp_path / ".w.csv.finished").mkdir()
+    (tmp_path / ".w.csv.finished" / "mine.txt").write_text("mine", encoding="utf-8")
+    with open_parts(target, MINE) as parts:
+        parts.write(0, ROWS)
+        remove_parts(target)
+    assert [path.name for path in tmp_path.rglob("*")] == [".w.csv.finished", "mine.txt"]
+
+
+def test_a_part_carries_its_sweep_so_that_no_other_takes_it(tmp_path: Path) -> None:
+    target, other = tmp_path / "w.csv", {**MINE, "over": [3]}
+    with open_parts(target, MINE) as parts:
+        parts.write(0, ROWS)
+    manifest = tmp_path / "w.csv.parts" / "manifest.json"
+    kept = manifest.read_text(encoding="utf-8")
+    manifest.unlink()
+    (message,) = told(claim, target, other)
+    assert "E885 is there and was not made by apc sweep" in message
+    manifest.write_text(json.dumps({"made by": "apc sweep", **other}), encoding="utf-8")
+    with open_parts(target, other) as parts:
+        assert parts.read(0) is None
+    manifest.write_text(kept, encoding="utf-8")
+    with open_parts(target, MINE) as parts:
         assert parts.read(0) == ROWS

@@ -30,7 +30,7 @@ from apc.compiler.source.reading import (
 )
 
 Sends = tuple[tuple[str, Expr, str, Place], ...]
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
 
 def read_equations(node: Node | None, mistakes: Mistakes) -> tuple[Equation, ...]:

@@ -1,7 +1,8 @@
 """The component library: which definitions there are, each read when it is first asked for.
 
 Takes: folders of YAML files. Gives: `Library`.
-Guarantees: a file is read at most once, and only if a scene needs it (or it lies in a user's own folder).
+Guarantees: a file is read at most once, and only if a scene needs it (or it lies in a user's own folder); no
+two files of a user's define one name.
 Does not: read what is in a definition (see `definitions`).
 """
 
@@ -12,15 +13,19 @@ from pathlib import Path
 from apc.compiler.cache import builtin_files
 from apc.compiler.components.component import Component, Connector
 from apc.compiler.components.definitions import read_component, read_connector
-from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import RefusedError, files_below, read_file, same_file
 from apc.compiler.source.nodes import Mapping, Scalar
-from apc.compiler.source.source import Source, parse_source, read_source
+from apc.compiler.source.reading import brief
+from apc.compiler.source.source import MAX_BYTES, Source, read_source
+
+SUFFIX = ".yaml"
 
 
 class Library:
     """Hands out components by name, each read and checked when it is first asked for.
 
-    Folders are searched in order; the built-in library comes last. In the built-in library a component's
+    A user's component takes the place of the built-in one of its name. In the built-in library a component's
     file has its name in kebab case, so that a scene reads only the files it needs.
     """
 
@@ -32,13 +37,19 @@ class Library:
         self._files: dict[str, Path] = dict(builtin_files())
         self._failed: dict[str, ApcError] = {}
         self._open: list[str] = []  # the components being read, each asked for by the one before
-        for folder in folders:
-            for path in sorted(folder.rglob("*.yaml")):
-                source = read_source(path)
-                name = _title(source)
-                if name:
-                    self._files[name] = path
-                    self._sources[name] = source
+        own: dict[str, Path] = {}
+        for path in (path for folder in folders for path in files_below(folder, SUFFIX)):
+            source = _read(path)
+            name = _title(source)
+            if not name:
+                continue
+            if not same_file(own.setdefault(name, path), path):
+                what = f"{brief(name)} is defined in {own[name]} already"
+                raise ApcError(
+                    Mistake("E218", source.root.place, what, hint="another name in one of the two")
+                )
+            self._sources[name] = source
+        self._files |= own
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -93,9 +104,29 @@ class Library:
     def _source(self, name: str) -> Source:
         if name not in self._sources:
             path = self._files[name]
-            self._sources[name] = parse_source(path.read_bytes(), file=path.name, path=path)
+            self._sources[name] = read_source(path, shown=path.name)
         self._texts[name] = self._sources[name].digest
         return self._sources[name]
+
+
+def _read(path: Path) -> Source:
+    """Read a file of a user's folder; of one that is about something else, no text is told."""
+    try:
+        return read_source(path)
+    except ApcError as error:
+        if any(word in _text(path) for word in (b"component", b"connector")):
+            raise
+        what = "a file of a library"
+        expected = "YAML that defines a component or connector"
+        places = [Place(one.place.file, one.place.line, one.place.column) for one in error.mistakes]
+        raise ApcError(Mistake("E219", place, what, expected) for place in places) from None
+
+
+def _text(path: Path) -> bytes:
+    try:
+        return read_file(path, MAX_BYTES)
+    except RefusedError:
+        return b"component"  # why it is not read tells nothing of what is in it
 
 
 def _title(source: Source) -> str | None:

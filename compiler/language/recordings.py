@@ -8,20 +8,22 @@ Does not: know what reads them.
 
 from __future__ import annotations
 
-import csv
 import math
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.tables import MOST_MISTAKES, open_rows, read_headings, read_table
+from apc.compiler.language.tables import MOST_MISTAKES, Headings, open_table, read_table
 from apc.compiler.language.units import NO_UNIT, Unit
 from apc.compiler.source.reading import brief
 
+DELAY = "delay"  # the column of a trace that is read
 LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with nothing in it
 
 
@@ -98,36 +100,31 @@ def read_trace(path: Path, named_at: Place) -> Trace:
         E701 it can't be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is at
         fault, or there is none.
     """
-    reader, digest = open_rows(path, named_at)
-    file = str(path)
     mistakes = Mistakes()
-    delays: list[float] = []
-    try:
-        names = read_headings(reader, file, mistakes)
-        mistakes.raise_if_any()
-        own = _delay_column(names)
+    delays = array("d")
+    with open_table(path, named_at, known=(DELAY,)) as opened:
+        own = _delay_column(opened.headings)
         faults = 0
-        for cells in reader:
+        for cells in opened.rows:
             if not cells or (len(cells) == 1 and cells[0].isspace()):
                 continue
-            delay = _delay(cells, own, names, Place(file, reader.line_num), mistakes)
+            at = Place(opened.file, opened.rows.line_num)
+            delay = _delay(cells, own, opened.headings, at, mistakes)
             delays.append(delay)
             faults += math.isnan(delay)
             if faults >= MOST_MISTAKES:
                 break
-    except csv.Error as error:
-        raise ApcError(Mistake("E703", Place(file, reader.line_num or 1, 1), f"is no CSV: {error}")) from None
-    mistakes.raise_if_any()
-    if not delays:
-        raise ApcError(Mistake("E703", Place(file, 2, 1), "the table has headings but no rows"))
-    return Trace(np.array(delays), digest)
+        mistakes.raise_if_any()
+        if not delays:
+            raise ApcError(Mistake("E703", Place(opened.file, 2, 1), "the table has headings but no rows"))
+    return Trace(np.array(delays), opened.digest)
 
 
-def _delay_column(names: list[tuple[str, Unit, Place]]) -> int:
+def _delay_column(names: Headings) -> int:
     """Return which column is called delay. Raises ApcError if there is none, or it is in no unit of time."""
     got, place = ", ".join(name for name, _, _ in names), names[0][2]
     for column, (name, unit, at) in enumerate(names):
-        if name == "delay":
+        if name == DELAY:
             if unit.dimension == SECOND:
                 return column
             got, place = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
@@ -135,9 +132,7 @@ def _delay_column(names: list[tuple[str, Unit, Place]]) -> int:
     raise ApcError(Mistake("E702", place, "a trace", expected, brief(got), "delay [ms]"))
 
 
-def _delay(
-    cells: list[str], own: int, names: list[tuple[str, Unit, Place]], row: Place, mistakes: Mistakes
-) -> float:
+def _delay(cells: list[str], own: int, names: Headings, row: Place, mistakes: Mistakes) -> float:
     """Return a packet's delay in seconds: infinite if it was lost, not a number if its row is at fault."""
     if len(cells) != len(names):
         what = f"the row has {len(cells)} cells and there are {len(names)} headings"
@@ -147,10 +142,10 @@ def _delay(
     if cell in ("", LOST):
         return math.inf
     try:
-        number = float(cell)
+        number = plain_float(cell)
     except ValueError:
         number = math.nan
-    if 0 <= number < math.inf:
+    if number >= 0:
         return number * float(names[own][1].scale)
     place = row.shifted(sum(len(other) + 1 for other in cells[:own]) + 1)
     mistakes.add("E703", place, "a delay", expected=f"a time of 0 or more, or {LOST}", got=brief(cell))

@@ -1,7 +1,8 @@
 """Tables in CSV files: columns with their units in the headings.
 
-Takes: a path. Gives: `Table`, in SI; `open_rows` and `read_headings`, for files not all of numbers.
-Guarantees: every cell is a finite number, or a mistake names its file, line and column.
+Takes: a path. Gives: `read_table`, a `Table` in SI; `open_table`, for files not all of numbers.
+Guarantees: every cell is a finite number, or a mistake names its file, line and column; of a file that is no
+table no text is told, as it may be somebody's; a number takes eight bytes.
 Does not: know what a column means.
 """
 
@@ -9,9 +10,11 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import math
+import io
 import re
-from collections.abc import Iterator
+from array import array
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -19,13 +22,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.files import RefusedError, read_file
 from apc.compiler.language.units import NO_UNIT, Unit, parse_unit
 from apc.compiler.source.reading import brief
 
-MAX_BYTES = 1 << 28  # 256 MiB: some ten million numbers
+MAX_BYTES = 1 << 26  # 64 MiB: some eight million numbers, read in a few seconds
+MOST_COLUMNS = 1000  # more than a scene has parameters that differ from peer to peer
 MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows
-_HEADING = re.compile(r"\s*(?P<name>[^\[\]]*?)\s*(\[\s*(?P<unit>[^\[\]]*?)\s*\])?\s*\Z")
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.]*\Z")
+
+Headings = tuple[tuple[str, Unit, Place], ...]  # name, unit and where it stands
 
 
 class Reader(Protocol):
@@ -80,144 +88,159 @@ def read_table(path: Path, named_at: Place) -> Table:
     ApcError
         E701 it can't be read, E702 a heading, E703 a row or cell is at fault.
     """
-    reader, digest = open_rows(path, named_at)
-    file = str(path)
-    mistakes = Mistakes()
-    try:
-        names = read_headings(reader, file, mistakes)
+    with open_table(path, named_at) as opened:
+        mistakes = Mistakes()
+        headings = opened.headings
+        cells, lines = _rows(opened, mistakes)
         mistakes.raise_if_any()
-        rows, lines = _rows(reader, len(names), file, mistakes)
-    except csv.Error as error:
-        raise ApcError(Mistake("E703", Place(file, reader.line_num or 1, 1), f"is no CSV: {error}")) from None
-    mistakes.raise_if_any()
-    if not rows:
-        raise ApcError(Mistake("E703", Place(file, 2, 1), "the table has headings but no rows"))
-    numbers = np.array(rows, dtype=np.float64)
+        if not lines:
+            raise ApcError(Mistake("E703", Place(opened.file, 2, 1), "the table has headings but no rows"))
+    numbers = np.frombuffer(cells, dtype=np.float64).reshape(len(lines), len(headings))
     columns = tuple(
         Column(name, unit, numbers[:, i] * float(unit.scale), place)
-        for i, (name, unit, place) in enumerate(names)
+        for i, (name, unit, place) in enumerate(headings)
     )
-    return Table(file, columns, tuple(lines), digest)
+    return Table(opened.file, columns, tuple(lines), opened.digest)
 
 
-def open_rows(path: Path, named_at: Place) -> tuple[Reader, str]:
-    """Return a file's rows of cells, and the SHA-256 of its bytes."""
-    data = _bytes(path, named_at)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ApcError(
-            Mistake("E701", named_at, f"{path.name} is not UTF-8 text (byte {error.start})")
-        ) from None
-    return csv.reader(text.splitlines()), hashlib.sha256(data).hexdigest()
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """A CSV file whose headings are read, each a name, a unit and a place; `rows` reads what is below them."""
+
+    file: str
+    digest: str
+    headings: Headings
+    rows: Reader
 
 
-def read_headings(reader: Reader, file: str, mistakes: Mistakes) -> list[tuple[str, Unit, Place]]:
-    """Return the name, unit and place of every heading, such as `device.mass [kg]`.
+@contextmanager
+def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iterator[Opened]:
+    """Open a CSV file and read its headings.
 
     Parameters
     ----------
-    reader
-        The rows of the file, none of them read yet.
-    file
-        Its name in messages.
-    mistakes
-        Takes E702 for a heading at fault.
+    path, named_at
+        As for `read_table`.
+    known
+        Names that are a heading's even without a unit.
 
     Raises
     ------
     ApcError
-        E702 there are no headings.
+        E701 it can't be read, E702 its headings; E703 its rows are no CSV. What the body raises passes, but of
+        a file that does not begin as a table does only that is told: its text may be somebody's.
     """
-    headings = next(reader, [])
-    if not any(heading.strip() for heading in headings):
+    data = _bytes(path, named_at)
+    file = str(path)
+    rows: Reader = csv.reader(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig"))
+    first: list[str] = []
+    try:
+        first = next(rows, [])
+        yield Opened(file, hashlib.sha256(data).hexdigest(), _headings(first, file), rows)
+    except csv.Error as error:
+        raise ApcError(Mistake("E703", Place(file, rows.line_num or 1, 1), f"is no CSV: {error}")) from None
+    except ApcError:
+        if not any(map(str.strip, first)) or _is_table(first, known):
+            raise
+        expected = "a name and its unit in each heading"
         raise ApcError(
-            Mistake("E702", Place(file, 1, 1), "the table has no headings", hint="device.mass [kg]")
-        )
-    return [_heading(heading, file, headings[:i], mistakes) for i, heading in enumerate(headings)]
+            Mistake("E702", Place(file, 1, 1), "a table", expected, hint="device.mass [kg]")
+        ) from None
+
+
+def _is_table(headings: list[str], known: Collection[str]) -> bool:
+    """Return whether a line is the first of a table: a heading has its unit, or there are several names."""
+    parts = [_parts(heading) for heading in headings]
+    return any(name in known or (unit and _NAME.match(name)) for name, unit in parts) or (
+        len(parts) > 1 and all(_NAME.match(name) and unit is None for name, unit in parts)
+    )
 
 
 def _bytes(path: Path, named_at: Place) -> bytes:
     try:
-        if not path.is_file():
-            reason = "is a folder" if path.is_dir() else "does not exist"
-            raise ApcError(Mistake("E701", named_at, f"the table {path} {reason}"))
-        if path.stat().st_size > MAX_BYTES:
-            raise ApcError(
-                Mistake("E701", named_at, f"the table {path} is larger than {MAX_BYTES >> 20} MiB")
-            )
-        return path.read_bytes()
-    except OSError as error:
+        data = read_file(path, MAX_BYTES)
+        data.decode("utf-8-sig")  # all of it: what decodes piece by piece counts from where it is
+    except RefusedError as refused:
+        raise ApcError(Mistake("E701", named_at, f"the table {path} {refused.words}")) from None
+    except UnicodeDecodeError as error:
         raise ApcError(
-            Mistake("E701", named_at, f"the table {path} can't be read: {error.strerror}")
+            Mistake("E701", named_at, f"{path.name} is not UTF-8 text (byte {error.start})")
         ) from None
+    return data
 
 
-def _heading(text: str, file: str, before: list[str], mistakes: Mistakes) -> tuple[str, Unit, Place]:
-    place = Place(file, 1, sum(len(other) + 1 for other in before) + 1)
-    found = _HEADING.match(text)
-    if found is None or not found["name"]:
-        mistakes.add(
-            "E702",
-            place,
-            "a heading",
-            expected="a name and its unit",
-            got=brief(text) or "nothing",
-            hint="device.mass [kg]",
-        )
-        return "", NO_UNIT, place
-    name = found["name"]
-    if any((other := _HEADING.match(one)) and other["name"] == name for one in before):
-        mistakes.add("E702", place, f"the heading {brief(name)} is used twice")
+def _headings(texts: list[str], file: str) -> Headings:
+    place = Place(file, 1, 1)
+    if not any(text.strip() for text in texts):
+        raise ApcError(Mistake("E702", place, "the table has no headings", hint="device.mass [kg]"))
+    if len(texts) > MOST_COLUMNS:
+        what = f"the table has {len(texts)} columns, and {MOST_COLUMNS} are the most"
+        raise ApcError(Mistake("E702", place, what, hint="several groups, each with a table"))
+    mistakes = Mistakes()
+    found: dict[str, tuple[str, Unit, Place]] = {}
+    for text in texts:
+        name, unit = _heading(text, place, mistakes)
+        if name in found:
+            mistakes.add("E702", place, f"the heading {brief(name)} is used twice")
+        found[name] = (name, unit, place)
+        place = place.shifted(len(text) + 1)
+    mistakes.raise_if_any()
+    return tuple(found.values())
+
+
+def _parts(heading: str) -> tuple[str, str | None]:
+    """Return the name and the unit of a heading, None if it has none; no name if it is no heading."""
+    name, bracket, unit = heading.strip().partition("[")
+    inside = unit.removesuffix("]")
+    if "]" in name or "[" in inside or "]" in inside or (bracket and inside == unit):
+        return "", None
+    return name.strip(), inside.strip() if bracket else None
+
+
+def _heading(text: str, place: Place, mistakes: Mistakes) -> tuple[str, Unit]:
+    name, written = _parts(text)
+    if not name:
+        expected, got = "a name and its unit", brief(text) or "nothing"
+        mistakes.add("E702", place, "a heading", expected=expected, got=got, hint="device.mass [kg]")
     try:
-        unit = parse_unit(found["unit"], place) if found["unit"] else NO_UNIT
+        return name, parse_unit(written, place) if written else NO_UNIT
     except ApcError as error:
         mistakes.take(error)
-        unit = NO_UNIT
-    return name, unit, place
+        return name, NO_UNIT
 
 
-def _rows(reader: Reader, width: int, file: str, mistakes: Mistakes) -> tuple[list[list[float]], list[int]]:
-    rows: list[list[float]] = []
-    lines: list[int] = []
+def _rows(opened: Opened, mistakes: Mistakes) -> tuple[array[float], array[int]]:
+    """Return all numbers, row after row, and the line of each row."""
+    width = len(opened.headings)
+    numbers, lines = array("d"), array("q")
     found = 0
-    for cells in reader:
-        if not cells or not any(cell.strip() for cell in cells):
+    for cells in opened.rows:
+        if not any(cell.strip() for cell in cells):
             continue
-        line = reader.line_num
+        line = opened.rows.line_num
         if len(cells) != width:
             what = f"the row has {len(cells)} cells and there are {width} headings"
-            mistakes.add("E703", Place(file, line, 1), what)
+            mistakes.add("E703", Place(opened.file, line, 1), what)
             found += 1
         else:
             try:
-                row = [float(cell) for cell in cells]
-                if all(map(math.isfinite, row)):
-                    rows.append(row)
-                    lines.append(line)
-                    continue
+                numbers.extend([plain_float(cell) for cell in cells])
+                lines.append(line)
+                continue
             except ValueError:
-                pass
-            _add_bad_cells(cells, file, line, mistakes)
-            found += 1
+                _add_bad_cells(cells, opened.file, line, mistakes)
+                found += 1
         if found >= MOST_MISTAKES:
             break
-    return rows, lines
+    return numbers, lines
 
 
 def _add_bad_cells(cells: list[str], file: str, line: int, mistakes: Mistakes) -> None:
     column = 1
     for cell in cells:
         try:
-            fine = math.isfinite(float(cell))
+            plain_float(cell)
         except ValueError:
-            fine = False
-        if not fine:
-            mistakes.add(
-                "E703",
-                Place(file, line, column),
-                "a cell",
-                expected="a finite number",
-                got=brief(cell) or "nothing",
-            )
+            place, got = Place(file, line, column), brief(cell) or "nothing"
+            mistakes.add("E703", place, "a cell", expected="a finite number", got=got)
         column += len(cell) + 1

@@ -29,7 +29,7 @@ PEERS = ("peers",)
 # A quantity starts with a number or a ratio such as 1/90; what follows is nothing or a unit, which may start
 # with a parenthesis or, behind a space, as 1/s does. An operator behind the number makes it an expression.
 _QUANTITY = re.compile(
-    r"[+-]?\s*(\d|\.\d)[\d.]*([eE][+-]?\d+)?(\s*/\s*\d[\d.]*)?"
+    r"[+-]?\s*([0-9]|\.[0-9])[0-9.]*([eE][+-]?[0-9]+)?(\s*/\s*[0-9][0-9.]*)?"
     r"(\s*([^\W\d_]|[°%µΩ(]).*|\s+1\s*[*·⋅/].*|\s*)\Z",
     re.DOTALL,
 )

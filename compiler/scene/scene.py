@@ -17,8 +17,9 @@ from pathlib import Path
 
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Settable
-from apc.compiler.components.library import Library
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.components.library import SUFFIX, Library
+from apc.compiler.errors import Mistakes, Place, visible
+from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.values import (
     Value,
 )
@@ -115,10 +116,19 @@ def library_folders(source: Source) -> tuple[Path, ...]:
         text = read_text(item, "library", mistakes, hint="library: ./parts")
         if text is not None:
             folder = _folder_of(source) / text
-            if _is_folder(folder):
-                found.append(folder)
+            try:
+                if not _is_folder(folder):
+                    raise RefusedError("missing", "does not exist")
+                files_below(folder, SUFFIX)
+            except RefusedError as refused:
+                mistakes.add(
+                    "E214",
+                    item.place,
+                    f"the library folder {brief(text)} {refused.words}",
+                    hint="library: ./parts" if refused.why == "large" else "",
+                )
             else:
-                mistakes.add("E214", item.place, f"the library folder {brief(text)} does not exist")
+                found.append(folder)
     mistakes.raise_if_any()
     return tuple(found)
 
@@ -143,8 +153,8 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     if root is None:
         return None
     root = check_keys(root, KEYS, "a topology", mistakes)
-    title = read_text(_required(root, "topology", "my-scene", mistakes), "topology", mistakes) or ""
-    about = read_text(root.get("about"), "about", mistakes) or ""
+    title = visible(read_text(_required(root, "topology", "my-scene", mistakes), "topology", mistakes) or "")
+    about = visible(read_text(root.get("about"), "about", mistakes) or "")
     peers = _required(root, "peers", "{user: {count: 3}}", mistakes)
     _required(root, "masses", "{device: {mass: 0.1 kg}}", mistakes)
     bodies = read_counts(peers, folder, mistakes, texts)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator
 
-from apc.compiler.errors import Mistakes, Place, nearest
+from apc.compiler.errors import Mistakes, Place, nearest, visible
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
 
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}\Z")
@@ -29,8 +29,8 @@ def form(node: Node) -> str:
 
 def brief(text: str) -> str:
     """Return a text short enough for one line of a message."""
-    flat = "".join(c if c.isprintable() else "�" for c in " ".join(text.split()))
-    return flat if len(flat) <= 60 else flat[:57] + "..."
+    flat = " ".join(text.split())
+    return visible(flat if len(flat) <= 60 else flat[:57] + "...")
 
 
 def read_mapping(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> Mapping | None:

@@ -1,23 +1,20 @@
 """A file, or its bytes, to the YAML nodes in it.
 
 Takes: a path, or bytes. Gives: `Source`: the text, its digest and its tree of nodes (see `nodes`).
-Guarantees: a regular file of bounded size, UTF-8 without control characters, one YAML document; nothing is
-waited for (a named pipe is refused).
+Guarantees: a regular file of bounded size (see `files`), UTF-8 without control characters, one YAML document.
 Does not: know what a topology is, or what any key means.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-import stat
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.files import RefusedError, read_file
 from apc.compiler.source.compose import compose
 from apc.compiler.source.nodes import Lines, Node
 
@@ -52,22 +49,30 @@ def read_source(path: Path, *, shown: str | None = None) -> Source:
         and those of `parse_source`.
     """
     file = str(path) if shown is None else shown
-    place = Place(file)
     try:
-        if path.is_dir():
-            raise ApcError(Mistake("E102", place, "this", "a YAML file", "a folder"))
-        with path.open("rb") if os.name == "nt" else _open(path) as stream:
-            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-                raise ApcError(Mistake("E104", place, "this", "a YAML file", "a device, pipe or socket"))
-            data = stream.read(MAX_BYTES + 1)
-    except (FileNotFoundError, NotADirectoryError):
-        raise ApcError(Mistake("E101", place, _missing(path))) from None
-    except PermissionError:
-        raise ApcError(Mistake("E103", place, "this file may not be read (no permission)")) from None
-    except (OSError, ValueError) as error:  # a name too long, a loop of links, a NUL in the name
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ApcError(Mistake("E103", place, f"this file cannot be read: {reason}")) from None
+        data = read_file(path, MAX_BYTES)
+    except RefusedError as refused:
+        raise ApcError(_not_read(path, Place(file), refused)) from None
     return parse_source(data, file=file, path=path)
+
+
+def _not_read(path: Path, place: Place, refused: RefusedError) -> Mistake:
+    match refused.why:
+        case "missing":
+            return Mistake("E101", place, _missing(path))
+        case "folder":
+            return Mistake("E102", place, "this", "a YAML file", "a folder")
+        case "special":
+            return Mistake("E104", place, "this", "a YAML file", refused.words.removeprefix("is "))
+        case "large":
+            return _too_large(place)
+        case _:
+            return Mistake("E103", place, f"this file {refused.words}")
+
+
+def _too_large(place: Place) -> Mistake:
+    what = f"this file is larger than {MAX_BYTES} bytes, the most a YAML file may have here"
+    return Mistake("E105", place, what)
 
 
 def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
@@ -91,18 +96,12 @@ def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
         E117 too many nodes.
     """
     if len(data) > MAX_BYTES:
-        what = f"this file is larger than {MAX_BYTES} bytes, the most a YAML file may have here"
-        raise ApcError(Mistake("E105", Place(file), what))
+        raise ApcError(_too_large(Place(file)))
     text = _decode(data, file)
     lines = Lines(file, text)
     _refuse_control_characters(text, lines)
     root = compose(text, lines)
     return Source(file, path, text, hashlib.sha256(data).hexdigest(), root)
-
-
-def _open(path: Path) -> IO[bytes]:
-    """Open for reading without waiting: a named pipe nobody writes to would block for ever."""
-    return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 
 
 def _missing(path: Path) -> str:

@@ -35,8 +35,11 @@ def run(arguments: list[str]) -> int:
     import click
 
     from apc.cli import apc
-    from apc.compiler.errors import ApcError
+    from apc.compiler.errors import ApcError, visible
 
+    if sys.stdout is None:  # closed before we began
+        click.echo("apc: the output can't be written: there is no stdout", err=True)
+        return 1
     try:
         apc.main(arguments, prog_name="apc", standalone_mode=False)
         sys.stdout.flush()
@@ -45,13 +48,17 @@ def run(arguments: list[str]) -> int:
             click.echo(str(mistake), err=True)
         return 1
     except click.ClickException as error:
+        error.message = visible(error.message)
         error.show()
         return 2
     except (click.Abort, KeyboardInterrupt):
         click.echo("stopped", err=True)
         return 130
     except SystemExit:
-        # click's answer to a broken pipe, and to nothing else here: whoever read our output has gone.
+        # click's answer to a broken pipe, and to nothing else here: whoever reads our output has gone.
+        return 0
+    except BrokenPipeError:
+        _silence_stdout()  # likewise, at the last flush
         return 0
     except OSError as error:
         if error.errno not in OUTPUT_ERRORS:

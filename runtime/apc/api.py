@@ -319,7 +319,12 @@ def sweep(
     from apc.runtime.sweep import sweep as points
 
     path = None if out is None else Path(out)
-    return points.sweep(_model(model, set), over, of=of, out=path, jobs=jobs, cluster=cluster)
+    system = _model(model, set)
+    if path is not None and not isinstance(model, CompiledSystem):
+        from apc.inputs import check_outputs
+
+        check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out": path})
+    return points.sweep(system, over, of=of, out=path, jobs=jobs, cluster=cluster)
 
 
 def _model(model: CompiledSystem | str | Path, set: Mapping[str, str] | None) -> CompiledSystem:

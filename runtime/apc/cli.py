@@ -22,7 +22,9 @@ from apc.cli_region import region_command
 from apc.cli_simulate import simulate_command
 from apc.cli_sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import write_file
 from apc.compiler.words import counted
+from apc.options import tell
 from apc.runtime.suffixes import check_suffix
 from apc.runtime.threads import start_single_threaded
 
@@ -40,7 +42,7 @@ def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> 
     if wanted:
         from apc.runtime.distribution import program_version
 
-        click.echo(f"apc {program_version()}")
+        tell(f"apc {program_version()}")
         context.exit()
 
 
@@ -111,7 +113,7 @@ def new(name: str) -> None:
         ) from None
     except OSError as error:
         raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {error.strerror}")) from None
-    click.echo(f"{path} is written. Next: apc compile {path}")
+    tell(f"{path} is written. Next: apc compile {path}")
 
 
 @apc.command()
@@ -126,7 +128,7 @@ def check(file: str | None) -> None:
 
     path = Path(file) if file else find_input(compiled_too=False)
     system = compile_topology(path)
-    click.echo(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
+    tell(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
 
 
 @apc.command("compile")
@@ -148,25 +150,25 @@ def compile_command(file: str | None, until: str, force: bool, timings: bool) ->
     if the topology, every file it names and apc itself are as they were.
     """
     start_single_threaded()
-    from apc.inputs import compiled_already, find_input
+    from apc.inputs import check_model_name, compiled_already, find_input
 
     path = Path(file) if file else find_input(compiled_too=False)
     if until != "compiled":
         from apc.compiler.pipeline import run_stages
         from apc.compiler.view.listing import describe
 
-        click.echo(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
+        tell(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
         return
     if path.suffix == ".apc":
         raise ApcError(Mistake("E614", Place(str(path)), "is compiled already", hint=f"apc analyze {path}"))
-    target = path.with_suffix(".apc")
     if not (force or timings) and compiled_already(path):
-        click.echo(f"{path} → {target}: unchanged, not compiled again (--force does)")
+        tell(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
         return
-    _compile(path, target, timings=timings)
+    check_model_name(path)
+    _compile(path, timings=timings)
 
 
-def _compile(path: Path, target: Path, *, timings: bool) -> None:
+def _compile(path: Path, *, timings: bool) -> None:
     """Compile, check, save and report; with `timings`, how long each of it took."""
     from apc.compiler.pipeline import each_stage
     from apc.compiler.store import save
@@ -190,11 +192,11 @@ def _compile(path: Path, target: Path, *, timings: bool) -> None:
     system = cast("CompiledSystem", values[-1])
     difference = check_frame(system)
     lap("self-check")
-    save(system, target, sealed=True)
+    save(system, target := path.with_suffix(".apc"), sealed=True)
     lap("save")
-    click.echo(compile_report(system, needs(system), target, difference))
+    tell(compile_report(system, needs(system), target, difference))
     if timings:
-        click.echo(timings_report(taken))
+        tell(timings_report(taken))
 
 
 @apc.command()
@@ -215,13 +217,14 @@ def show(file: str | None, format_: str | None, out: Path | None) -> None:
     long what it computes is held, and which packets are on their way.
     """
     from apc.api import show as shown
-    from apc.inputs import find_input
+    from apc.inputs import check_topology_outputs, find_input
 
     wanted = format_ or "text"
-    if out is not None:
+    if out is not None and (out.suffix or not format_):
         check_suffix(out, [suffix for suffix in FORMATS if format_ in (None, FORMATS[suffix])], "--out")
         wanted = FORMATS[out.suffix.lower()]
     path = Path(file) if file else find_input(compiled_too=False)
+    check_topology_outputs(path, {"--out": out})
     _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
 
 
@@ -247,12 +250,11 @@ def schema(out: Path | None) -> None:
 
 def _print_or_write(text: str, out: Path | None) -> None:
     if out is None:
-        click.echo(text)
+        tell(text)
         return
-    from apc.compiler.store import write_atomically
 
     def write(temporary: Path) -> None:
         temporary.write_bytes(f"{text}\n".encode())
 
-    write_atomically(out, write)
-    click.echo(f"{out} is written")
+    write_file(out, write)
+    tell(f"{out} is written")

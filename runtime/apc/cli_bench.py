@@ -7,30 +7,23 @@ Does not: compute.
 
 from __future__ import annotations
 
-import errno
-import json
 import math
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import click
 
+from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import check_target
+from apc.options import json_option, print_document, set_option, tell
 
 HARD = Path("tests/hard")  # of a copy of the repository
 
 
 @click.command("bench")
 @click.argument("file", required=False)
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar='PATH="VALUE UNIT"',
-    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
-)
+@set_option
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
@@ -54,7 +47,7 @@ HARD = Path("tests/hard")  # of a copy of the repository
     help=f"Analyse a folder of scenes whose truth is known instead ({HARD} if not given). "
     "Not with FILE, --set, --plot or --scale.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+@json_option
 def bench_command(
     file: str | None,
     settings: tuple[str, ...],
@@ -82,7 +75,7 @@ def bench_command(
             raise click.UsageError("--hard has scenes of its own: no FILE, --set, --plot or --scale with it")
         _hard(folder, as_json)
         return
-    from apc.inputs import find_input, load_or_compile
+    from apc.inputs import find_input, open_scene
 
     if counts is not None:
         if settings or plot:
@@ -95,13 +88,9 @@ def bench_command(
     if plot is not None:
         from apc.runtime.simulate.figures import check_format
 
-        _check_folder(plot)
+        check_target(plot)
         check_format(plot)
-    system = load_or_compile(Path(file) if file else find_input(compiled_too=True))
-    if settings:
-        from apc.runtime.frame.overrides import apply, parse_override
-
-        system = apply(system, [parse_override(system, text) for text in settings])
+    system = open_scene(file, settings, {"--plot": plot})
     found = bench(system)
     _print(found.to_dict(), bench_report(found), as_json)
     if plot is not None:
@@ -109,25 +98,10 @@ def bench_command(
 
         save_bench(found, plot)
         if not as_json:
-            click.echo(f"  {plot} is written")
+            tell(f"  {plot} is written")
     if found.faults:
         what = f"not everything came out right: {'; '.join(found.faults)}"
         raise ApcError(Mistake("E922", Place(found.topology), what))
-
-
-def _check_folder(plot: Path) -> None:
-    """Refuse a picture that could not be written once everything is measured."""
-    place, what = Place("--plot"), "the file"
-    if not plot.name:
-        raise ApcError(Mistake("E878", place, what, "a name like bench.png", "none"))
-    try:
-        if plot.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        with tempfile.TemporaryFile(dir=plot.parent):
-            pass
-    except OSError as error:
-        reason = f"can't be written: {error.strerror or error}"
-        raise ApcError(Mistake("E601", Place(str(plot)), reason)) from error
 
 
 def _hard(folder: Path, as_json: bool) -> None:
@@ -151,7 +125,7 @@ def _scale(path: Path, counts: str, as_json: bool) -> None:
         what = "is a compiled model, whose peers are counted"
         raise ApcError(Mistake("E921", Place(str(path)), what, hint=f"apc bench {path.with_suffix('.yaml')}"))
     try:
-        numbers = [float(text) for text in counts.split(",")]
+        numbers = [plain_float(text) for text in counts.split(",")]
     except ValueError:
         numbers = []
     if not numbers or not all(number.is_integer() for number in numbers):
@@ -163,9 +137,9 @@ def _scale(path: Path, counts: str, as_json: bool) -> None:
 
 def _print(document: dict[str, Any], text: str, as_json: bool) -> None:
     if as_json:
-        click.echo(json.dumps(_finite(document), ensure_ascii=False, allow_nan=False, indent=2))
+        print_document(_finite(document))
     else:
-        click.echo(text)
+        tell(text)
 
 
 def _finite(value: Any) -> Any:

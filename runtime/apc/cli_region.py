@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.options import json_option, print_result, set_option
+from apc.options import WholeNumber, json_option, print_result, set_option, tell
 from apc.progress import status_line
 from apc.runtime.threads import start_single_threaded
 
@@ -48,7 +48,7 @@ from apc.runtime.threads import start_single_threaded
 @set_option
 @click.option(
     "--cells",
-    type=click.IntRange(2, 256),
+    type=WholeNumber(2, 256),
     default=12,
     show_default=True,
     help="Cells along each side of the rectangle to begin with.",
@@ -96,7 +96,7 @@ def region_command(
         what = "--vary and --panel both say what the panels are: one of them is enough"
         raise ApcError(Mistake("E907", Place("region"), what))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
-    systems = [open_scene(one, settings) for one in (file, *compare)]
+    systems = [open_scene(one, settings, {"--out": out}) for one in (file, *compare)]
     with status_line() as told:
         found = compare_regions(
             systems, x=x, y=y, panels=listed, overlays=overlays, normalize=normalize, cells=cells, told=told
@@ -105,4 +105,4 @@ def region_command(
         write_panels(out, found)
     print_result(found, as_json=as_json)
     if out is not None and not as_json:
-        click.echo(f"\n{out} is written")
+        tell(f"\n{out} is written")

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 import click
 
 from apc.compiler.errors import ApcError
-from apc.options import json_option, print_document, print_result, set_option
+from apc.compiler.files import partial_name
+from apc.options import WholeNumber, json_option, print_document, print_result, set_option, tell
 from apc.progress import progress_bar
 from apc.runtime.suffixes import check_suffix
 
@@ -64,19 +65,19 @@ if TYPE_CHECKING:
 @click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
 @click.option(
     "--seed",
-    type=click.IntRange(0, 2**63 - 1),
+    type=WholeNumber(0, 2**63 - 1),
     metavar="NUMBER",
     help="Of packets that get lost or come late; the experiment's if not given.",
 )
 @click.option(
     "--runs",
-    type=click.IntRange(1, 10_000_000),
+    type=WholeNumber(1, 10_000_000),
     metavar="NUMBER",
     help="Play it so often, with other packets each time, and say what that amounts to.",
 )
 @click.option(
     "--jobs",
-    type=click.IntRange(1, 1024),
+    type=WholeNumber(1, 1024),
     default=1,
     show_default=True,
     metavar="NUMBER",
@@ -130,7 +131,7 @@ def simulate_command(
     chosen = parse_method(method) if method is not None else DEFAULT
     asked = parse_duration(duration) if duration is not None else None
     _check_files(out, plot, still)
-    system = open_scene(file, settings)
+    system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still})
     seconds = duration_of(system, asked)
     check_length(system, seconds, runs=runs or 1)
     if still is not None:
@@ -201,48 +202,57 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
     keeper = Keeper(simulation) if kept.plot is not None else None
     comparison = compare_with(simulation, signals=kept.signals) if kept.error else None
     sinks = [sink for sink in (keeper, comparison) if sink is not None]
-    summary, interrupted = _play_into(simulation, kept.out, sinks)
+    summary, interrupted, out = _play_into(simulation, kept.out, sinks)
     estimate = comparison.estimate() if comparison is not None else None
-    if kept.plot is not None and keeper is not None:
+    plot = kept.plot
+    if plot is not None and keeper is not None:
         from apc.runtime.simulate.figures import save
 
-        save(trajectory_of(simulation, keeper, summary, interrupted), kept.plot)
+        plot = partial_name(plot) if interrupted else plot
+        save(trajectory_of(simulation, keeper, summary, interrupted), plot)
     provenance = provenance_of(simulation)
     if as_json:
         print_document(result_document(system.name, summary, provenance, interrupted, estimate))
     else:
-        click.echo(result_text(system.name, summary, provenance, estimate))
-        for written in (kept.out, kept.plot, kept.still):
+        tell(result_text(system.name, summary, provenance, estimate))
+        for written in (out, plot, kept.still):
             if written is not None:
-                click.echo(f"  {written} is written")
+                tell(f"  {written} is written")
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
-        click.echo(f"stopped at {until}; what was done is kept", err=True)
+        tell(f"stopped at {until}; what was done is kept", err=True)
         raise click.Abort
 
 
-def _play_into(simulation: Simulation, out: Path | None, sinks: Sequence[Sink]) -> tuple[Summary, bool]:
-    """Play a simulation into sinks and a file; what was done is in the file even if the run can't go on."""
+def _play_into(
+    simulation: Simulation, out: Path | None, sinks: Sequence[Sink]
+) -> tuple[Summary, bool, Path | None]:
+    """Play a simulation into sinks and a file, whose name is returned with what `play` returns.
+
+    What was done is in the file even if the run can't go on.
+    """
     from apc.runtime.simulate.length import size_note
     from apc.runtime.simulate.recording import open_recording
     from apc.runtime.simulate.trajectory import play
 
     recording = open_recording(out, simulation) if out is not None else None
     if out is not None and (note := size_note(simulation, decimal=out.suffix.lower() == ".csv")):
-        click.echo(f"{out} {note}", err=True)
+        tell(f"{out} {note}", err=True)
     total = float(simulation.settings.duration)
     try:
         with progress_bar("simulate", "s") as show:
             every = sinks if recording is None else [recording, *sinks]
-            found = play(simulation, every, progress=lambda done: show(done, total))
+            summary, interrupted = play(simulation, every, progress=lambda done: show(done, total))
         if recording is not None:
-            recording.close()
+            recording.close(partial=interrupted)
     except ApcError:  # the run can't go on: what was done is kept
         if recording is not None:
-            recording.close()
+            recording.close(partial=True)
+            if recording.path != out:
+                tell(f"{recording.path} holds what was done; {out} is as it was", err=True)
         raise
     except BaseException:
         if recording is not None:
             recording.discard()
         raise
-    return found
+    return summary, interrupted, recording.path if recording is not None else None

@@ -15,8 +15,9 @@ from pathlib import Path
 import click
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.options import json_option, print_result, set_option
+from apc.options import WholeNumber, json_option, print_result, set_option, tell
 from apc.progress import Bar, progress_bar
+from apc.runtime.given import given
 
 
 @click.command("sweep")
@@ -44,11 +45,17 @@ from apc.progress import Bar, progress_bar
     help="What to compute at each point; see below.",
 )
 @set_option
-@click.option("--jobs", type=click.IntRange(min=1), help="Processes to compute with; all cores by default.")
+@click.option("--jobs", type=WholeNumber(min=1), help="Processes to compute with; all cores by default.")
 @click.option(
     "--cluster",
     metavar="ADDRESS",
     help="Compute on a running Dask cluster instead: its scheduler's address, tcp://HOST:8786.",
+)
+@click.option(
+    "--patience",
+    metavar='"TIME"',
+    help='End when nothing has come from processes or cluster for so long, such as "10 min"; wait for ever '
+    "if not given.",
 )
 @json_option
 def sweep_command(
@@ -59,6 +66,7 @@ def sweep_command(
     settings: tuple[str, ...],
     jobs: int | None,
     cluster: str | None,
+    patience: str | None,
     as_json: bool,
 ) -> None:
     """Compute a result at every combination of parameter values.
@@ -77,13 +85,26 @@ def sweep_command(
     changes, with its error).
     """
     from apc.inputs import open_scene
-    from apc.runtime.sweep.sweep import sweep
+    from apc.runtime.sweep.sweep import Patience, sweep
 
+    waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))
     values = _values(over)
-    system = open_scene(file, settings)
+    system = open_scene(file, settings, {"--out": out})
     with _progress(out) as progress:
-        result = sweep(system, values, of=of, out=out, jobs=jobs, cluster=cluster, progress=progress)
+        result = sweep(
+            system, values, of=of, out=out, jobs=jobs, cluster=cluster, progress=progress, patience=waiting
+        )
     print_result(result, as_json=as_json)
+
+
+def _seconds(patience: str | None) -> float | None:
+    if patience is None:
+        return None
+    found = float(given("--patience", patience, what="patience", unit="s"))
+    if found <= 0:
+        form = '--patience "10 min"'
+        raise ApcError(Mistake("E889", Place("sweep"), "--patience", "more than 0 s", patience[:80], form))
+    return found
 
 
 def _values(over: tuple[str, ...]) -> dict[str, str]:
@@ -115,5 +136,5 @@ def _progress(out: Path) -> Iterator[Bar]:
     except BaseException:
         if state["done"] > 0:
             kept = f"{state['done']:,.0f} of {state['of']:,.0f} points are kept in {out}.parts"
-            click.echo(f"{kept}; the same command takes up from there", err=True)
+            tell(f"{kept}; the same command takes up from there", err=True)
         raise

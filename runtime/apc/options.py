@@ -1,7 +1,7 @@
 """What commands have in common: the options `--set` and `--json`, and how a result is printed.
 
-Takes: a result. Gives: `set_option`, `json_option`; `print_result`, `print_document`.
-Guarantees: with --json, one JSON document is printed and nothing else.
+Takes: a result. Gives: `set_option`, `json_option`, `WholeNumber`; `print_result`, `print_document`, `tell`.
+Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
 
@@ -12,6 +12,9 @@ from typing import Any, Protocol
 
 import click
 
+from apc.compiler.digits import plain_int
+from apc.compiler.errors import visible
+
 set_option = click.option(
     "--set",
     "settings",
@@ -20,6 +23,19 @@ set_option = click.option(
     help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+
+
+class WholeNumber(click.IntRange):
+    """A whole number in ASCII digits, within bounds."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number of a text. Fails as click does if it is none."""
+        if isinstance(value, str):
+            try:
+                value = plain_int(value)
+            except ValueError:
+                self.fail(f"{value[:40]!r} is not a whole number.", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 class Result(Protocol):
@@ -34,9 +50,14 @@ def print_result(found: Result, *, as_json: bool) -> None:
     if as_json:
         print_document(found.to_dict())
     else:
-        click.echo(str(found))
+        tell(str(found))
 
 
 def print_document(document: Any) -> None:
     """Print plain data as one JSON document."""
-    click.echo(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
+    tell(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
+
+
+def tell(text: str, *, err: bool = False) -> None:
+    """Print a text, with characters that would act on the terminal written out."""
+    click.echo(visible(text), err=err)

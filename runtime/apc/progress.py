@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from apc.compiler.errors import visible
+
 LONG = 1.0  # seconds of work after which a bar is shown
 
 # Is told how much is done, and of how much.
@@ -69,7 +71,7 @@ def status_line() -> Iterator[Callable[[str], None]]:
 
     def write(text: str) -> None:
         if terminal:
-            sys.stderr.write(f"\r\x1b[K{text[: shutil.get_terminal_size().columns - 1]}")
+            sys.stderr.write(f"\r\x1b[K{visible(text)[: shutil.get_terminal_size().columns - 1]}")
             sys.stderr.flush()
 
     try:

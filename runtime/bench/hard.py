@@ -20,7 +20,9 @@ from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import RefusedError, read_file
 from apc.compiler.pipeline import compile_topology
+from apc.compiler.source.source import MAX_BYTES
 from apc.runtime.analysis.analysis import Analysis, analyze
 from apc.runtime.bench.timing import median_time
 from apc.runtime.threads import single_threaded
@@ -187,10 +189,9 @@ def _truths(folder: Path) -> dict[str, Any]:
     path = folder / TRUTHS
     place = Place(str(path))
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        what = f"can't be read: {error.strerror or error}"
-        raise ApcError(Mistake("E920", place, what, hint=FOLDER)) from error
+        found = json.loads(read_file(path, MAX_BYTES))
+    except RefusedError as refused:
+        raise ApcError(Mistake("E920", place, refused.words, hint=FOLDER)) from None
     except ValueError as error:
         raise ApcError(Mistake("E920", place, f"is not JSON: {error}")) from error
     listed: list[tuple[str, Any]] = list(found.items()) if isinstance(found, dict) else [("", None)]

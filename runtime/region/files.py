@@ -10,13 +10,12 @@ Does not: compute.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.store import write_atomically
+from apc.compiler.files import check_target, write_file
 from apc.runtime.distribution import program_version
 from apc.runtime.optional import need
 from apc.runtime.region.figure import draw_panels
@@ -39,17 +38,14 @@ def check_region_path(path: Path) -> None:
     Raises
     ------
     ApcError
-        E908 the suffix, E601 the folder, E887 or E875 a library that is missing.
+        E908 the suffix, E601 the place, E887 or E875 a library that is missing.
     """
     suffix = path.suffix.lower()
     known = (*FORMATS, *SUFFIXES, ".json")
     if suffix not in known:
         got = suffix or "no suffix"
         raise ApcError(Mistake("E908", Place(str(path)), "--out", f"one of {', '.join(known)}", got))
-    folder = path.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        why = "the folder does not exist" if not folder.is_dir() else "the folder allows no new files"
-        raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {why}"))
+    check_target(path)
     if suffix in SUFFIXES:
         check_table_path(path)
     elif suffix in FORMATS:
@@ -76,7 +72,7 @@ def write_panels(path: Path, found: Panels) -> None:
         write_table(path, headings(first), [kind for _, kind in COLUMNS], rows, made)
     else:
         text = json.dumps(found.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
-        write_atomically(path, lambda temporary: _write_text(temporary, text))
+        write_file(path, lambda temporary: _write_text(temporary, text))
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.files import write_file
 from apc.runtime.optional import need
 from apc.runtime.simulate.signals import Signal
 from apc.runtime.simulate.trajectory import Trajectory
@@ -86,8 +87,6 @@ def save(trajectory: Trajectory, path: Path) -> None:
 
 def write_figure(figure: Any, path: Path) -> None:
     """Write a matplotlib Figure, its format chosen by the suffix; the same figure gives the same bytes."""
-    from apc.compiler.store import write_atomically
-
     # No date in the file, and the same names inside it.
     matplotlib = need("matplotlib", "plot")
     dates: dict[str, dict[str, None]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
@@ -97,7 +96,7 @@ def write_figure(figure: Any, path: Path) -> None:
         with matplotlib.rc_context({"svg.hashsalt": "apc"}):
             figure.savefig(temporary, format=suffix[1:], dpi=DPI, metadata=dates.get(suffix))
 
-    write_atomically(path, write)
+    write_file(path, write)
 
 
 def check_format(path: Path, option: str = "--plot") -> None:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 
 EXACT, RK4, SEMI_IMPLICIT, CVODES = "exact", "rk4", "semi-implicit", "cvodes"
@@ -105,7 +106,7 @@ def parse_method(text: str) -> Method:
 
 def _tolerance(text: str, place: Place) -> float:
     try:
-        found = float(text)
+        found = plain_float(text)
     except ValueError:
         found = 0.0
     if not TIGHTEST <= found <= LOOSEST:

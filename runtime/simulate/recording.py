@@ -1,9 +1,9 @@
 """Trajectories as files, written as they come: CSV, Parquet, MAT, NPZ.
 
 Takes: the blocks of a simulation. Gives: `Recording`, `open_recording`, `SUFFIXES`.
-Guarantees: a file is there whole or not at all: a temporary beside the target, then a rename; of a run
-that is cut short, by whatever it be or as the disk is full, what was done is kept in a file that can be
-read.
+Guarantees: a file is there whole or not at all (see `files`); of a run that is cut short, by whatever it be or
+as the disk is full, what was done is kept in a file that can be read: NAME.partial.csv and so on, where a file
+of the name was there before.
 Does not: compute, or know how a format is written (see `formats`).
 
 Every file says what made it: in the schema's metadata (Parquet), the variable `provenance` (MAT, NPZ), or
@@ -12,11 +12,10 @@ beside it in NAME.csv.json, as a table's first line has to be its headings.
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import begin_file, drop_file, finish_file, partial_name
 from apc.runtime.simulate.blocks import Block
 from apc.runtime.simulate.formats import WRITERS
 from apc.runtime.simulate.simulation import Simulation
@@ -27,7 +26,7 @@ SUFFIXES = tuple(WRITERS)
 
 
 class Recording:
-    """A file being written. `take` each block, then `close`; `path` appears when it is closed.
+    """A file being written. `take` each block, then `close`; `path` appears when it is closed, and says where.
 
     When no more can be written, as the disk is full, `take` raises ApcError (E879) and the file is closed
     with what was written until then; without a row there is none.
@@ -37,15 +36,15 @@ class Recording:
         self.path = path
         self._until = 0.0  # seconds, the last row's time
         self._open = True
-        self._files: dict[Path, Path] = {}  # temporary, and the name it gets
+        self._files: dict[Path, str] = {}  # temporary, and what its name adds to that of the file
         provenance = provenance_of(simulation).to_json()
         try:
-            temporary = self._temporary(path)
+            temporary = self._temporary("")
             self._writer = WRITERS[path.suffix.lower()](temporary, simulation.signals, provenance)
             if self._writer.beside:  # now, while there is room
-                beside = self._temporary(path.with_name(f"{path.name}.json"))
+                beside = self._temporary(".json")
                 beside.write_text(self._writer.beside, encoding="utf-8")
-        except OSError as error:
+        except (OSError, ValueError) as error:
             self._away()
             raise self._failed(error) from error
         except ApcError:  # a library is missing
@@ -67,8 +66,8 @@ class Recording:
                 self._until = float(block.time[some][-1])
                 done += step
 
-    def close(self) -> None:
-        """Finish the file and give it its name. Raises ApcError (E879) if it can't be.
+    def close(self, *, partial: bool = False) -> None:
+        """Finish the file and give it its name; `partial` if not all is in it. Raises ApcError (E879).
 
         Without a row there is no file, and once closed it stays so.
         """
@@ -77,7 +76,7 @@ class Recording:
         if not self._open:
             return
         try:
-            self._finish()
+            self._finish(partial)
         except OSError as error:
             self.discard()
             raise self._failed(error) from error
@@ -89,30 +88,32 @@ class Recording:
             self._writer.close()
             self._away()
 
-    def _temporary(self, path: Path) -> Path:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        os.close(handle)
-        self._files[Path(name)] = path
-        return Path(name)
+    def _temporary(self, added: str) -> Path:
+        temporary = begin_file(self._place(added))
+        self._files[temporary] = added
+        return temporary
+
+    def _place(self, added: str) -> Path:
+        return self.path.with_name(f"{self.path.name}{added}")
 
     def _away(self) -> None:
         for temporary in self._files:
-            temporary.unlink(missing_ok=True)
+            drop_file(temporary)
 
-    def _finish(self) -> None:
+    def _finish(self, partial: bool) -> None:
         self._writer.finish()
-        mask = os.umask(0)
-        os.umask(mask)
-        for temporary, path in self._files.items():
-            temporary.chmod(0o666 & ~mask)
-            temporary.replace(path)
+        if partial:
+            self.path = partial_name(self.path)
+        for temporary, added in self._files.items():
+            finish_file(temporary, self._place(added))
+        self._away()
         self._open = False
 
     def _rescued(self, error: OSError) -> ApcError:
         """Keep what was written before the disk was full."""
         rows = self._writer.whole_rows
         try:
-            self.close()
+            self.close(partial=True)
         except ApcError as failed:
             return failed
         if not rows:
@@ -120,7 +121,7 @@ class Recording:
         what = f"holds the first {rows} rows only, up to {self._until:.9g} s: {_reason(error)}"
         return ApcError(Mistake("E879", Place(str(self.path)), what))
 
-    def _failed(self, error: OSError) -> ApcError:
+    def _failed(self, error: OSError | ValueError) -> ApcError:
         return ApcError(Mistake("E879", Place(str(self.path)), f"can't be written: {_reason(error)}"))
 
 
@@ -136,5 +137,5 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
     return Recording(path, simulation)
 
 
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error)
+def _reason(error: OSError | ValueError) -> str:
+    return (error.strerror if isinstance(error, OSError) else "") or str(error)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import re
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from apc.runtime.sweep.work import Computed, Work, compute_part
 PATIENCE_S = 5
 
 # Dask's own reading of addresses hangs on some that are none.
-_ADDRESS = re.compile(r"([a-z]+://)?([\w.-]+|\[[0-9a-fA-F:.]+\]):\d{1,5}")
+_ADDRESS = re.compile(r"([a-z]+://)?([\w.-]+|\[[0-9a-fA-F:.]+\]):[0-9]{1,5}")
 
 
 @contextmanager
@@ -63,13 +64,19 @@ def cluster_workers(work: Work, address: str) -> Iterator[Workers]:
         except (OSError, ValueError) as error:
             what = f"no Dask scheduler answers there within {PATIENCE_S} s"
             raise ApcError(Mistake("E888", place, what, hint=form)) from error
+        except (TypeError, RuntimeError) as error:  # what it says of an address it can't be asked at
+            what = "Dask has no certificate for it (distributed.comm.tls in its own configuration)"
+            raise ApcError(Mistake("E888", place, what, hint=form)) from error
         with client:
             try:
                 client.wait_for_workers(1, timeout=PATIENCE_S)
             except TimeoutError as error:
                 raise ApcError(Mistake("E888", place, "the cluster there has no workers")) from error
             executor = client.get_executor(pure=False)
-            sent = client.scatter(work, broadcast=True)
+            # A task like the others: to scatter it would wait for every worker, frozen ones included.
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of a large model, which is sent once
+                sent = client.submit(_taken, work, pure=False)
 
             def submit(part: int) -> Future[Computed]:
                 future: Future[Computed] = executor.submit(compute_part, sent, part)
@@ -79,6 +86,11 @@ def cluster_workers(work: Work, address: str) -> Iterator[Workers]:
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
+
+
+def _taken(work: Work) -> Work:
+    """Keep the work on a worker, from which the others have it."""
+    return work
 
 
 def _trouble(error: BaseException, place: Place) -> ApcError | None:

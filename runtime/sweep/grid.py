@@ -29,7 +29,7 @@ MOST_POINTS = 10_000_000
 MOST_DIGITS = 20  # of a count that are read: it is too large anyway
 
 _FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
-_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*")
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,18 @@ PLACE = Place("sweep")
 PART_POINTS = 64
 MOST_PARTS = 10_000
 
+# Seconds without a part after which that is told, and again after twice as many.
+SILENCE = 60.0
+
 Progress = Callable[[int, int], None]  # points done, points in all
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """What to do while no part comes: `told` hears of it; after `limit` seconds the sweep ends."""
+
+    limit: float | None = None
+    told: Callable[[str], None] = lambda _: None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,6 +133,7 @@ def sweep(
     jobs: int | None = None,
     cluster: str | None = None,
     progress: Progress | None = None,
+    patience: Patience | None = None,
 ) -> Sweep:
     """Compute a result at every combination of some parameters' values.
 
@@ -143,13 +155,15 @@ def sweep(
         The address of a Dask scheduler that computes instead.
     progress
         Called with the points done and the points in all, at the start and after each part.
+    patience
+        How long to wait for processes or a cluster of which nothing comes; for ever if not given.
 
     Raises
     ------
     ApcError
         An axis is at fault (E622, E881 to E883, E896, E204, …); E884 nothing is computed under that name;
         E885 other work stands at the target; E887 or E601 the target can't be written; E888 the cluster;
-        E889 a process ended. What is finished is kept.
+        E889 a process ended, or nothing came for too long. What is finished is kept.
     """
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
@@ -167,7 +181,8 @@ def sweep(
     work = Work(model_bytes(system), of, grid, max(PART_POINTS, -(-grid.points // MOST_PARTS)))
     made_of = _description(system, work)
     with _kept(out, made_of) as kept:
-        notes = _compute_missing(work, kept, jobs or cores(), cluster, progress)
+        whose = Whose(jobs or cores(), cluster, patience or Patience())
+        notes = _compute_missing(work, kept, whose, progress)
         headings = (*(axis.heading for axis in grid.axes), *(one.heading for one in quantity.columns))
         kinds = (*("number" for _ in grid.axes), *(one.kind for one in quantity.columns))
         columns = _columns(work, kept, kinds)
@@ -228,9 +243,16 @@ def _kept(out: Path | None, made_of: Mapping[str, Any]) -> Iterator[_Kept]:
         yield parts
 
 
-def _compute_missing(
-    work: Work, kept: _Kept, jobs: int, cluster: str | None, progress: Progress | None
-) -> tuple[str, ...]:
+@dataclass(frozen=True, slots=True)
+class Whose:
+    """Who computes: so many processes here, or a cluster at this address; and how long they are waited for."""
+
+    jobs: int
+    cluster: str | None
+    patience: Patience
+
+
+def _compute_missing(work: Work, kept: _Kept, whose: Whose, progress: Progress | None) -> tuple[str, ...]:
     """Compute the parts that aren't there, keep each as it comes, and return what to tell of it."""
     there = kept.there()
     missing = [part for part in range(work.parts) if part not in there or kept.read(part) is None]
@@ -243,10 +265,10 @@ def _compute_missing(
         progress(done, work.grid.points)
     if not missing:
         return tuple(notes)
-    with _workers(work, min(jobs, len(missing)), cluster) as workers:
-        for computed in _computed(workers, missing):
+    with _workers(work, min(whose.jobs, len(missing)), whose.cluster) as workers:
+        for computed in _computed(workers, missing, whose.patience):
             if computed.versions != program_versions():
-                raise ApcError(_other_versions(computed, cluster))
+                raise ApcError(_other_versions(computed, whose.cluster))
             kept.write(computed.part, computed.rows)
             done += len(computed.rows)
             if progress:
@@ -262,8 +284,9 @@ def _workers(work: Work, jobs: int, cluster: str | None) -> AbstractContextManag
     return nullcontext(this_process(work)) if jobs == 1 else local_processes(work, jobs)
 
 
-def _computed(workers: Workers, missing: Sequence[int]) -> Iterator[Computed]:
+def _computed(workers: Workers, missing: Sequence[int], patience: Patience) -> Iterator[Computed]:
     """Yield each part as it comes; never more of them are handed out than keep the workers busy."""
+    silent = 0.0  # seconds since the last part
     left = iter(missing)
     running: set[Future[Computed]] = set()
     try:
@@ -274,7 +297,13 @@ def _computed(workers: Workers, missing: Sequence[int]) -> Iterator[Computed]:
                     break
             if not running:
                 return
-            finished, running = wait(running, return_when=FIRST_COMPLETED)
+            pause = silent or SILENCE
+            if patience.limit is not None:
+                pause = min(pause, patience.limit - silent)
+            finished, running = wait(running, pause, return_when=FIRST_COMPLETED)
+            silent = 0.0 if finished else silent + pause
+            if silent:
+                _tell_silence(silent, patience)
             for future in finished:
                 yield future.result()
     except ApcError:
@@ -284,6 +313,15 @@ def _computed(workers: Workers, missing: Sequence[int]) -> Iterator[Computed]:
         if told is None:
             raise
         raise told from error
+
+
+def _tell_silence(seconds: float, patience: Patience) -> None:
+    """Say that nothing came for a while. Raises ApcError E889 if that is too long."""
+    what = f"nothing has come from those who compute for {seconds:g} s"
+    if patience.limit is not None and seconds >= patience.limit:
+        what += ": they are stuck, or a part takes longer"
+        raise ApcError(Mistake("E889", PLACE, what, hint=f'--patience "{2 * seconds:g} s"'))
+    patience.told(f"{what}; still waiting")
 
 
 def _other_versions(computed: Computed, cluster: str | None) -> Mistake:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.store import write_atomically
+from apc.compiler.files import check_target, write_file
 from apc.runtime.distribution import install_line
 from apc.runtime.sweep.quantities import Cell, Row
 
@@ -28,9 +28,7 @@ METADATA = b"apc"  # the key of what made a table, in a Parquet file's own metad
 
 
 def check_table_path(path: Path) -> None:
-    """Raise ApcError if no table can be written there: E887 by its suffix, E601 a folder is in the way."""
-    if path.is_dir():
-        raise ApcError(Mistake("E601", Place(str(path)), "can't be written: it is a folder"))
+    """Raise ApcError if no table can be written there: E887 by its suffix, E601 by its place."""
     if path.suffix.lower() not in SUFFIXES:
         got = path.suffix or "no suffix"
         raise ApcError(Mistake("E887", Place(str(path)), "a table", " or ".join(SUFFIXES), got))
@@ -41,6 +39,7 @@ def check_table_path(path: Path) -> None:
             what = "is a Parquet file, which needs pyarrow; without it, --out can end in .csv"
             hint = install_line("data")
             raise ApcError(Mistake("E887", Place(str(path)), what, hint=hint)) from None
+    check_target(path)
 
 
 def write_table(
@@ -69,9 +68,9 @@ def write_table(
         E601 the file can't be written.
     """
     if path.suffix.lower() == ".csv":
-        write_atomically(path, lambda temporary: _write_csv(temporary, headings, rows))
+        write_file(path, lambda temporary: _write_csv(temporary, headings, rows))
     else:
-        write_atomically(path, _parquet_writer(headings, kinds, rows, metadata))
+        write_file(path, _parquet_writer(headings, kinds, rows, metadata))
 
 
 def _write_csv(path: Path, headings: Sequence[str], rows: Iterable[Row]) -> None:

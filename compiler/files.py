@@ -1,0 +1,286 @@
+"""What is read from disk and written to it, whoever named the file.
+
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `is_bounded`; `write_file`, `check_target`, and for what is
+written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`; `same_file`.
+Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is waited
+for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a link stays
+and its file is written; a device or pipe is written to, never replaced.
+Does not: know a format, or say at which line a file was named.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from apc.compiler.errors import ApcError, Mistake, Place
+
+# Of a folder of a user's components: the largest library we know of has a hundred files, three deep.
+MOST_ENTRIES = 10_000
+MOST_DEPTH = 8
+KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
+
+Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
+
+
+class RefusedError(Exception):
+    """A file is not read: `why`, and the same in words that follow its name."""
+
+    def __init__(self, why: Why, words: str) -> None:
+        super().__init__(words)
+        self.why, self.words = why, words
+
+
+def read_file(path: Path, most: int) -> bytes:
+    """Return the bytes of a regular file.
+
+    Parameters
+    ----------
+    path
+        The file, or a link to it.
+    most
+        How many bytes it may have.
+
+    Raises
+    ------
+    RefusedError
+        It isn't there, is no regular file, is larger, or can't be read.
+    """
+    try:
+        check_file(path, most)  # first, as opening a device can already do something
+        with open(path, "rb", opener=_without_waiting) as stream:
+            _check(os.fstat(stream.fileno()), most)  # of what was opened
+            data = stream.read(most + 1)
+    except (OSError, ValueError) as error:
+        raise _refusal(error) from None
+    if len(data) > most:  # it grew meanwhile
+        raise _too_large(most)
+    return data
+
+
+def check_file(path: Path, most: int) -> None:
+    """Refuse what `read_file` would refuse by what it is, without opening it. Raises RefusedError."""
+    try:
+        _check(path.stat(), most)
+    except (OSError, ValueError) as error:
+        raise _refusal(error) from None
+
+
+def _refusal(error: OSError | ValueError) -> RefusedError:
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
+        return RefusedError("missing", "does not exist")
+    if isinstance(error, PermissionError):
+        return RefusedError("forbidden", "may not be read (no permission)")
+    # a name too long, a loop of links, a NUL in the name
+    return RefusedError("unreadable", f"can't be read: {_reason(error)}")
+
+
+def _check(found: os.stat_result, most: int) -> None:
+    if stat.S_ISDIR(found.st_mode):
+        raise RefusedError("folder", "is a folder")
+    if not stat.S_ISREG(found.st_mode):
+        raise RefusedError("special", "is a device, pipe or socket")
+    if found.st_dev in _kernels_devices():
+        raise RefusedError("special", "is an answer of the system's kernel")
+    if found.st_size > most:
+        raise _too_large(most)
+
+
+def _too_large(most: int) -> RefusedError:
+    return RefusedError("large", f"is larger than {_size(most)}, the most it may have")
+
+
+def _size(size: int) -> str:
+    return f"{size >> 20} MiB" if size % (1 << 20) == 0 else f"{size:,} bytes"
+
+
+def _kernels_devices() -> set[int]:
+    return {os.stat(name).st_dev for name in KERNELS if os.path.ismount(name)}  # noqa: PTH116 -- no path of a user's
+
+
+def _without_waiting(name: str, flags: int) -> int:
+    """Open a file: what has become a pipe meanwhile would block for ever."""
+    return os.open(name, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0))
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+
+
+def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
+    """Return the files of a folder and the folders in it by their suffix, in order; links to folders are not followed.
+
+    Raises
+    ------
+    RefusedError
+        It can't be read, has more than `MOST_ENTRIES` entries, or is more than `MOST_DEPTH` folders deep.
+    """
+    found: list[Path] = []
+    seen = 0
+    waiting = [(folder, 1)]
+    while waiting:
+        here, depth = waiting.pop()
+        if depth > MOST_DEPTH:
+            raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
+        try:
+            with os.scandir(here) as entries:
+                for entry in entries:
+                    seen += 1
+                    if seen > MOST_ENTRIES:
+                        raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting.append((Path(entry.path), depth + 1))
+                    elif entry.name.endswith(suffix):
+                        found.append(Path(entry.path))
+        except (OSError, ValueError) as error:
+            raise _refusal(error) from None
+    return tuple(sorted(found))
+
+
+def is_bounded(path: Path, most: int, suffix: str) -> bool:
+    """Return whether a path is a file that `read_file` would read, or a folder that `files_below` would."""
+    try:
+        if path.is_dir():
+            return all(is_bounded(file, most, suffix) for file in files_below(path, suffix))
+        check_file(path, most)
+    except (RefusedError, OSError, ValueError):
+        return False
+    return True
+
+
+def same_file(one: Path, other: Path) -> bool:
+    """Return whether two paths lead to one file that exists."""
+    try:
+        return one.samefile(other)
+    except (OSError, ValueError):
+        return False
+
+
+def write_file(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a temporary file, then put it where it belongs.
+
+    Parameters
+    ----------
+    path
+        Where: a name in a folder that exists, a file, a link to one, a device or a pipe.
+    write
+        Takes the path of the temporary file, which exists and is empty.
+
+    Raises
+    ------
+    ApcError
+        E601 it can't be written; then what was there before is as it was.
+    """
+    temporary: Path | None = None
+    try:
+        temporary = begin_file(path)
+        write(temporary)
+        finish_file(temporary, path)
+    except (OSError, ValueError) as error:
+        if isinstance(error, ValueError) and temporary is not None:
+            raise  # not of the name: of what `write` does
+        raise _unwritable(path, error) from error
+    finally:
+        if temporary is not None:
+            drop_file(temporary)
+
+
+def check_target(path: Path) -> None:
+    """Refuse a place where nothing can be written, before what is to be written is computed: ApcError E601."""
+    try:
+        drop_file(begin_file(path))
+    except (OSError, ValueError) as error:
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path: Path, error: OSError | ValueError) -> ApcError:
+    return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}"))
+
+
+def begin_file(path: Path) -> Path:
+    """Make the empty temporary file of a path: beside what it leads to, so that a rename puts it there.
+
+    Raises
+    ------
+    OSError
+        It can't be made: the folder isn't there or allows no new files, or a folder is in the way.
+    ValueError
+        The name can't be one.
+    """
+    target = _target(path)
+    if target.is_dir():
+        raise IsADirectoryError(None, "it is a folder")
+    folder = None if _is_special(target) else target.parent
+    # The name of the target need not fit: a temporary's is longer.
+    handle, name = tempfile.mkstemp(prefix=f".{target.name[:64]}.", dir=folder)
+    os.close(handle)
+    return Path(name)
+
+
+def finish_file(temporary: Path, path: Path) -> None:
+    """Put a temporary file where it belongs: in place of a file, with its mode; into a device or pipe.
+
+    Raises
+    ------
+    OSError
+        It can't be put there.
+    """
+    target = _target(path)
+    if _is_special(target):
+        with temporary.open("rb") as source, open(target, "wb", buffering=0, opener=_existing) as drain:
+            shutil.copyfileobj(source, drain)
+        return
+    try:
+        before = target.stat()
+    except FileNotFoundError:
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+    else:
+        made = temporary.stat()
+        if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
+            _give(temporary, before)
+        temporary.chmod(stat.S_IMODE(before.st_mode))
+    temporary.replace(target)
+
+
+def partial_name(path: Path) -> Path:
+    """Return where a part of what was to be written goes: a file that is there whole is not given for it."""
+    target = _target(path)
+    return target.with_name(f"{target.stem}.partial{target.suffix}") if target.is_file() else path
+
+
+def drop_file(temporary: Path) -> None:
+    """Remove a temporary file, if it is still there."""
+    temporary.unlink(missing_ok=True)
+
+
+def _target(path: Path) -> Path:
+    """Return what a path leads to, whether or not it is there."""
+    try:
+        return path.resolve() if path.is_symlink() else path
+    except RuntimeError as error:  # a loop of links
+        raise OSError(None, "its links lead to one another") from error
+
+
+def _is_special(target: Path) -> bool:
+    """Return whether something is there that is neither a file nor a folder."""
+    return target.exists() and not (target.is_file() or target.is_dir())
+
+
+def _give(temporary: Path, before: os.stat_result) -> None:
+    """Give a file to the owner of the one it replaces, where that is allowed."""
+    try:
+        os.chown(temporary, before.st_uid, before.st_gid)
+    except (OSError, AttributeError):  # only root may; and not on Windows
+        return
+
+
+def _existing(name: str, flags: int) -> int:
+    """Open what is there, and make nothing."""
+    return os.open(name, flags & ~(os.O_CREAT | os.O_TRUNC))

@@ -1,0 +1,308 @@
+"""`files`: what is no bounded file is not read, and what is written replaces nothing but a file."""
+
+from __future__ import annotations
+
+import os
+import stat
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from apc.__main__ import run
+from apc.compiler import files
+from apc.compiler.files import (
+    RefusedError,
+    begin_file,
+    files_below,
+    finish_file,
+    is_bounded,
+    read_file,
+    write_file,
+)
+from tests.topologies import AVERAGE, replaced, told
+
+FIFO = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+
+
+def refused(path: Path, most: int = 100) -> tuple[str, str]:
+    """Return why a file is not read, and the words."""
+    with pytest.raises(RefusedError) as caught:
+        read_file(path, most)
+    assert not is_bounded(path, most, ".yaml") or caught.value.why == "folder"
+    return caught.value.why, caught.value.words
+
+
+def test_a_file_is_read_up_to_its_limit_and_through_links(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"x" * 100)
+    (tmp_path / "link").symlink_to("a")
+    assert read_file(tmp_path / "link", 100) == b"x" * 100
+    assert refused(tmp_path / "link", 99) == ("large", "is larger than 99 bytes, the most it may have")
+
+
+@FIFO
+def test_what_is_no_file_is_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    (tmp_path / "cpu").symlink_to("/proc/cpuinfo")
+    monkeypatch.setattr(files, "_without_waiting", None)  # opening anything would fail otherwise
+    for name in ("pipe", "link", "zero"):
+        assert refused(tmp_path / name) == ("special", "is a device, pipe or socket")
+    assert refused(tmp_path / "cpu") == ("special", "is an answer of the system's kernel")
+    assert refused(tmp_path) == ("folder", "is a folder")
+    assert refused(tmp_path / "none") == ("missing", "does not exist")
+    assert refused(tmp_path / ("n" * 300))[0] == "unreadable"
+
+
+def test_a_folder_is_walked_so_far_and_no_further(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    for name in ("two.yaml", "a/b/one.yaml", "a/none.txt"):
+        (tmp_path / name).touch()
+    (tmp_path / "a" / "round").symlink_to("..")
+    assert files_below(tmp_path, ".yaml") == (tmp_path / "a/b/one.yaml", tmp_path / "two.yaml")
+    monkeypatch.setattr(files, "MOST_DEPTH", 2)
+    with pytest.raises(RefusedError, match="is more than 2 folders deep"):
+        files_below(tmp_path, ".yaml")
+    monkeypatch.setattr(files, "MOST_ENTRIES", 3)
+    with pytest.raises(RefusedError, match="holds more than 3 files and folders"):
+        files_below(tmp_path, ".yaml")
+
+
+def fill(text: str) -> object:
+    return lambda temporary: temporary.write_text(text, encoding="utf-8")
+
+
+def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_the_mask(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    before = os.umask(0o027)
+    try:
+        write_file(path, fill("one"))
+        assert stat.S_IMODE(path.stat().st_mode) == 0o640
+        path.chmod(0o600)
+        write_file(path, fill("two"))
+    finally:
+        os.umask(before)
+    assert (stat.S_IMODE(path.stat().st_mode), path.read_text()) == (0o600, "two")
+    assert [one.name for one in tmp_path.iterdir()] == ["r.csv"]
+
+
+def test_a_link_stays_and_its_file_is_written(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "r.csv").symlink_to("there/real.csv")
+    write_file(tmp_path / "r.csv", fill("new"))
+    assert (tmp_path / "r.csv").is_symlink()
+    assert (tmp_path / "there" / "real.csv").read_text() == "new"
+    assert [one.name for one in (tmp_path / "there").iterdir()] == ["real.csv"]
+
+
+def test_of_a_failure_nothing_is_seen(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text("before", encoding="utf-8")
+
+    def fail(temporary: Path) -> None:
+        temporary.write_text("half", encoding="utf-8")
+        raise OSError(28, "No space left on device")
+
+    assert told(write_file, path, fail) == [f"{path}: E601 can't be written: No space left on device."]
+    assert path.read_text() == "before"
+    assert [one.name for one in tmp_path.iterdir()] == ["r.csv"]
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("", "it is a folder"),
+        ("none/r.csv", "No such file or directory"),
+        ("x" * 300, "File name too long"),
+        ("\0", "embedded null"),
+        ("round", "its links lead to one another"),
+    ],
+)
+def test_where_nothing_can_be_written_is_told(tmp_path: Path, name: str, why: str) -> None:
+    (tmp_path / "round").symlink_to("round")
+    (message,) = told(write_file, tmp_path / name, fill(""))
+    assert f": E601 can't be written: {why}" in message
+
+
+def reading(pipe: Path, into: list[bytes]) -> threading.Thread:
+    """Start to read a pipe, as another program does."""
+    thread = threading.Thread(target=lambda: into.append(pipe.read_bytes()))
+    thread.start()
+    return thread
+
+
+@FIFO
+def test_a_pipe_is_written_to_and_stays_a_pipe(tmp_path: Path) -> None:
+    pipe, found = tmp_path / "pipe.csv", []
+    os.mkfifo(pipe)
+    other = reading(pipe, found)
+    write_file(pipe, fill("through"))
+    other.join()
+    assert found == [b"through"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert [one.name for one in tmp_path.iterdir()] == ["pipe.csv"]
+
+
+def test_a_device_is_written_to_and_stays_a_device(tmp_path: Path) -> None:
+    link = tmp_path / "null.csv"
+    link.symlink_to(os.devnull)
+    before = Path(os.devnull).stat()
+    write_file(link, fill("gone"))
+    temporary = begin_file(Path(os.devnull))
+    assert temporary.parent != Path(os.devnull).parent, "nothing is made among the devices"
+    finish_file(temporary, Path(os.devnull))
+    temporary.unlink()
+    after = Path(os.devnull).stat()
+    assert (before.st_ino, before.st_mode) == (after.st_ino, after.st_mode)
+    assert link.is_symlink()
+
+
+# ---- through the command line ----
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    yield tmp_path
+
+
+def failed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """Run a command that must fail with code 1, and return the first line of what it says."""
+    code = run(list(words))
+    out, err = capsys.readouterr()
+    assert (code, out) == (1, ""), err
+    return err.splitlines()[0]
+
+
+@FIFO
+def test_a_pipe_as_a_model_or_as_what_a_model_was_made_of_is_not_waited_for(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo("scene.apc")
+    assert run(["analyze", "scene.yaml"]) == 0
+    capsys.readouterr()
+    assert "E602 is a device, pipe or socket, not a compiled model." in failed(capsys, "analyze", "scene.apc")
+    Path("scene.apc").unlink()
+    Path("users.csv").write_text("device.mass [kg]\n0.1\n0.2\n", encoding="utf-8")
+    Path("scene.yaml").write_text(replaced(AVERAGE, ("{count: 3}", "{table: users.csv}")), encoding="utf-8")
+    assert run(["compile", "scene.yaml"]) == 0
+    capsys.readouterr()
+    Path("users.csv").unlink()
+    for make in (os.mkfifo, lambda name: Path(name).symlink_to("/dev/zero")):
+        make("users.csv")
+        assert "E605 is stale: users.csv has changed" in failed(capsys, "analyze", "scene.apc")
+        assert "E701 the table users.csv is a device, pipe or socket." in failed(
+            capsys, "analyze", "scene.yaml"
+        )
+        Path("users.csv").unlink()
+
+
+def test_a_library_that_is_the_whole_disk_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = replaced(AVERAGE, ("topology: three-users-average\n", "topology: a\nlibrary: /\n"))
+    Path("scene.yaml").write_text(text, encoding="utf-8")
+    monkeypatch.setattr(files, "MOST_ENTRIES", 3)
+    assert failed(capsys, "check", "scene.yaml").endswith(
+        "E214 the library folder / holds more than 3 files and folders. Write: library: ./parts"
+    )
+
+
+SECRET = "root:$6$abc:19000:0:99999:7:::"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{SECRET}\ndaemon:*:19000:0:99999:7:::\n",
+        f"ghp_{'S' * 30}\n",
+        f"ghp_S\n{SECRET}\n",
+        f"[{SECRET}]\nuser = {SECRET}\n",
+        f"KEY={SECRET},1\n2\n",
+        '"unclosed' + "S" * 200_000,
+    ],
+)
+def test_a_file_that_is_no_table_is_told_without_its_text(
+    folder: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    Path("users.csv").write_text(text, encoding="utf-8")
+    for old, new in (
+        ("{count: 3}", "{table: users.csv}"),
+        ("delay: 8 ms}", "delay: 8 ms, trace: users.csv}"),
+    ):
+        Path("scene.yaml").write_text(replaced(AVERAGE, (old, new)), encoding="utf-8")
+        assert run(["check"]) == 1
+        err = capsys.readouterr().err
+        assert "E70" in err
+        assert "root" not in err and "SS" not in err and "ghp" not in err
+
+
+def test_a_library_file_about_something_else_is_told_without_its_text(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("parts").mkdir()
+    Path("parts/config.yaml").write_text(f"token: [{SECRET}\nroot: {{\n", encoding="utf-8")
+    Path("scene.yaml").write_text(f"library: ./parts\n{AVERAGE}", encoding="utf-8")
+    message = "E219 a file of a library wants YAML that defines a component or connector."
+    assert run(["check"]) == 1
+    err = capsys.readouterr().err
+    assert message in err and "root" not in err
+
+
+def test_two_files_that_define_one_name_are_refused_naming_both(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("parts").mkdir()
+    for name, value in (("one", 1), ("two", 2)):
+        text = f"component: Rest\nvariables: {{y: {{unit: m}}}}\nequations: [y = {value}*initial(y)]\n"
+        Path(f"parts/{name}.yaml").write_text(text, encoding="utf-8")
+    Path("scene.yaml").write_text(f"library: ./parts\n{AVERAGE}", encoding="utf-8")
+    assert failed(capsys, "check") == (
+        "parts/two.yaml:1:1: E218 Rest is defined in parts/one.yaml already. Write: another name in one of the two"
+    )
+    Path("scene.yaml").write_text(f"library: [./parts, ./parts/]\n{AVERAGE}", encoding="utf-8")
+    Path("parts/two.yaml").unlink()
+    assert run(["check"]) == 0, "a folder that is named twice defines nothing twice"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ("sweep", "scene.yaml", "--over", "contact.stiffness=1 N/m:2 N/m:2", "--out", "users.csv"),
+            "users.csv: E616 is read by this command: --out would replace it. Write: --out users-result.csv",
+        ),
+        (
+            ("simulate", "scene.yaml", "--duration", "1 s", "--out", "link.csv"),
+            "link.csv: E616 is read by this command: --out would replace it. Write: --out link-result.csv",
+        ),
+        (
+            ("show", "scene.txt", "--out", "scene.txt"),
+            "scene.txt: E616 is read by this command: --out would replace it. Write: --out scene-result.txt",
+        ),
+        (
+            ("show", "scene.yaml", "--format", "text", "--out", "users.txt"),
+            "users.txt: E616 is read by this command: --out would replace it. Write: --out users-result.txt",
+        ),
+        (
+            ("simulate", "scene.yaml", "--duration", "1 s", "--plot", "a.png", "--still", "./a.png"),
+            "a.png: E616 is given to --plot and to --still: the second would replace the first. "
+            "Write: --still a-result.png",
+        ),
+    ],
+)
+def test_what_a_command_reads_it_never_replaces(
+    folder: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], message: str
+) -> None:
+    table = "device.mass [kg]\n0.1\n0.2\n"
+    Path("users.csv").write_text(table, encoding="utf-8")
+    for name in ("link.csv", "users.txt"):
+        Path(name).symlink_to("users.csv")
+    Path("scene.yaml").write_text(replaced(AVERAGE, ("{count: 3}", "{table: users.csv}")), encoding="utf-8")
+    Path("scene.txt").write_text(AVERAGE, encoding="utf-8")
+    assert failed(capsys, *words) == message
+    assert Path("users.csv").read_text() == table
+    assert Path("scene.txt").read_text() == AVERAGE
