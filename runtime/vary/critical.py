@@ -39,7 +39,9 @@ class Critical:
     matters: with the present value stable, the first crossing above it or else the first below it; with the
     present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
     there is no crossing; `verdict` then says whether all that was scanned is stable. `enters` says whether
-    anything that decides depends on the parameter: on a start value of a linear scene nothing does.
+    anything that decides depends on the parameter: on a start value of a linear scene nothing does. `groups`
+    are the groups' present values (None where their peers differ) of a parameter that is set for all groups
+    though they have not all the same.
     """
 
     topology: str
@@ -55,6 +57,7 @@ class Critical:
     whole: bool
     enters: bool
     verdict: str
+    groups: tuple[tuple[str, float | None], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer as plain data, ready for JSON."""
@@ -72,6 +75,7 @@ class Critical:
             "whole": self.whole,
             "enters": self.enters,
             "verdict": self.verdict,
+            "groups": dict(self.groups),
         }
 
     def __str__(self) -> str:
@@ -79,6 +83,13 @@ class Critical:
         low, high = (with_unit(f"{one:.6g}", self.unit) for one in self.scanned)
         present = with_unit(f"{self.present:.6g}", self.unit)
         lines = [f"{self.topology}: {self.parameter} is {present}", ""]
+        if self.groups:
+            own = [
+                f"{'several values' if value is None else with_unit(f'{value:.6g}', self.unit)} at {group}"
+                for group, value in self.groups
+            ]
+            lines = [f"{self.topology}: {self.parameter}, one value for all groups"]
+            lines += [*wrapped(f"now {', '.join(own)}", "  ", "    "), ""]
         if self.value is None:
             lines += wrapped(self.verdict, "  ", "  ")
         if not self.enters:
@@ -159,6 +170,19 @@ def critical(
         whole=found.whole,
         enters=found.enters,
         verdict="" if chosen else verdict,
+        groups=_by_group(system, known) if group is None else (),
+    )
+
+
+def _by_group(system: CompiledSystem, name: str) -> tuple[tuple[str, float | None], ...]:
+    """Return what each group has of a parameter, where not all have everybody's."""
+    several = {group.name for group in system.groups if name in {one.name for one in group.columns}}
+    own = {group.name for group in system.groups if name in {one.name for one in group.values}}
+    if not several | own:
+        return ()
+    return tuple(
+        (group.name, None if group.name in several else parameter_of(system, Free(name, group.name)).value)
+        for group in system.groups
     )
 
 

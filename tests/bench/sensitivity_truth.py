@@ -52,7 +52,7 @@ APART = 1e-30
 
 # Points in which a mode is followed between two events, and the least share of the largest state's way that a
 # state's own must be to have an angle.
-POINTS, LEAST = 64, 1e-6
+POINTS, LEAST = 6, 1e-6
 
 # Modes smaller than this in a frame are not followed: what is left of them at its end drowns.
 FADED = 1e-9
