@@ -37,6 +37,8 @@ def test_the_answer_is_plain_data() -> None:
         "linearized",
         "notes",
         "proof",
+        "translations",
+        "unfelt",
     ]
     assert (found["topology"], found["peers"], found["frame_s"]) == ("paper", 3, 0.008)
     assert (found["states_per_peer"], found["method"], found["stable"]) == (8, "modes", True)

@@ -148,3 +148,18 @@ def test_what_reaches_a_time_is_told_from_what_does_not() -> None:
     assert reaches_time(system, Free("wait"))
     assert reaches_time(system, Free("lan.delay"))
     assert not reaches_time(system, Free("kt"))
+
+
+def test_what_enters_as_a_ratio_alone_is_moved_all_the_same() -> None:
+    """Without clocks A has k/m and d/m and nothing else: moved all alike, these stay."""
+    system = compiled(
+        "topology: ratio\npeers: {user: {count: 1}}\nmasses:\n  device: {mass: 2 kg, damping: 3 N*s/m}\n"
+        "couplers:\n  s: {type: SpringDamper, a: device, b: ground, stiffness: 50 N/m, damping: 1 N*s/m}\n"
+    )
+    names = ("device.mass", "device.damping", "s.stiffness", "s.damping")
+    family = evaluator(system, [Free(name) for name in names])
+    [matrix] = family.matrices(np.array([[2.0, 3.0, 50.0, 1.0], [4.0, 3.0, 70.0, 1.0]]))
+    for found, (m, k) in zip(matrix, ((2.0, 50.0), (4.0, 70.0)), strict=True):
+        roots = np.exp(np.roots([m, 4.0, k]))  # a frame of one second
+        values = np.linalg.eigvals(found)
+        assert all(np.abs(values - root).min() < 1e-12 for root in roots)

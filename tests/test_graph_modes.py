@@ -59,3 +59,32 @@ def test_a_cycle_one_way_has_complex_pairs() -> None:
 
 def test_a_matrix_without_a_full_set_of_eigenvectors_is_told() -> None:
     assert graph_modes(_given((0, 1, 1.0), (1, 2, 1.0)), 3, mean=False) is None
+
+
+@pytest.mark.parametrize("mean", [True, False])
+@pytest.mark.parametrize("shape", ["star", "ring"])
+def test_two_peers_are_exact(shape: str, mean: bool) -> None:
+    found = graph_modes(_graph(shape), 2, mean=mean)
+    assert found is not None
+    assert all(mode.doubt == 0 for mode in found)
+    assert sorted(_values(found), key=lambda value: value.real) == pytest.approx(
+        sorted(np.linalg.eigvals(_matrix(_graph(shape), 2, mean=mean)).astype(complex), key=lambda v: v.real)
+    )
+
+
+def test_simple_fractions_are_exact_and_others_have_a_doubt() -> None:
+    """Three peers who hear both others by halves: 1 and twice −1/2. A path of four: the golden section."""
+    halves = _given(*((i, j, 0.5) for i in range(3) for j in range(3) if i != j))
+    found = graph_modes(halves, 3, mean=False)
+    assert found is not None
+    assert [(mode.real, mode.multiplicity, mode.doubt) for mode in found] == [
+        (1, 1, 0),
+        (Fraction(-1, 2), 2, 0),
+    ]
+    path = _given(*((i, j, 1.0) for i in range(4) for j in range(4) if abs(i - j) == 1))
+    found = graph_modes(path, 4, mean=False)
+    assert found is not None
+    golden = (1 + 5**0.5) / 2
+    for mode, value in zip(found, (golden, 1 / golden, -1 / golden, -golden), strict=True):
+        assert 0 < mode.doubt < 1e-12
+        assert abs(mode.value - value) <= mode.doubt

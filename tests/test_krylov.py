@@ -17,6 +17,7 @@ from apc.runtime.large.sparse_system import small_matrix, sparse_system
 from apc.runtime.large.translation import free_motions
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper
+from tests.topologies import MESH, compiled, replaced
 
 CLOCKS: list[dict[str, Any]] = [
     {},
@@ -164,3 +165,20 @@ def test_a_peer_that_differs_in_what_it_is_free_to_do_leaves_the_verdict_open() 
     found = analyze(system, method="krylov")
     assert found.stable is None
     assert found.spectral_radius_error >= found.spectral_radius
+
+
+@pytest.mark.parametrize("graph", ["star", "{edges: [[1, 2], [2, 3], [3, 4], [4, 5], [5, 6]]}"])
+def test_a_mesh_whose_peers_hear_different_sums_translates_as_one(graph: str) -> None:
+    """The centre of a star hears five, the others one: moved together, none of them feels a force."""
+    masses = ", ".join(f"{0.1 + 0.013 * k:.3f} kg" for k in range(6))
+    text = replaced(
+        MESH,
+        ("user: {count: 3}", f"user: {{count: 6, set: {{device.mass: [{masses}]}}}}"),
+        ("delay: 8 ms}", f"delay: 8 ms, graph: {graph}}}"),
+        ("stiffness: 500 N/m", "stiffness: 60 N/m"),
+    )
+    system = compiled(text)
+    found, whole = analyze(system, method="krylov"), analyze(system, method="dense")
+    assert (found.verdict, found.rigid_modes) == (whole.verdict, whole.rigid_modes)
+    assert found.verdict == "stable up to a common translation"
+    assert abs(found.spectral_radius - whole.spectral_radius) <= found.spectral_radius_error < 1e-6

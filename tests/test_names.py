@@ -7,6 +7,7 @@ import pytest
 from apc.compiler.errors import ApcError
 from apc.runtime.frame.names import Free, find, parameter_of, unit_of
 from tests.sites import grouped, paper
+from tests.topologies import MESH, compiled
 
 
 @pytest.mark.parametrize(
@@ -38,3 +39,9 @@ def test_a_free_parameter_is_its_groups_own_if_the_group_sets_it() -> None:
         assert parameter_of(system, Free("contact.stiffness", group)).value == value
     assert Free("contact.stiffness", "left").label == "left.contact.stiffness"
     assert (unit_of(system, "contact.stiffness"), unit_of(system, "lan.delay")) == ("N/m", "s")
+
+
+@pytest.mark.parametrize("written", ["count(lan)", "user.count(lan)"])
+def test_how_many_peers_are_heard_is_no_parameter_to_set(written: str) -> None:
+    with pytest.raises(ApcError, match="is how many peers are heard: change a count and compile again"):
+        find(compiled(MESH), written)

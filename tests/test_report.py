@@ -109,3 +109,15 @@ def test_a_share_that_would_show_as_zero_is_left_out() -> None:
     text = analysis_report(dataclasses.replace(result, modes=(first,)))
     assert "device.v 100%" in text
     assert " 0%" not in text
+
+
+def test_only_what_is_known_to_be_faster_is_called_faster() -> None:
+    """A mode known to ±1 may be of any size: neither in the table nor among those that die faster."""
+    result = analyze(compiled(AVERAGE))
+    unknown = dataclasses.replace(result.modes[0], error=1.0)
+    text = " ".join(analysis_report(dataclasses.replace(result, modes=(*result.modes, unknown))).split())
+    assert "5 modes more (--json lists all), 1 of them known too roughly to say how fast it" in text
+    assert "faster-dying" not in text
+    alone = " ".join(analysis_report(dataclasses.replace(result, modes=(unknown, unknown))).split())
+    assert "2 modes (--json lists all), all of them known too roughly" in alone
+    assert "within a frame" not in alone

@@ -2,8 +2,9 @@
 
 Takes: a `CompiledSystem`.
 Gives: `Sensitivity`, `Sensitivities`, `sensitivities`, `sensitivity_report`.
-Guarantees: all parameters as one batch, exact to rounding; where several eigenvalues share the radius, one
-row for each of them and no gradient that belongs to none.
+Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, with a bound on its
+error; each name can be set as it stands; where several eigenvalues share the radius, one row for each of them
+and no gradient that belongs to none.
 Does not: vary times, or the number of peers.
 
 For a simple eigenvalue, M v = λ v and w M = λ w,   dλ = w dM v / (w v),   d|λ| = Re(λ̄ dλ)/|λ|. A cluster of
