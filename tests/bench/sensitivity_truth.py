@@ -1,15 +1,14 @@
 # ruff: noqa: E501 -- scenes are written by long lines
 """Sensitivities and frequencies of random scenes against 320-bit arithmetic.
 
-`python -m tests.bench.sensitivity_truth` draws scenes with weights on graphs, groups with numbers of their own, several
-clocks, couplers that are linearized where they start, stars, and no clocks at all. The truth comes from the
-compiled functions alone, event by event (see `bench.events`): derivatives from frame matrices on either side of
-a value, frequencies from following each mode through a frame.
+`run` draws scenes with weights on graphs, groups with numbers of their own, several clocks, couplers that are
+linearized where they start, stars, and no clocks at all; `check_sensitivities` and `check_frequencies` serve any
+scene. The truth comes from the compiled functions alone, event by event (see `bench.events`): derivatives from
+frame matrices on either side of a value, frequencies from following each mode through a frame.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 import random
@@ -35,7 +34,6 @@ from apc.runtime.eigen.balls import precision
 from apc.runtime.frame.names import Free, find, parameter_of
 from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.sensitivity import Sensitivities, sensitivities
-from tests.bench.judge import Judge
 from tests.topologies import compiled
 
 BITS = 320
@@ -351,19 +349,3 @@ def run(points: int, *, seed: int = 0) -> list[str]:
             if one
         ]
     return wrong
-
-
-def main() -> None:
-    """Print what is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--points", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    judge = Judge()
-    for one in run(given.points, seed=given.seed):
-        judge.right(one, holds=False)
-    judge.end()
-
-
-if __name__ == "__main__":
-    main()
