@@ -21,6 +21,7 @@ HELPERS = {  # not run by themselves
     "judge",
     "paper_scene",
     "contact_reference",
+    "sensitivity_truth",
 }
 
 

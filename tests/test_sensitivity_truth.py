@@ -1,4 +1,4 @@
-"""Some of the random scenes of `tests.bench.sensitivity_truth`, and scenes that are hard for a derivative."""
+"""Random scenes of `tests.bench.sensitivity_truth`, and scenes that are hard for a derivative."""
 
 from __future__ import annotations
 

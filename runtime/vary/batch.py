@@ -27,7 +27,15 @@ from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.modes import split
 from apc.runtime.eigen.peer_group import PeerGroup
 from apc.runtime.eigen.rigid import find_rigid_modes
-from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows, roundings_of
+from apc.runtime.frame.batch_lift import (
+    HOPELESS,
+    PERTURBED_FRAMES,
+    SAFE,
+    compose_rows,
+    exponential_rows,
+    lift_rows,
+    roundings_of,
+)
 from apc.runtime.frame.discretize import UNIT
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.jacobians import SiteJacobians
@@ -35,7 +43,7 @@ from apc.runtime.frame.lift import lift
 from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
 from apc.runtime.frame.names import Free, value_now
 from apc.runtime.frame.rows import free_rows
-from apc.runtime.frame.schedule import Propagate
+from apc.runtime.frame.schedule import Propagate, Schedule
 from apc.runtime.frame.site import LinearSite, every_matrix
 from apc.runtime.vary.wiring import (
     Lifted,
@@ -395,28 +403,30 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
     -----
     A complex step whose every number is replaced by its magnitudes, of value and of slope, comes out as the
     magnitudes of all that was added up on either way: both are off by the roundings of a frame times that.
+    Where that says nothing, it is estimated as in `batch_lift`.
     """
     assert not evaluator.timed, "the errors of a step belong to its time"
     complex_values = values + (STEP * 1j) * along
     large: dict[tuple[int, int], Lifted] = {}
-    charge = 0.0
+    wide: dict[tuple[int, int], Lifted] = {}
     for group in evaluator.groups:
         built, schedule = group.jacobians, group.schedule
         rows = evaluator.rows(built, evaluator.vectors(group, complex_values))
-        site = sites_of_rows(built, rows)
-        steps, charges = {}, {}
-        for quanta, (seconds, _) in evaluator.durations.items():
-            steps[quanta], charges[quanta] = _large_step(site, seconds)
-        charge = max(charge, roundings_of(site, schedule, charges))
-        z, s = compose_rows(every_matrix(site, _sized), schedule, steps)
-        n_z = z.shape[1]
-        large[site_key(group)] = Lifted(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
+        here = lift_rows(built, schedule, rows.real[:1])
+        value_errors = (here.p_error, here.q_error, here.s_error, here.d_error)
+        size, off = _moved_blocks(sites_of_rows(built, rows), schedule, evaluator.durations)
+        large[site_key(group)] = Lifted(*size)
+        wide[site_key(group)] = Lifted(
+            *(a + b + (STEP * 1j) * c for a, b, c in zip(size, value_errors, off, strict=True))
+        )
     found = []
     errors, plain = matrix_errors(evaluator, values), evaluator.lifted(complex_values)
     for wiring, error in zip(evaluator.wirings, errors, strict=True):
         whole = replace(wiring, now=tuple(map(np.abs, wiring.now)), before=tuple(map(np.abs, wiring.before)))
-        terms = charge + sum(now.shape[0] + now.shape[1] for now in wiring.now)
-        off = (2 * terms * UNIT) * closed_loop(whole, large).imag / STEP
+        terms = max(len(group.lifted.z_names) for group in wiring.system.sites)
+        terms += sum(now.shape[0] + now.shape[1] for now in wiring.now)
+        bound, upper = (closed_loop(whole, one).imag / STEP for one in (large, wide))
+        off = (upper - bound) + 8 * (terms + 2) * (1 + len(wiring.now[0])) * UNIT * upper
         rest, held = wiring.rest, wiring.held
         own = off[:, rest[:, None], rest]
         if len(held):
@@ -426,13 +436,50 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
             below = off[:, held[:, None], rest] + 8 * (len(held) + 2) * UNIT * moved[:, held[:, None], rest]
             own = own + np.abs(weights.real) @ below
             if wiring.moving:
-                size = np.abs(np.linalg.inv(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest]))
+                inverse = np.abs(np.linalg.inv(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest]))
                 wide = np.abs(weights.real)
                 late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ wide + error @ turned
                 late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ wide)
-                own = own + (size @ late) @ np.abs(matrix.real[:, held[:, None], rest])
+                own = own + (inverse @ late) @ np.abs(matrix.real[:, held[:, None], rest])
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
+
+
+def _moved_blocks(
+    site: LinearSite, schedule: Schedule, durations: Mapping[int, tuple[float, float]]
+) -> tuple[tuple[Matrices, ...], tuple[Floats, ...]]:
+    """Return the sizes of P, Q, S and D, of their slopes as a complex step, and the errors of the slopes."""
+    plain, steps, charges = {}, {}, {}
+    for quanta, (seconds, _) in durations.items():
+        plain[quanta] = exponential_rows(site.a * seconds, site.b * seconds, 1.0)[0]
+        steps[quanta], charges[quanta] = _large_step(site, seconds)
+    roundings = roundings_of(site, schedule, charges)
+    frame = compose_rows(site, schedule, plain)
+    bounds = compose_rows(every_matrix(site, _sized), schedule, steps)
+    errors = [(2 * roundings * UNIT / STEP) * one.imag for one in bounds]
+    slopes = [np.abs(one.imag) / STEP for one in frame]
+    if not all(
+        e.max(initial=0.0) <= HOPELESS * s.max(initial=0.0) for e, s in zip(errors, slopes, strict=True)
+    ):
+        random = np.random.default_rng(len(schedule.events))
+
+        def moved(matrix: Matrices) -> Matrices:
+            by = roundings * UNIT * random.uniform(-1, 1, (2, *matrix.shape))
+            return np.asarray(matrix.real * (1 + by[0]) + 1j * (matrix.imag * (1 + by[1])))
+
+        errors = [roundings * UNIT * slope for slope in slopes]
+        for _ in range(PERTURBED_FRAMES):
+            other = compose_rows(
+                every_matrix(site, moved), schedule, {quanta: moved(step) for quanta, step in plain.items()}
+            )
+            apart = (SAFE * np.abs(one.imag - two.imag) / STEP for one, two in zip(frame, other, strict=True))
+            errors = [np.maximum(one, two) for one, two in zip(errors, apart, strict=True)]
+    n_z = frame[0].shape[1]
+    cut = [(block, columns) for block in (0, 1) for columns in (slice(None, n_z), slice(n_z, None))]
+    return (
+        tuple(_sized(frame[block])[..., columns] for block, columns in cut),
+        tuple(errors[block][..., columns] for block, columns in cut),
+    )
 
 
 def _sized(matrix: Matrices) -> Matrices:

@@ -217,12 +217,16 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
     active: list[tuple[complex, str]] = []
     notes, untied = [], dict[str, None]()
     for one in leading:
-        if one.condition >= WORST:
+        try:
+            rates = list(_rates(one)) if one.condition < WORST else None
+        except np.linalg.LinAlgError:  # nothing tells it from another eigenvalue
+            rates = None
+        if rates is None:
             notes.append(_defective(one))
             continue
         first = len(active)
         active += [(complex(value), one.moved.name) for value in one.values]
-        for number, (growth, doubt) in enumerate(_rates(one)):
+        for number, (growth, doubt) in enumerate(rates):
             parameter = parameter_of(system, free[number])
             if growth is None:
                 untied[free[number].label] = None
@@ -238,7 +242,7 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
                     first + k,
                 )
                 for k, rate in enumerate(np.sort(growth)[::-1])
-                if np.isfinite(rate)
+                if np.isfinite(rate) and np.isfinite(doubt)
             ]
     if len(active) > 1:
         notes.append(f"{len(active)} eigenvalues share the radius: the largest of their changes decides")

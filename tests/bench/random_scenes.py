@@ -32,6 +32,7 @@ from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.simulate.simulation import ROW
 from apc.runtime.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
+from tests.bench.sensitivity_truth import check_frequencies, check_sensitivities
 from tests.bench.shapes import PARTS, Shape, draw_shape
 from tests.topologies import compiled
 
@@ -76,6 +77,7 @@ class Tally:
     as_they_must: int = 0  # refused by name
     undecided: int = 0
     proved: int = 0
+    looked_into: int = 0  # derivatives and frequencies of these were checked, too
     seconds: float = 0.0
     tightest: float = 0.0  # the largest error ÷ bound
     verdicts: Counter[str] = field(default_factory=Counter)
@@ -88,7 +90,7 @@ class Tally:
         words = ", ".join(f"{count} {name}" for name, count in sorted(self.verdicts.items()))
         return (
             f"{self.scenes} analyses: {words}\n{len(self.wrong)} wrong, {self.undecided} undecided ({share * self.undecided:.2g} %), "
-            f"{self.proved} proved in balls, {self.refused} beyond floats ({share * self.refused:.2g} %), {self.as_they_must} refused as they must; error/bound at most "
+            f"{self.proved} proved in balls, {self.refused} beyond floats ({share * self.refused:.2g} %), {self.as_they_must} refused as they must, derivatives and frequencies of {self.looked_into}; error/bound at most "
             f"{self.tightest:.2g}; {each:.1f} ms an analysis"
         )
 
@@ -177,9 +179,11 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
                 off = float(abs(known[0] - flint.arb(found.spectral_radius)).mid())
                 if found.spectral_radius_error:
                     tally.tightest = max(tally.tightest, off / found.spectral_radius_error)
-                wrong = check(found, *known)
-                if wrong:
-                    tally.wrong.append(f"{method}: {wrong}\n{text}{values}")
+                told = [check(found, *known)]
+                if method == "auto" and number % draws == 0:
+                    tally.looked_into += 1
+                    told += [check_sensitivities(system, found), check_frequencies(system, found)]
+                tally.wrong += [f"{method}: {wrong}\n{text}{values}" for wrong in told if wrong]
     return tally
 
 
