@@ -35,7 +35,17 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.cache import DAMAGE, FORMAT, MEMBER, SEAL, Archive, DamageError, read_archive
+from apc.compiler.cache import (
+    DAMAGE,
+    FORMAT,
+    MEMBER,
+    SEAL,
+    Archive,
+    DamageError,
+    Record,
+    read_archive,
+    record_of,
+)
 from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.plain import PlainFunction, plain, read_function
@@ -88,11 +98,17 @@ def save(system: CompiledSystem, path: Path, *, sealed: bool = False) -> None:
 
 def load(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if the file is missing, damaged or of another version."""
+    return load_with_record(path)[0]
+
+
+def load_with_record(path: Path) -> tuple[CompiledSystem, Record]:
+    """Read a compiled model, and what it was made from as far as it may be looked up. Raises as `load`."""
     try:
         if path.exists() and not path.is_file():  # a named pipe that nobody writes to would block for ever
             kind = "a folder" if path.is_dir() else "no ordinary file"
             raise ApcError(Mistake("E602", Place(str(path)), f"is {kind}, not a compiled model"))
-        return unpacked(read_archive(path), path)
+        archive = read_archive(path)
+        return unpacked(archive, path), record_of(archive)
     except FileNotFoundError as error:
         raise ApcError(Mistake("E602", Place(str(path)), "does not exist", hint="apc compile")) from error
     except OSError as error:
