@@ -102,10 +102,19 @@ def read_archive(path: Path) -> Archive:
 
 
 def record_of(archive: Archive) -> Record:
-    """Return what an unpacked model was made from. Raises one of DAMAGE if it doesn't say."""
+    """Return what an unpacked model was made from, as far as it may be looked up.
+
+    What has no seal may name any file or folder of the machine: of its texts only the topology beside it is
+    looked at, and what comes with the program. Raises one of DAMAGE if it doesn't say.
+    """
     origin = archive.document["system"]["origin"]
+    topology = str(origin["topology"])
+    if topology in ("", "..") or PurePath(topology).name != topology or "\0" in topology:
+        raise ValueError("the topology is not beside it")
     texts = tuple((str(name), str(digest)) for name, digest in origin["texts"])
-    return Record(str(origin["topology"]), texts)
+    if not archive.sealed:
+        texts = tuple(one for one in texts if one[0] == topology or not _is_path(one[0]))
+    return Record(topology, texts)
 
 
 def changed(record: Record, folder: Path) -> str:
@@ -225,6 +234,8 @@ def _path_digest(path: Path) -> str:
     """Return the SHA-256 of a file, or of a folder's YAML files and their names; empty if unreadable."""
     try:
         if not path.is_dir():
+            if not path.is_file():  # a device or a pipe may have no end
+                return ""
             return hashlib.sha256(path.read_bytes()).hexdigest()
         whole = hashlib.sha256()
         for file in sorted(path.rglob("*.yaml")):

@@ -33,7 +33,18 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.cache import DAMAGE, FORMAT, LARGEST, MEMBER, SEAL, Archive, DamageError, read_archive
+from apc.compiler.cache import (
+    DAMAGE,
+    FORMAT,
+    LARGEST,
+    MEMBER,
+    SEAL,
+    Archive,
+    DamageError,
+    Record,
+    read_archive,
+    record_of,
+)
 from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_file, write_file
@@ -64,9 +75,15 @@ def save(system: CompiledSystem, path: Path, *, sealed: bool = False) -> None:
 
 def load(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if the file is missing, damaged or of another version."""
+    return load_with_record(path)[0]
+
+
+def load_with_record(path: Path) -> tuple[CompiledSystem, Record]:
+    """Read a compiled model, and what it was made from as far as it may be looked up. Raises as `load`."""
     try:
         check_file(path, LARGEST)
-        return unpacked(read_archive(path), path)
+        archive = read_archive(path)
+        return unpacked(archive, path), record_of(archive)
     except RefusedError as refused:
         hint = "apc compile" if refused.why == "missing" else ""
         other = ", not a compiled model" if refused.why in ("folder", "special") else ""

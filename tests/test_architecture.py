@@ -122,7 +122,17 @@ BACKWARDS = {
     *(("apc.runtime.region.region", f"apc.runtime.region.{late}") for late in ("report", "figure", "files")),
     *(("apc.runtime.region.panels", f"apc.runtime.region.{late}") for late in ("report", "figure")),
 }
-FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "sympify", "parse_expr", "lambdify", "S"}
+FORBIDDEN_CALLS = {
+    "eval",
+    "exec",
+    "compile",
+    "__import__",
+    "sympify",
+    "parse_expr",
+    "lambdify",
+    "S",
+    "deserialize",
+}
 FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "sympy.parsing"}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import pytest
 from apc.__main__ import run
 from apc.compiler import cache, seal, store
 from apc.compiler.cache import MEMBER, SEAL
+from apc.inputs import load_fresh
 from tests.fuzz.models import packed, zipped
 from tests.topologies import AVERAGE, ROOT, compiled, replaced, told
 
@@ -203,6 +205,28 @@ def test_without_a_folder_of_ones_own_everything_is_compiled_and_works(
         assert run(["compile"]) == 0
         assert "unchanged" not in capsys.readouterr().out
     assert run(["analyze", "scene.apc"]) == 0
+
+
+@pytest.mark.parametrize("topology", ["", ".", "..", "../scene.yaml", "/etc/passwd", "a/b", "x\0"])
+def test_a_model_of_a_topology_elsewhere_is_refused(topology: str) -> None:
+    store.save(compiled(AVERAGE), MODEL)
+    document, members = opened()
+    document["system"]["origin"]["topology"] = topology
+    MODEL.write_bytes(packed(document, members))
+    assert "E604 is damaged" in told(load_fresh, MODEL)[0]
+
+
+def test_what_a_model_from_elsewhere_names_is_not_read(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["compile"]) == 0
+    os.mkfifo("pipe")  # who reads it waits for ever
+    document, members = opened()
+    texts = document["system"]["origin"]["texts"]
+    texts[:0] = [["./pipe", "0" * 64], ["/", "0" * 64], ["../", "0" * 64], ["/dev/zero", "0" * 64]]
+    MODEL.write_bytes(packed(document, members))
+    assert load_fresh(MODEL).peers == 3
+    Path("scene.yaml").write_text(AVERAGE + "# changed\n", encoding="utf-8")
+    assert "E605 is stale: scene.yaml has changed" in told(load_fresh, MODEL)[0]
 
 
 # ---- size ----

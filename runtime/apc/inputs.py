@@ -72,14 +72,13 @@ def _is_topology(path: Path) -> bool:
 
 def load_fresh(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
-    from apc.compiler.store import load
+    from apc.compiler.store import load_with_record
 
-    system = load(path)
-    record = Record(system.origin.topology, system.origin.texts)
+    system, record = load_with_record(path)
     now = _changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
     if now:
         what = f"is stale: {now} has changed since it was compiled"
-        hint = f"apc compile {path.with_name(system.origin.topology)}"
+        hint = f"apc compile {path.with_name(record.topology)}"
         raise ApcError(Mistake("E605", Place(str(path)), what, hint=hint))
     return system
 

@@ -186,7 +186,10 @@ def forge(seed: str) -> Forged:
         ("value", "value", "value", "move", "number", "function", "function", "array", "bytes")
     )
     for _ in range(chance.choice((1, 1, 1, 2, 5))):
-        _SORTS[sort](chance, document, members)
+        try:
+            _SORTS[sort](chance, document, members)
+        except (IndexError, KeyError, TypeError):
+            break  # what it changes is gone already
     content = packed(document, members, kind=chance.choice((zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED)))
     if sort == "bytes":
         data = bytearray(content)

@@ -51,6 +51,7 @@ _FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Pop
             "os.remove", "os.rename", "os.mkdir", "shutil.rmtree", "ctypes.dlopen", "exec",
             "compile")  # fmt: skip
 
+_CYTHON = b"_getframe()"  # what Cython has compiled when it writes a traceback
 _MODULE = re.compile(r'<code object <module> .*\.py", line 1>')  # what runs when a module is loaded
 
 
@@ -263,7 +264,7 @@ _listening = False
 
 def _listen(event: str, arguments: tuple[object, ...]) -> None:
     """Note what no input may cause, and files opened to write."""
-    if not _listening:
+    if not _listening or arguments[:1] == (_CYTHON,):
         return
     if (event in _FOREIGN and not (event == "exec" and _MODULE.search(str(arguments)))) or (
         event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax+")
