@@ -22,7 +22,7 @@ from apc.compiler.language.recordings import TimeTable
 Definition: TypeAlias = sympy.Expr | ImplicitBlock
 # CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
 # afterwards and squares the error: the rest is rounding. A bound on the residual would depend on its scale.
-NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100}
+NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100, "show_eval_warnings": False}
 _EXTREMES = {"min": casadi.fmin, "max": casadi.fmax}  # of two values each
 _CASADI: dict[str, Callable[..., Any]] = {
     "abs": casadi.fabs,
