@@ -198,11 +198,13 @@ class _System:
     def _moves_on(self, row: int) -> bool:
         """Return whether an equation holds what a derivative of it may determine.
 
-        One that holds nothing has cancelled; one whose derivative holds nothing new asks for its unknowns in
-        conditions only.
+        One that holds nothing has cancelled. One whose derivatives hold nothing new, though conditions were
+        passed by that hold higher ones, asks for its unknowns in conditions only.
         """
-        before = self.integral.get(row)
-        return bool(self.held[row]) and (before is None or self.held[row] != self.held[before])
+        held, same = self.held[row], 0
+        while (before := self.integral.get(row)) is not None and self.held[before] == held:
+            row, same = before, same + 1
+        return bool(held) and same <= max(held.values())
 
     def _report_empty(self, row: int, mistakes: Mistakes) -> None:
         """Say that what an equation holds cancels, in itself or in its derivative."""
