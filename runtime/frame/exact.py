@@ -95,7 +95,7 @@ def evaluate_exact(
     Raises
     ------
     ValueError
-        The function holds an operation this walk does not know.
+        The function holds an operation this walk does not know, or one without a value.
     """
     work: list[Any] = [None] * function.sz_w()
     results: list[list[Any]] = [[number(0.0)] * function.nnz_out(i) for i in range(function.n_out())]
@@ -111,6 +111,8 @@ def evaluate_exact(
         elif code == casadi.OP_OUTPUT:
             results[outputs[0]][outputs[1]] = work[inputs[0]]
         elif code == casadi.OP_CONST:
+            if math.isnan(constant):
+                raise ValueError("math domain error")  # of constants alone, which CasADi evaluates at once
             work[outputs[0]] = number(constant)
         elif code in own:
             work[outputs[0]] = own[code](*(work[place] for place in inputs))
