@@ -115,7 +115,8 @@ LINE = r"own\.yaml:\d+:\d+: "
         (["z = max(z, z - 0*sample(a.x))", "a.f = hold(z*K)", "b.f = -a.f"], "0 m", LINE + "E503 .* a loop that many values solve, or none"),
         (["z = max(z, sample(a.x))", "a.f = hold(z*K)", "b.f = -a.f"], "0 m", LINE + "E503 .* a loop that many values solve, or none"),
         (["z = max(z + sample(a.x), L)", "a.f = hold(z*K)", "b.f = -a.f"], "0 m", LINE + "E503 .* a loop that many values solve, or none"),
-        (["z = sample(a.x)", "a.f = hold(K*z + F*sqrt(((K*z - K*z) - F)/F))", "b.f = -a.f"], "0 m", "E808 an equation has no finite value"),
+        (["z = sample(a.x)", "a.f = hold(K*z + F*sqrt(((K*z - K*z) - F)/F))", "b.f = -a.f"], "0 m", LINE + "E512 `own.held1 = "),
+        (["z = sample(a.x)", "a.f = hold(K*z + F*sqrt((K*sample(b.x) - F)/F))", "b.f = -a.f"], "0 m", "E808 "),
         (["z = z*z/L + z + sample(a.x)", "a.f = hold(z*K)", "b.f = -a.f"], "0 m", "E808 .* at the start values"),
     ],
 )  # fmt: skip
