@@ -16,7 +16,14 @@ import sympy
 
 from apc.compiler.equations.elimination import ZeroTests, eliminate
 from apc.compiler.equations.matching import match_columns, strong_components
-from apc.compiler.equations.residuals import MOST_LISTED, Residual, listed, report_no_number, report_singular
+from apc.compiler.equations.residuals import (
+    MOST_LISTED,
+    SCENE,
+    Residual,
+    listed,
+    report_no_number,
+    report_singular,
+)
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step
 from apc.compiler.equations.symbolic import (
     NoDerivativeError,
@@ -28,7 +35,7 @@ from apc.compiler.equations.symbolic import (
 )
 from apc.compiler.equations.tearing import tear
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
-from apc.compiler.errors import Mistakes
+from apc.compiler.errors import Mistakes, Place
 
 # A loop of more guesses, or with more pieces between its corners, is not asked whether it has one solution.
 MOST_GUESSES, MOST_PIECES = 3, 64
@@ -42,6 +49,7 @@ def solve_blocks(
     *,
     nonzero: Collection[sympy.Symbol] = (),
     vanishes: Vanishing = NOTHING_VANISHES,
+    place: Place = SCENE,
 ) -> tuple[Step, ...]:
     """Match, sort and solve.
 
@@ -58,12 +66,14 @@ def solve_blocks(
         Parameters that no number can make zero; divisors stay when all others are zero, where possible.
     vanishes
         Whether an expression is zero with the scene's numbers; what is divided by must not be.
+    place
+        Where to point when there is no equation.
     """
     columns = {unknown: j for j, unknown in enumerate(unknowns)}
     incidence = [sorted(columns[s] for s in r.expression.free_symbols & columns.keys()) for r in residuals]
     match = match_columns(incidence, len(unknowns))
     if len(residuals) != len(unknowns) or None in match:
-        report_singular(residuals, [u.name for u in unknowns], incidence, match, where, mistakes)
+        report_singular(residuals, [u.name for u in unknowns], incidence, match, where, mistakes, place)
         return ()
     computes = {row: column for column, row in enumerate(match) if row is not None}
     # Row i computes column computes[i]; it needs the rows that compute its other unknowns.

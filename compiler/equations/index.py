@@ -24,14 +24,18 @@ import sympy
 
 from apc.compiler.equations.jets import TIME, Jet, Jets
 from apc.compiler.equations.matching import match_columns
-from apc.compiler.equations.residuals import Residual, report_singular
+from apc.compiler.equations.residuals import SCENE, Residual, report_singular
 from apc.compiler.equations.symbolic import NoDerivativeError, linear_form
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
-from apc.compiler.errors import Mistakes
+from apc.compiler.errors import Mistakes, Place
 
 # More derivatives than this of one variable: no mechanical model needs them (a constraint on a position
 # needs two), so the equations do not end.
 HIGHEST_ORDER = 8
+
+# Nodes of a derivative: that of a product of nonlinear factors is longer than the product. The derivatives
+# of the joints of a mechanism have some hundreds of them.
+LARGEST = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,7 @@ def reduce_index(
     where: str,
     mistakes: Mistakes,
     vanishes: Vanishing = NOTHING_VANISHES,
+    place: Place = SCENE,
 ) -> Reduced | None:
     """Differentiate what must be and choose the states; None if the equations can't be solved.
 
@@ -69,12 +74,14 @@ def reduce_index(
         value that jumps, E509 states that can't be chosen once and for all.
     vanishes
         Whether an expression is zero with the scene's numbers.
+    place
+        Where to point when there is no equation left.
     """
     column = {name: j for j, name in enumerate(names)}
     incidence = [sorted({column[n] for n, _ in jets.jets(r.expression).values()}) for r in residuals]
     match = match_columns(incidence, len(names))
     if len(residuals) != len(names) or None in match:
-        report_singular(residuals, names, incidence, match, where, mistakes)
+        report_singular(residuals, names, incidence, match, where, mistakes, place)
         return None
     system = _System(residuals, names, jets, vanishes)
     if not system.differentiate_constraints(mistakes):
@@ -131,8 +138,8 @@ class _System:
             row = start
             while (stuck := self._augment(row, computed_by, computes)) is not None:
                 rows, names = stuck
-                if empty := [one for one in rows if not self.held[one]]:
-                    self._report_empty(empty[0], mistakes)
+                if still := [one for one in rows if not self._moves_on(one)]:
+                    self._report_empty(still[0], mistakes)
                     return False
                 for name in names:
                     self.order[name] += 1
@@ -180,10 +187,24 @@ class _System:
             report_no_derivative(residual, missing, mistakes)
             return False
         self.derivative[row], self.integral[len(self.residuals)] = len(self.residuals), row
+        if any(count >= LARGEST for count, _ in enumerate(sympy.preorder_traversal(expression))):
+            self._report_endless([row], mistakes)
+            return False
         made = Residual(expression, residual.equation)
         self.residuals.append(made)
         self._hold(made)
         return True
+
+    def _moves_on(self, row: int) -> bool:
+        """Return whether an equation holds what a derivative of it may determine.
+
+        One that holds nothing has cancelled. One whose derivatives hold nothing new, though conditions were
+        passed by that hold higher ones, asks for its unknowns in conditions only.
+        """
+        held, same = self.held[row], 0
+        while (before := self.integral.get(row)) is not None and self.held[before] == held:
+            row, same = before, same + 1
+        return bool(held) and same <= max(held.values())
 
     def _report_empty(self, row: int, mistakes: Mistakes) -> None:
         """Say that what an equation holds cancels, in itself or in its derivative."""

@@ -17,6 +17,7 @@ from apc.compiler.equations.matching import leftovers
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.words import counted
 
+SCENE = Place("topology")
 MOST_LISTED = 8  # equations or unknowns in one message
 
 
@@ -46,6 +47,7 @@ def report_singular(
     match: Sequence[int | None],
     where: str,
     mistakes: Mistakes,
+    place: Place = SCENE,
 ) -> None:
     """Add the mistake E502: which equations and which unknowns are too many.
 
@@ -61,10 +63,12 @@ def report_singular(
         Which partition that is, for the message.
     mistakes
         Takes the mistake.
+    place
+        Where to point when there is no equation.
     """
     found = leftovers(incidence, match)
     parts = []
-    place = residuals[0].equation.place if residuals else Place("topology")
+    place = residuals[0].equation.place if residuals else place
     if found.over_rows:
         place = next(r for i, r in enumerate(residuals) if i not in match).equation.place
         count = counted(len(found.over_columns), "unknown")

@@ -31,7 +31,7 @@ from apc.compiler.equations.clocks import (
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.index import reduce_index, report_no_derivative
 from apc.compiler.equations.jets import Jets
-from apc.compiler.equations.residuals import Residual, report_no_number
+from apc.compiler.equations.residuals import SCENE, Residual, report_no_number
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
 from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, symbol, to_sympy
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Given, Vanishing
@@ -167,7 +167,8 @@ def sort_kind(
             continue
         unknowns = [symbol(name) for name in clock.variables]
         where = f"the equations of clock {clock.clock}"
-        found = solve_blocks(own, unknowns, where, mistakes, nonzero=divisors, vanishes=vanishes)
+        place = next((one.place for one in (*clock.equations, *kind.flat.equations)), SCENE)
+        found = solve_blocks(own, unknowns, where, mistakes, nonzero=divisors, vanishes=vanishes, place=place)
         partitions.append(SortedPartition(clock.clock, found))
     return SortedKind(
         kind,
@@ -204,7 +205,7 @@ def _sort_continuous(
     where = "the continuous equations"
     held = [hold.symbol for hold in kind.holds]
     started = {variable.name for variable in kind.flat.variables if variable.start}
-    place = partition.equations[0].place if partition.equations else Place("topology")
+    place = next((one.place for one in (*partition.equations, *kind.flat.equations)), SCENE)
     # What is read, each as an equation of its own, `sample(x) = x`, for messages.
     reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, place) for s in kind.samples]
     reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.sends]
@@ -224,7 +225,7 @@ def _sort_continuous(
     jets = jets.renamed(aliases.kept, aliases.velocities)
     probes = _probes(reads, read_values, jets)
     reduced = reduce_index(
-        [*residuals, *probes.values()], jets.names, started, jets, where, mistakes, vanishes
+        [*residuals, *probes.values()], jets.names, started, jets, where, mistakes, vanishes, place
     )
     if reduced is None:
         return _Continuous()
@@ -232,7 +233,13 @@ def _sort_continuous(
     _check_starts(states, started, partition.equations, mistakes)
     named = tuple((f"der({x})", symbol(v)) for x, v in aliases.velocities.items() if x in states)
     solved = solve_blocks(
-        reduced.residuals, reduced.unknowns, where, mistakes, nonzero=divisors, vanishes=vanishes
+        reduced.residuals,
+        reduced.unknowns,
+        where,
+        mistakes,
+        nonzero=divisors,
+        vanishes=vanishes,
+        place=place,
     )
     return _Continuous(
         states,

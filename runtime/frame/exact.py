@@ -97,7 +97,7 @@ def evaluate_exact(
     Raises
     ------
     ValueError
-        The function holds an operation this walk does not know.
+        The function holds an operation this walk does not know, or one without a value.
     OverflowError
         A rational number takes more than BITS bits.
     """
@@ -115,6 +115,8 @@ def evaluate_exact(
         elif code == casadi.OP_OUTPUT:
             results[outputs[0]][outputs[1]] = work[inputs[0]]
         elif code == casadi.OP_CONST:
+            if math.isnan(constant):
+                raise ValueError("math domain error")  # of constants alone, which CasADi evaluates at once
             work[outputs[0]] = number(constant)
         elif code in own:
             work[outputs[0]] = own[code](*(work[place] for place in inputs))

@@ -161,9 +161,9 @@ def _functions(kind: Kind) -> list[Any]:
 
 def _refuse_loop_with_edges(kind: Kind) -> None:
     """Refuse what neither the scalar walk nor the implicit function theorem covers yet."""
-    receives = [receive for partition in kind.clocks for receive in partition.receives]
-    edges = [receive.edge for receive in receives if receive.edge is not None]
-    if edges and not all(function.is_a("SXFunction") for function in (*_functions(kind), *edges)):
+    heard = [receive for part in kind.clocks for receive in part.receives if edge_name(part, receive)]
+    edges = [receive.edge for receive in heard if receive.edge is not None]
+    if heard and not all(function.is_a("SXFunction") for function in (*_functions(kind), *edges)):
         what = (
             "has a nonlinear loop and a reduction that looks at each sender by itself; "
             "together they can't be linearized"
