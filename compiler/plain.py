@@ -44,7 +44,7 @@ _WORD = re.compile(r"[a-zA-Z][a-zA-Z0-9]*(_[a-zA-Z0-9]+)*\Z", re.ASCII)  # what 
 LONGEST_WORD = 200
 # CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
 # afterwards and squares the error: the rest is rounding. A bound on the residual would depend on its scale.
-NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100}
+NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100, "show_eval_warnings": False}
 
 _Columns = tuple[tuple[str, int], ...]  # of each: its name and how many entries it has
 
