@@ -437,9 +437,9 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
             own = own + np.abs(weights.real) @ below
             if wiring.moving:
                 inverse = np.abs(np.linalg.inv(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest]))
-                wide = np.abs(weights.real)
-                late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ wide + error @ turned
-                late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ wide)
+                heavy = np.abs(weights.real)
+                late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ heavy + error @ turned
+                late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ heavy)
                 own = own + (inverse @ late) @ np.abs(matrix.real[:, held[:, None], rest])
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)

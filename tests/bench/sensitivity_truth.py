@@ -52,6 +52,9 @@ APART = 1e-30
 # state's own must be to have an angle.
 POINTS, LEAST = 6, 1e-6
 
+# Beside what is computed, a motion this small is what the truth's own rounding makes.
+STILL = 1e-40
+
 # Motions that turn further than this in a frame, in radians, take too long to follow.
 MOST_TURN = 500.0
 
@@ -197,8 +200,8 @@ def _vectors(matrix: Any, own: Sequence[Any]) -> tuple[Any, Any]:
     start = flint.acb_mat(n, c, [flint.acb(generator.uniform(-1, 1)) for _ in range(n * c)])
     right, left = start, start
     for _ in range(4):
-        right = _scaled(shifted.solve(right).mid())
-        left = _scaled(shifted.transpose().solve(left).mid())
+        right = _scaled(shifted.solve(right, algorithm="approx"))
+        left = _scaled(shifted.transpose().solve(left, algorithm="approx"))
     w = left.transpose()
     return (w * right).inv() * w, right
 
@@ -333,6 +336,8 @@ def _turns(scene: Happening, frame: Fraction, state: Sequence[Any]) -> list[floa
             note()
     course = np.array(rows)
     largest = np.abs(course).max(axis=0)
+    if largest.max(initial=0.0) < STILL * max(float(abs(one)) for one in state):
+        return []  # nothing but computed values moves: they turn by whole ticks
     found = []
     for place in np.flatnonzero(largest > LEAST * largest.max(initial=0.0)):
         path = course[:, place][np.abs(course[:, place]) > 0]
