@@ -85,3 +85,7 @@ def test_digits_that_an_error_leaves_open_are_not_shown() -> None:
     assert known_digits(1645.3530049, 0.2, 7) == "1645"
     assert known_digits(1645.3530049, 3e3, 7) == "2e+03"
     assert known_digits(0.25, 0.0, 7) == "0.25"
+
+
+def test_nothing_is_measured_as_nothing() -> None:
+    assert measured(0.0, 0.0) == "0 ± 0"

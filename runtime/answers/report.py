@@ -119,6 +119,8 @@ def analysis_report(result: Analysis) -> str:
         lines += _note(note)
     lines.append("")
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
+    if not result.states_per_peer:
+        words = "Nothing here is free to move."
     if result.linearized:
         words = f"{NEAR_THE_START}\n{words}"
     lines += [f"  {line}" for line in words.splitlines()]
