@@ -93,8 +93,9 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedRo
         roundings = roundings_of(many, schedule, charges)
         gamma = roundings * UNIT / (1 - roundings * UNIT)
         errors = gamma * z_large, gamma * s_large
+        lost = {duration: charges[duration] * UNIT * size for duration, size in sizes.items()}
         if not all(float(one.max(initial=0.0)) <= HOPELESS for one in errors):
-            errors, estimated = _perturbed(many, schedule, (steps, sizes), (z, s), roundings), True
+            errors, estimated = _perturbed(many, schedule, (steps, lost), (z, s), roundings), True
         parts.append((z, s, *errors))
     z, s, z_error, s_error = (np.concatenate(part) for part in zip(*parts, strict=True))
     return LiftedRows(
@@ -124,7 +125,7 @@ def _perturbed(
     Parameters
     ----------
     site, schedule, steps
-        What the frame is composed of; the steps with their sizes, see `exponential_rows`.
+        What the frame is composed of; the steps with what their exponentials may be off by.
     frame
         The frame as it came out.
     size
@@ -132,9 +133,9 @@ def _perturbed(
     """
     random = np.random.default_rng(len(schedule.events))
 
-    def moved(matrix: Matrix, large: Matrix | None = None) -> Matrix:
-        by = matrix if large is None else large
-        return np.asarray(matrix + by * (size * UNIT * random.uniform(-1, 1, matrix.shape)))
+    def moved(matrix: Matrix, by: Matrix | float = 0.0) -> Matrix:
+        most = size * UNIT * np.abs(matrix) + by
+        return np.asarray(matrix + most * random.uniform(-1, 1, matrix.shape))
 
     errors = [size * UNIT * np.abs(one) for one in frame]
     for _ in range(PERTURBED_FRAMES):
