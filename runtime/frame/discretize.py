@@ -1,6 +1,6 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
-Takes: the matrices of dx/dt = A x + B u, exact. Gives: `Step`, `discretize`; `step_balls`.
+Takes: the matrices of dx/dt = A x + B u, exact. Gives: `Step`, `discretize`, `moved_together`; `step_balls`.
 Guarantees: every entry is right to the last digit but one, proved by ball arithmetic, whether a mode dies
 out in a nanosecond or never.
 Does not: know when anything happens (see `scheduling`).
@@ -102,7 +102,7 @@ def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Intege
     ApcError
         E812 too many states move together.
     """
-    for states in _together(a):
+    for states in moved_together(a):
         if len(states) > MOST_TOGETHER:
             what = (
                 f"{len(states)} states of one peer move together in continuous time, "
@@ -115,7 +115,7 @@ def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Intege
             yield states, inputs[begin : begin + step]
 
 
-def _together(a: NDArray[Any]) -> Iterator[Integers]:
+def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
     """Yield the states in sets between which A has no entry."""
     neighbours: list[set[int]] = [set() for _ in a]
     for row, column in np.argwhere(a != 0).tolist():
