@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.discretize import PRECISIONS, TOO_LARGE, UNIT
+from apc.runtime.frame.discretize import PRECISIONS, TOO_LARGE, UNIT, moved_together
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.lift import COEFFICIENT_ROUNDINGS, lift
@@ -38,6 +38,9 @@ SEED = 20_090_616
 
 # Sites of one kind that are checked: they differ in numbers only, which the functions take as they come.
 MOST_CHECKED = 3
+
+# Evaluations that compare a function with its slopes: each costs as much as the function is long.
+MOST_PROBES = 64
 
 # The exponential is a Taylor series of X = A T/2^k with norms below 2^−16 and so many terms, then squared k
 # times: what is left out of every mode is below 2^−(16·25)/25! of it, less than 2^−480.
@@ -185,6 +188,8 @@ class _Stepped:
         self.kind = exact.kind
         p = exact_numbers(exact.kind, parameters)
         self.rates = _agreed(exact.kind.derivative, (exact.a, exact.b), p)
+        self.parts = [(states.tolist(), _picked(self.rates, states.tolist())) for states in moved_together(exact.a)]
+        self.steps: dict[Fraction, list[tuple[list[int], Any, Any]]] = {}
         self.ticks = [
             _agreed(clock.tick, (one.x, one.u, one.m, one.r), p)
             for clock, one in zip(exact.kind.clocks, exact.ticks, strict=True)
@@ -195,28 +200,52 @@ class _Stepped:
         ]
 
     def propagated(self, x: list[Any], u: list[Any], duration: Fraction) -> list[Any]:
-        """Return x after `duration` seconds: dx/dt = A x + B u with u constant, by exp([A Bu; 0 0] T)."""
+        """Return x after `duration` seconds: dx/dt = A x + c with c = B u constant, x⁺ = e^{AT} x + φ₁(AT) T c."""
         import flint
 
         n = len(x)
         constant = _times(self.rates, [flint.arb(0)] * n + u)
-        seconds = flint.arb(flint.fmpq(duration.numerator, duration.denominator))
-        entries = [
-            entry
-            for row, rate in zip(self.rates.tolist(), constant, strict=True)
-            for entry in (*row[:n], rate)
-        ]
-        whole = flint.arb_mat(n + 1, n + 1, entries + [0] * (n + 1)) * seconds
-        norm = max((sum(abs(float(one)) for one in row[:n]) for row in whole.tolist()[:n]), default=0.0)
-        squarings = max(0, int(np.ceil(np.log2(norm / SMALL)))) if 0 < norm < np.inf else 0
-        whole = whole / 2**squarings
-        unit = flint.arb_mat(n + 1, n + 1, [int(i == j) for i in range(n + 1) for j in range(n + 1)])
-        step = unit
-        for term in range(TERMS, 0, -1):
-            step = unit + whole * step / term
-        for _ in range(squarings):
-            step = step * step
-        return _times(step, [*x, flint.arb(1)])[:n]
+        if duration not in self.steps:
+            seconds = flint.arb(flint.fmpq(duration.numerator, duration.denominator))
+            self.steps[duration] = [(states, *_step(rates, seconds)) for states, rates in self.parts]
+        after = list(x)
+        for states, whole, mean in self.steps[duration]:
+            moved = _times(whole, [x[i] for i in states])
+            pushed = _times(mean, [constant[i] for i in states])
+            for i, one, other in zip(states, moved, pushed, strict=True):
+                after[i] = one + other
+        return after
+
+
+def _step(rates: Any, seconds: Any) -> tuple[Any, Any]:
+    """Return e^{AT} and φ₁(AT) T, φ₁(X) = I + X/2! + X²/3! + …, by φ₁(2X) = (e^X + 1) φ₁(X)/2."""
+    import flint
+
+    n = rates.nrows()
+    whole = rates * seconds
+    norm = max((sum(abs(float(one)) for one in row) for row in whole.tolist()), default=0.0)
+    squarings = max(0, int(np.ceil(np.log2(norm / SMALL)))) if 0 < norm < np.inf else 0
+    whole = whole / 2**squarings
+    unit = flint.arb_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
+    mean = unit
+    for term in range(TERMS, 0, -1):
+        mean = unit + whole * mean / (term + 1)
+    step = unit + whole * mean
+    for _ in range(squarings):
+        mean = (step * mean + mean) / 2
+        step = step * step
+    return step, mean * seconds
+
+
+def _probes(columns: int) -> Iterator[NDArray[np.int64]]:
+    """Yield inputs that tell the slopes: each column by itself or, of many, a few at once by random weights."""
+    together = -(-columns // MOST_PROBES)
+    weights = np.random.default_rng(SEED).integers(1, 2**16, columns) if together > 1 else np.ones(columns, np.int64)
+    for first in range(MOST_PROBES):
+        probe = np.zeros(columns, np.int64)
+        probe[first::MOST_PROBES] = weights[first::MOST_PROBES]
+        if probe.any():
+            yield probe
 
 
 def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) -> Any:
@@ -225,23 +254,38 @@ def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) ->
 
     whole = np.hstack(slopes)
 
-    def values(*, at: int | None) -> NDArray[Any]:
+    def values(probe: NDArray[np.int64]) -> NDArray[Any]:
         arguments, first = [], 0
         for size in (one.shape[1] for one in slopes):
-            arguments.append([Fraction(first + i == at) for i in range(size)])
+            arguments.append([Fraction(one) for one in probe[first : first + size].tolist()])
             first += size
         found = evaluate_exact(function, [*arguments, p, [Fraction(0)]])[0]
         return np.array([Fraction(one) for one in found], dtype=object)
 
-    still = values(at=None)
-    apart = np.array([abs(values(at=j) - still - whole[:, j]) for j in range(whole.shape[1])])
-    size = np.array([max(map(abs, row), default=Fraction(0)) for row in whole], dtype=object)
-    assert (apart <= COEFFICIENT_ROUNDINGS * Fraction(UNIT) * size).all(), (
-        f"the slopes of {function.name()} are not what it multiplies its inputs by"
-    )
     rows, columns = whole.shape
+    still = values(np.zeros(columns, np.int64))
+    size = np.array([max(map(abs, row), default=Fraction(0)) for row in whole], dtype=object)
+    filled = [np.flatnonzero(column) for column in (whole != 0).T]
+    for probe in _probes(columns):
+        expected = np.full(rows, Fraction(0), dtype=object)
+        for column in np.flatnonzero(probe).tolist():
+            touched = filled[column]
+            expected[touched] += whole[touched, column] * int(probe[column])
+        apart = abs(values(probe) - still - expected)
+        allowed = COEFFICIENT_ROUNDINGS * Fraction(UNIT) * int(probe.sum()) * size
+        assert (apart <= allowed).all(), (
+            f"the slopes of {function.name()} are not what it multiplies its inputs by"
+        )
     entries = [flint.arb(flint.fmpq(one.numerator, one.denominator)) for one in whole.ravel()]
     return flint.arb_mat(rows, columns, entries)
+
+
+def _picked(matrix: Any, places: list[int]) -> Any:
+    """Return the rows and columns of some places."""
+    import flint
+
+    size = len(places)
+    return flint.arb_mat(size, size, [matrix[i, j] for i in places for j in places])
 
 
 def _times(matrix: Any, vector: list[Any]) -> list[Any]:

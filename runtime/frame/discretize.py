@@ -1,6 +1,6 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
-Takes: the matrices of dx/dt = A x + B u, exact. Gives: `Step`, `discretize`; `step_balls`.
+Takes: the matrices of dx/dt = A x + B u, exact. Gives: `Step`, `discretize`, `moved_together`; `step_balls`.
 Guarantees: every entry is right to the last digit but one, proved by ball arithmetic, whether a mode dies
 out in a nanosecond or never.
 Does not: know when anything happens (see `scheduling`).
@@ -15,7 +15,7 @@ precision loses log₂(bT/m) bits where the mass is tiny. Arb's exponential (Joh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from apc.compiler.errors import ApcError, Mistake, Place
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 UNIT = float(np.finfo(np.float64).eps) / 2  # the unit roundoff of double precision
 
@@ -35,6 +36,10 @@ PRECISIONS = (128, 256, 512, 1024, 2048)
 # Radius asked of every ball, relative to the largest entry: far below a rounding of double precision.
 RADIUS = 2.0**-80
 
+
+# States whose exponential is one: its cost is their cube, half a minute for so many. Inputs beside fewer states.
+MOST_TOGETHER = 600
+FEWEST_INPUTS = 8
 
 # What a number below the range of floats may be off by when it is rounded to zero, in units of UNIT.
 UNDERFLOW = float(np.finfo(np.float64).tiny) / UNIT
@@ -67,10 +72,66 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
     Raises
     ------
     ApcError
-        E806 an entry of the exponential is too large for a float: something grows without measure within T.
+        E806 an entry of the exponential is too large for a float: something grows without measure within T;
+        E812 too many states move together.
     """
-    generator = _generator(a, b)
-    return tuple(_step(generator * _rational(duration), len(a)) for duration in durations)
+    n_x = len(a)
+    pieces = [
+        (states, np.concatenate([states, n_x + inputs]), _generator(a[np.ix_(states, states)], b[np.ix_(states, inputs)]))
+        for states, inputs in _pieces(a, b)
+    ]
+    steps = []
+    for duration in durations:
+        matrix = np.zeros((n_x, n_x + b.shape[1]))
+        size = np.full(matrix.shape, UNDERFLOW)
+        for states, places, generator in pieces:
+            piece = _step(generator * _rational(duration), len(states))
+            matrix[np.ix_(states, places)], size[np.ix_(states, places)] = piece.matrix, piece.size
+        steps.append(Step(matrix, size))
+    return tuple(steps)
+
+
+def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Integers]]:
+    """Yield states that move together with a few of the inputs that move them, until all are had.
+
+    What moves by itself has an exponential of its own, and so has each input's column of G: an array of a
+    thousand parts costs a thousand small cubes, not one of its own.
+
+    Raises
+    ------
+    ApcError
+        E812 too many states move together.
+    """
+    for states in moved_together(a):
+        if len(states) > MOST_TOGETHER:
+            what = (
+                f"{len(states)} states of one peer move together in continuous time, "
+                f"and {MOST_TOGETHER} are the most that are analysed"
+            )
+            raise ApcError(Mistake("E812", Place("the scene"), what, hint="smaller arrays, as count: 100"))
+        inputs = np.flatnonzero((b[states] != 0).any(axis=0))
+        step = max(len(states), FEWEST_INPUTS)
+        for begin in range(0, max(len(inputs), 1), step):
+            yield states, inputs[begin : begin + step]
+
+
+def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
+    """Yield the states in sets between which A has no entry."""
+    neighbours: list[set[int]] = [set() for _ in a]
+    for row, column in np.argwhere(a != 0).tolist():
+        neighbours[row].add(column)
+        neighbours[column].add(row)
+    left = dict.fromkeys(range(len(a)))
+    while left:
+        waiting = [next(iter(left))]
+        found = set(waiting)
+        while waiting:
+            new = neighbours[waiting.pop()] - found
+            found |= new
+            waiting += new
+        for one in found:
+            del left[one]
+        yield np.array(sorted(found), np.int64)
 
 
 def step_balls(a: NDArray[Any], b: NDArray[Any], duration: Fraction) -> NDArray[Any]:

@@ -38,6 +38,7 @@ from apc.runtime.frame.schedule import (
 from apc.runtime.frame.site import LinearSite
 
 MOST_PACKETS = 100_000  # of one peer: each has a name
+MOST_HELD = 1000  # values of one peer, computed and not acting yet: each is a row and a column of the frame's map
 
 # What happens when: the instant, the rank of its like among what happens at once, and itself; None only stops
 # the propagation there.
@@ -73,7 +74,7 @@ def build_schedules(
     Raises
     ------
     ApcError
-        E801 a mean, maximum or minimum over nobody; E805 too many ticks or packets in a frame.
+        E801 a mean, maximum or minimum over nobody; E805 too many ticks, packets or delayed values in a frame.
     """
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
     rank = {name: place for place, name in enumerate(order)}
@@ -84,6 +85,7 @@ def build_schedules(
     hearing = [hearing_of(system, patterns, exchange, group, read) for group in range(len(system.groups))]
     times = times_in_use(system, timings, patterns, live, hearing)
 
+    _check_held(system, patterns, live, times)
     known: dict[tuple[int, Hearing], dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]] = {}
     depth: dict[Sent, int] = {}
     for group, own in zip(system.groups, hearing, strict=True):
@@ -103,6 +105,34 @@ def build_schedules(
         for (kind, own), heard in known.items()
     }
     return tuple(built[group.kind, own] for group, own in zip(system.groups, hearing, strict=True))
+
+
+def _check_held(
+    system: CompiledSystem,
+    patterns: Sequence[LinearSite],
+    live: Sequence[frozenset[tuple[int, int]]],
+    times: Times,
+) -> None:
+    """Refuse delays of forces so long that all that is computed meanwhile can't be remembered."""
+    for pattern, outputs in zip(patterns, live, strict=True):
+        held: dict[str, int] = {}
+        for hold, used in zip(pattern.kind.holds, live_holds(pattern, outputs), strict=True):
+            if used:
+                period = times.clocks[hold.clock].period
+                held[hold.delay] = held.get(hold.delay, 0) + times.delays[hold.delay] // period
+        number = sum(held.values())
+        if number <= MOST_HELD:
+            continue
+        longest = max(held, key=lambda name: held[name])
+        seconds = times.delays[longest] * times.quantum
+        what = (
+            f"with {longest} = {float(seconds):.6g} s each peer keeps {number:,} values that are computed and "
+            f"do not act yet; at most {MOST_HELD:,} can be analysed"
+        )
+        left = MOST_HELD - (number - held[longest])
+        fits = f"{longest}: {float(seconds * left / held[longest]):.3g} s, or a slower clock" if left > 0 else ""
+        hint = fits or "shorter delays of all forces, or a slower clock"
+        raise ApcError(Mistake("E805", Place(system.name), what, hint=hint))
 
 
 def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:

@@ -1,0 +1,87 @@
+"""Work that could grow without end is estimated first: refused with its number and the limit, or cheap."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apc.compiler.errors import ApcError, Place
+from apc.compiler.language import tables
+from apc.compiler.language.tables import read_table
+from apc.runtime.analysis.selfcheck import check_frame
+from apc.runtime.frame import discretize as discretizing
+from apc.runtime.frame import scheduling
+from apc.runtime.frame.discretize import discretize, moved_together
+from tests.topologies import AVERAGE, compiled, replaced, told
+
+NOWHERE = Place("scene.yaml", 7, 9)
+
+
+def table(folder: Path, text: str) -> Path:
+    path = folder / "users.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_table_is_refused_by_its_size_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = table(tmp_path, "device.mass [kg]\n0.1\n")
+    with path.open("r+b") as file:
+        file.truncate((64 << 20) + 1)
+    monkeypatch.setattr(tables.csv, "reader", lambda _: pytest.fail("it is read"))
+    assert told(read_table, path, NOWHERE) == [
+        f"scene.yaml:7:9: E701 the table {path} is larger than 64 MiB, the most it may have."
+    ]
+
+
+def test_the_columns_of_a_table_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "_heading", lambda *_: pytest.fail("a heading is read"))
+    path = table(tmp_path, ",".join(f"a{i} [kg]" for i in range(1001)) + "\n")
+    assert told(read_table, path, NOWHERE) == [
+        f"{path}:1:1: E702 the table has 1001 columns, and 1000 are the most. "
+        "Write: several groups, each with a table"
+    ]
+
+
+def test_a_heading_of_spaces_and_brackets_is_read_in_one_pass(tmp_path: Path) -> None:
+    for heading in (" " * 100_000 + "[", "[" * 100_000, "a" + " " * 100_000 + "] [kg]"):
+        (message,) = told(read_table, table(tmp_path, f"b [kg],{heading}\n"), NOWHERE)
+        assert ":1:8: E702 a heading wants a name and its unit" in message
+
+
+@pytest.mark.parametrize("cell", ["1_0", "١٠", "nan", "infinity", "0x10"])
+def test_a_cell_is_a_plain_number(tmp_path: Path, cell: str) -> None:
+    path = table(tmp_path, f"device.mass [kg]\n{cell}\n")
+    assert told(read_table, path, NOWHERE) == [f"{path}:2:1: E703 a cell wants a finite number, got {cell}."]
+
+
+def test_delays_of_forces_are_refused_by_what_they_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduling, "_build", lambda *_: pytest.fail("a schedule is built"))
+    late = compiled(replaced(AVERAGE, ("clock: haptic, delay: 1 ms}", "clock: haptic, delay: 10 s}")))
+    assert told(check_frame, late) == [
+        "three-users-average: E805 with contact.delay = 10 s each peer keeps 10,001 values that are computed and "
+        "do not act yet; at most 1,000 can be analysed. Write: contact.delay: 0.999 s, or a slower clock"
+    ]
+
+
+def test_what_moves_together_has_a_limit_and_what_is_apart_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(discretizing, "MOST_TOGETHER", 3)
+    rates = np.array([[Fraction(-i - 1)] for i in range(4)])
+    apart = np.where(np.eye(4, dtype=bool), rates, Fraction(0))
+    step = discretize(apart, np.ones((4, 20)), [Fraction(1)])[0].matrix
+    decay = np.exp(-np.arange(1.0, 5))
+    assert step[:, :4] == pytest.approx(np.diag(decay), rel=1e-15)
+    assert step[:, 4:] == pytest.approx(np.outer((1 - decay) / np.arange(1.0, 5), np.ones(20)), rel=1e-15)
+    monkeypatch.setattr(discretizing, "_step", lambda *_: pytest.fail("an exponential is taken"))
+    with pytest.raises(ApcError, match="E812 4 states of one peer move together .*, and 3 are the most"):
+        discretize(np.full((4, 4), Fraction(1)), np.ones((4, 1)), [Fraction(1)])
+
+
+def test_states_move_together_where_one_enters_the_rate_of_another() -> None:
+    rates = np.zeros((6, 6))
+    rates[0, 3] = rates[3, 5] = rates[1, 1] = rates[4, 2] = 1
+    assert [one.tolist() for one in moved_together(rates)] == [[0, 3, 5], [1], [2, 4]]
