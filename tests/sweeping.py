@@ -26,7 +26,7 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
 
 # Waits once it has kept so many parts: however late it is stopped from outside, it has done no more.
 _WAITING = """\
-import signal, sys
+import sys, time
 from apc.__main__ import run
 from apc.runtime.sweep.store import Parts
 kept, write = [], Parts.write
@@ -34,8 +34,8 @@ kept, write = [], Parts.write
 def write_and_wait(*arguments):
     write(*arguments)
     kept.append(arguments)
-    if len(kept) == int(sys.argv[1]):
-        signal.pause()
+    while len(kept) == int(sys.argv[1]):  # signal.pause() would miss a signal that comes just before it
+        time.sleep(0.01)
 
 Parts.write = write_and_wait
 sys.exit(run(["sweep", *sys.argv[2:]]))

@@ -76,10 +76,10 @@ def _text(changes: dict[str, str]) -> str:
 @pytest.mark.parametrize("place", VARYING)
 def test_a_coefficient_that_changes_with_time_is_refused_by_name(place: str, tmp_path: Path) -> None:
     system = compiled(SCENE, library(tmp_path, _text(VARYING[place])))
-    with pytest.raises(ApcError, match=r"scene\.yaml: E809 the equation of .* changes with time"):
+    with pytest.raises(ApcError, match=r"scene\.yaml: E810 the equation of .* changes with time"):
         analyze(system)
     for asked in (lambda: lifted_groups(system), lambda: refuse_varying(system, prepare(system).jacobians)):
-        with pytest.raises(ApcError, match="E809"):
+        with pytest.raises(ApcError, match="E810"):
             asked()
 
 
@@ -121,7 +121,7 @@ def test_a_scene_whose_slopes_change_with_time_is_compiled_and_says_so(tmp_path:
 def test_a_scan_and_a_map_refuse_what_an_analysis_refuses(tmp_path: Path) -> None:
     system = compiled(SCENE, library(tmp_path, _text(VARYING["a tick"])))
     free = Free("w.k")
-    with pytest.raises(ApcError, match="E809"):
+    with pytest.raises(ApcError, match="E810"):
         evaluator(system, [free])
-    with pytest.raises(ApcError, match="E809"):
+    with pytest.raises(ApcError, match="E810"):
         critical(system, "w.k")

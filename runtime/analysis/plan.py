@@ -69,14 +69,14 @@ def refuse_varying(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -
     Raises
     ------
     ApcError
-        E809 such an equation.
+        E810 such an equation.
     """
     for site in jacobians:
         if names := varying_slopes(site):
             what = f"the equation of {names[0]} multiplies what moves by what changes with time"
             why = "no one frame stands for all others, so that no verdict can be had; a simulation plays it"
             place = Place(system.origin.topology)
-            raise ApcError(Mistake("E809", place, f"{what}: {why}", hint="apc simulate"))
+            raise ApcError(Mistake("E810", place, f"{what}: {why}", hint="apc simulate"))
 
 
 def make_plan(

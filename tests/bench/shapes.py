@@ -339,7 +339,7 @@ def timed(generator: random.Random) -> Shape:
     kind = generator.choice(["Timed", "Pushed"])
     text = f"topology: timed\n{clocks}peers: {{user: {{count: 2}}}}\n{BODIES}couplers:\n{_contact('haptic', '0 s')}"
     text += f"  own: {{type: {kind}, a: device, b: ground, stiffness: 100 N/m, clock: haptic}}\n"
-    return Shape(text, MASSES | CONTACT | {"own.stiffness": (-1, 4, 0)}, "E809" if kind == "Timed" else "")
+    return Shape(text, MASSES | CONTACT | {"own.stiffness": (-1, 4, 0)}, "E810" if kind == "Timed" else "")
 
 
 SHAPES: Mapping[str, Callable[[random.Random], Shape]] = {
