@@ -19,13 +19,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
 import math
 import re
 import types
 import typing
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ from apc.compiler.cache import (
     read_archive,
     record_of,
 )
-from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind
+from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind, counts_peers
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_file, write_file
 from apc.compiler.plain import PlainFunction, plain, read_function
@@ -103,7 +104,9 @@ def unpacked(archive: Archive, path: Path) -> CompiledSystem:
     document = archive.document
     if document["format"] != FORMAT:
         what = f"has format version {_shown(document['format'])}, this program reads version {FORMAT}"
-        raise ApcError(Mistake("E603", Place(str(path)), what, hint=f"apc compile {path.stem}.yaml"))
+        raise ApcError(
+            Mistake("E603", Place(str(path)), what, hint=f"apc compile {path.with_suffix('.yaml')}")
+        )
     system = _typed(CompiledSystem, document["system"], archive.members)
     assert isinstance(system, CompiledSystem)
     if not _is_consistent(system):
@@ -233,6 +236,7 @@ def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], paramet
             for partition in kind.clocks
             for receive in partition.receives
         )
+        and all(_is_rounding(kind, place, exact) for place, exact in kind.rounded)
         and parameters_of.issuperset(state.start for state in kind.states)
         and partitions.keys() <= clocks
         and all(len(partition.units) == len(partition.outputs) for partition in kind.clocks)
@@ -257,8 +261,20 @@ def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], paramet
     )
 
 
+def _is_rounding(kind: Kind, place: int, exact: Sequence[Fraction]) -> bool:
+    """Return whether a count of a kind may be these rationals, in order, each float one of them at most."""
+    try:
+        floats = [float(one) for one in exact]
+    except OverflowError:
+        return False
+    known = 0 <= place < len(kind.parameters) and counts_peers(kind.parameters[place])
+    return known and all(a < b for a, b in itertools.pairwise(floats))
+
+
 def _damaged(path: Path, why: str) -> ApcError:
-    mistake = Mistake("E604", Place(str(path)), f"is damaged: {why}", hint=f"apc compile {path.stem}.yaml")
+    mistake = Mistake(
+        "E604", Place(str(path)), f"is damaged: {why}", hint=f"apc compile {path.with_suffix('.yaml')}"
+    )
     return ApcError(mistake)
 
 

@@ -25,4 +25,4 @@ def versions(*libraries: str) -> tuple[tuple[str, str], ...]:
 
 def install_line(extra: str) -> str:
     """Return the line that installs an extra (one of pyproject.toml's), from the checkout."""
-    return f"pip install '.[{extra}]'  (in the folder of apc's own pyproject.toml)"
+    return f"pip install '.[{extra}]'  # in the folder of apc's own pyproject.toml"

@@ -18,5 +18,5 @@ def check_suffix(path: Path, known: Iterable[str], option: str) -> None:
     names = tuple(known)
     if path.suffix.lower() not in names:
         wanted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
-        what, hint = f"the suffix of {option}", f"{path.stem}{names[0]}"
+        what, hint = f"the suffix of {option}", f"{option} {path.with_suffix(names[0])}"
         raise ApcError(Mistake("E878", Place(str(path)), what, wanted, path.suffix or "none", hint))

@@ -39,9 +39,9 @@ from apc.compiler.scene.scene import Scene, SceneGroup
 
 PEERS = Name(("peers",))
 
-# The functions whose value hangs on those of their arguments at the same moment, and on nothing else.
 _HELD = "held"  # with a number behind it, the name of an expression that is held
 
+# The functions whose value hangs on those of their arguments at the same moment, and on nothing else.
 POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "exp", "log", "sin", "cos", "tanh", "floor"))
 
 

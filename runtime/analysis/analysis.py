@@ -27,6 +27,7 @@ from apc.runtime.eigen.rigid import LENGTHS, what_stands
 from apc.runtime.eigen.spectrum import (
     DRIFTS,
     STABLE_TRANSLATING,
+    TO_DRIFT,
     Mode,
     Spectrum,
     finite,
@@ -196,7 +197,7 @@ def analyze(
         verdict, stable = spectrum.verdict, spectrum.stable
         if unfelt and verdict in (STABLE_TRANSLATING, DRIFTS):
             verdict, stable = judge([True], translations, drifts)
-        proof = spectrum.proof if verdict == DRIFTS else spectrum.proof.replace("to drift", "stable")
+        proof = spectrum.proof if verdict == DRIFTS else spectrum.proof.replace(TO_DRIFT, "stable")
         if proof and linearized:
             proof += ", of the linearization"
     return Analysis(
@@ -217,7 +218,7 @@ def analyze(
         linearized=linearized,
         notes=(*plan.notes, *notes, *spectrum.notes),
         proof=proof,
-        left_out=left_out(system),
+        left_out=left_out(system, linear=not linearized),
         unfelt=unfelt,
         translations=translations,
     )

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
+from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.language.evaluation import OPERATORS, Operation, compute
 from apc.compiler.language.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not
@@ -112,6 +113,7 @@ def _percentage(text: str, whole: str, place: Place) -> Fraction:
     if not number.endswith("%"):
         raise _malformed(whole, place)
     try:
+        plain_float(number[:-1])  # Fraction reads more than a plain number
         share = Fraction(number[:-1].strip()) / 100
     except (ValueError, ZeroDivisionError):
         raise _malformed(whole, place) from None

@@ -35,7 +35,6 @@ LEAST_SHARE = 0.005  # shows as zero
 HEADINGS = ("magnitude", "shape", "times", "frequency", "damping", "moves most")
 
 LINEARIZED = ", linearized at its start"
-NEAR_THE_START = "The scene is not linear: this is said of small motions around the start."
 
 _WORDS = {
     "stable": "Every motion dies out.",
@@ -121,8 +120,6 @@ def analysis_report(result: Analysis) -> str:
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
     if not result.states_per_peer:
         words = "Nothing here is free to move."
-    if result.linearized:
-        words = f"{NEAR_THE_START}\n{words}"
     lines += [f"  {line}" for line in words.splitlines()]
     removed = ""
     if result.translations:

@@ -60,11 +60,11 @@ def _check_order(path: str, file: str | None) -> None:
     if Path(path).suffix.lower() not in SCENES:
         return
     got, name = f"{path}, then {file}", file
-    if file is None:
+    if file is None or Path(file).suffix.lower() in SCENES:  # then a name of the scene's own is shown
         from apc.inputs import open_scene
         from apc.runtime.vary.margins import coupler_parameters
 
-        got = f"{path} alone"
+        got = got if file else f"{path} alone"
         name = next((one.label for one in coupler_parameters(open_scene(path, ()))), None)
     hint = f"apc critical {name} {path}" if name else ""
     wanted = "a parameter or delay, then the scene"

@@ -140,7 +140,7 @@ def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...]
     pairs, weights = arcs(graph, n)
     plain = np.zeros((n, n))
     np.add.at(plain, (pairs[:, 1], pairs[:, 0]), weights)
-    sums = plain.sum(axis=1)
+    sums = sum_weights(pairs[:, 1], weights, n).floats  # those that cancel lose no digits
     matrix = plain / sums[:, None] if mean else plain
     size = EIGEN_ROUNDINGS * n * UNIT
     if np.array_equal(plain, plain.T) and (not mean or np.all(sums > 0)):

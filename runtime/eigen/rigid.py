@@ -87,8 +87,8 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     pairs = [state for _, state in _drifts(system, exact, numbering, still)] if still and with_drifts else []
     n = len(system.names)
     return RigidModes(
-        directions=_columns(vectors, n),
-        generalized=_columns(pairs, n),
+        directions=exact_columns(vectors, n),
+        generalized=exact_columns(pairs, n),
         names=tuple(
             ", ".join(name for name, entry in zip(system.names, vector, strict=True) if entry)
             for vector in vectors
@@ -569,7 +569,7 @@ def _independent(vectors: Sequence[Sequence[Fraction]]) -> list[int]:
     return [next(c for c in range(len(vectors)) if reduced[line, c] != 0) for line in range(rank)]
 
 
-def _columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
+def exact_columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
     """Return exact vectors as the columns of a float matrix (n, len(vectors))."""
     return (
         np.array([[float(entry) for entry in vector] for vector in vectors], dtype=np.float64)

@@ -183,6 +183,10 @@ def _is_open(one: _Solved, lowest: float) -> bool:
     return (one.inside is None and not lowest > 1) or not one.high - one.low <= WIDE * max(one.low, 1.0)
 
 
+# What a proof says of a scene that drifts; a drift that nothing reads is none of the scene's.
+TO_DRIFT = "to drift"
+
+
 def _proof_in_words(solved: Sequence[_Solved], drifts: int) -> str:
     """Say what was proved, "" where floats decided everything."""
     bits = max((one.bits for one in solved), default=0)
@@ -195,7 +199,7 @@ def _proof_in_words(solved: Sequence[_Solved], drifts: int) -> str:
         return f"undecided at {bits} bits"
     if unstable or not all(one.bits for one in solved if one.modes):
         return f"decided with {bits} bits where floats left it open"
-    return f"proved {'to drift' if drifts else 'stable'} with {bits} bits"
+    return f"proved {TO_DRIFT if drifts else 'stable'} with {bits} bits"
 
 
 def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[str, bool | None]:

@@ -77,7 +77,11 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
     """
     n_x = len(a)
     pieces = [
-        (states, np.concatenate([states, n_x + inputs]), _generator(a[np.ix_(states, states)], b[np.ix_(states, inputs)]))
+        (
+            states,
+            np.concatenate([states, n_x + inputs]),
+            _generator(a[np.ix_(states, states)], b[np.ix_(states, inputs)]),
+        )
         for states, inputs in _pieces(a, b)
     ]
     steps = []

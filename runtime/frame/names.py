@@ -73,7 +73,7 @@ def is_named(name: str) -> bool:
     What the compiler counts, as `peers` and `count(lan)`, and the delay of a hold without one or by an
     expression, are not the user's to vary: their names hold what no name in a scene can.
     """
-    return name != PEERS and not set(name) & set(" (")
+    return not counts_peers(name) and " " not in name
 
 
 def named_times(system: CompiledSystem) -> list[Timing]:

@@ -9,6 +9,7 @@ Does not: read or apply overrides (`overrides`); build a matrix (`linearize`, `s
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -64,5 +65,7 @@ def exact_numbers(kind: Kind, vector: Floats) -> list[Fraction]:
     """
     numbers = [Fraction(value) for value in vector.tolist()]
     for place, rationals in kind.rounded:
-        numbers[place] = next((one for one in rationals if float(one) == vector[place]), numbers[place])
+        near = bisect_left(rationals, vector[place], key=float)
+        assert float(rationals[near]) == vector[place], f"{kind.parameters[place]} is none of its values"
+        numbers[place] = rationals[near]
     return numbers

@@ -27,7 +27,7 @@ from apc.runtime.eigen.loop import Loop
 from apc.runtime.eigen.modes import complete_loops
 from apc.runtime.eigen.peer_group import PeerGroup, states_of, used_ways
 from apc.runtime.eigen.peers import group_of_row
-from apc.runtime.eigen.rigid import find_rigid_modes, stays_rigid
+from apc.runtime.eigen.rigid import exact_columns, find_rigid_modes, stays_rigid
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.exchange import Exchange
 from apc.runtime.frame.linearize import site_of_entries
@@ -138,7 +138,7 @@ def free_motions(listed: Sequence[Crowd], exchange: Exchange) -> FreeMotions | N
     rest = list(_echelon(common).values())
     return FreeMotions(
         tuple(
-            _columns(list(motions.values()), b - a)
+            exact_columns(list(motions.values()), b - a)
             for motions, (a, b) in zip(own, itertools.pairwise(ends), strict=True)
         ),
         tuple(tuple(motions) for motions in own),
@@ -253,11 +253,6 @@ def _subtract(vector: list[Fraction], times: Fraction, other: Sequence[Fraction]
     if times:
         for place, entry in enumerate(other):
             vector[start + place] -= times * entry
-
-
-def _columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
-    """Return exact vectors as the columns of a matrix (n, len(vectors))."""
-    return np.array([[float(entry) for entry in one] for one in vectors], np.float64).reshape(-1, n).T
 
 
 def hold_for_all(loop: Loop, listed: Sequence[Crowd], *, exchange: Exchange | None = None) -> bool:

@@ -272,7 +272,7 @@ def region(
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]
-        linear = all(site.parameters_suffice for site in used)
+        closed_form = all(site.parameters_suffice for site in used)
         affine = all(site.affine for site in used)
         times = [place for place, one in enumerate(free) if reaches_time(system, one)]
         source: BatchEvaluator | PointEvaluator
@@ -281,7 +281,7 @@ def region(
         else:
             source = evaluator(system, free, prepared=prepared)
         found: Striped | None = None
-        if linear and len(times) == 1:
+        if closed_form and len(times) == 1:
             found = trace_strips(
                 system, axes, times[0], prepared, cells=cells, tolerance=tolerance, told=told
             )
@@ -301,7 +301,7 @@ def region(
         finest=found.finest,
         corner=found.corner,
         stepped=stepped,
-        linearized=not linear,
+        linearized=not affine,
         left_out=left_out(system, linear=affine),
         system=system,
     )

@@ -25,6 +25,7 @@ from apc.runtime.frame.discretize import discretize
 from apc.runtime.frame.exact import evaluate_exact
 from apc.runtime.frame.guards import guards_of
 from apc.runtime.frame.jacobians import structural_pattern
+from apc.runtime.frame.parameters import exact_numbers
 
 Floats = NDArray[np.float64]
 Pattern = NDArray[np.bool_]
@@ -160,7 +161,9 @@ def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fractio
     kind = rates_of.kind
     n_x, n_u = len(kind.states), len(kind.holds)
     if rates_of.matrices.is_a("SXFunction"):
-        exact = evaluate_exact(rates_of.matrices, [[Fraction(float(one)) for one in parameters]])[0]
+        exact = evaluate_exact(
+            rates_of.matrices, [exact_numbers(kind, np.asarray(parameters, dtype=np.float64))]
+        )[0]
     else:
         exact = [Fraction(float(one)) for one in np.asarray(rates_of.matrices(parameters)).ravel()]
     whole = np.array(exact, dtype=object).reshape((n_x, n_x + n_u + 1), order="F")

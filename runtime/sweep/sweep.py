@@ -25,6 +25,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, with_unit, wrapped
 from apc.runtime.frame.names import Free
+from apc.runtime.frame.jacobians import jacobians
 from apc.runtime.network.nominal import left_out, refuse_channel_number
 from apc.runtime.sweep.grid import Grid, build_grid, check_size, parse_axis
 from apc.runtime.sweep.local import Workers, cores, local_processes, this_process
@@ -201,7 +202,7 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
         "topology": system.name,
         "peers": system.peers,
         "of": work.of,
-        "left_out": list(left_out(system)),
+        "left_out": list(left_out(system, linear=all(jacobians(kind).affine for kind in system.kinds))),
         "points": work.grid.points,
         "over": [
             {"parameter": axis.label, "unit": axis.unit, "values": [float(value) for value in axis.values]}

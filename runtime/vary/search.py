@@ -290,12 +290,15 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
         held = bracket_in_floats(root, all_of_them, low=low, high=high)
         if held is None and _alike(*(all_of_them(one) for one in beside)):
             return None
-        return _described(root, held, [(one, _free(one)) for one in all_of_them(root.value)])
+        return _described(root, held, list(with_rigid(all_of_them(root.value))))
 
     @functools.cache
     def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
         listed = zip(family.exact_at(point(value)), family.wirings, strict=True)
-        return [(one, _free(one) if wiring.moving else wiring.rigid) for one, wiring in listed]
+        return [
+            (one, find_rigid_modes(one, with_drifts=False) if wiring.moving else wiring.rigid)
+            for one, wiring in listed
+        ]
 
     def at(value: float) -> ClosedSystem:
         return family.system_at(point(value), root.system)
@@ -318,10 +321,6 @@ def _alike(one: Sequence[ClosedSystem], other: Sequence[ClosedSystem]) -> bool:
     """Say whether the analyses on both sides of a root have one verdict: floats alone took it for one."""
     sides = [solve_spectrum(systems).stable for systems in (one, other)]
     return sides[0] is not None and sides[0] == sides[1]
-
-
-def _free(system: ClosedSystem) -> RigidModes:
-    return find_rigid_modes(system, with_drifts=False)
 
 
 def _described(
