@@ -188,7 +188,9 @@ class _Stepped:
         self.kind = exact.kind
         p = exact_numbers(exact.kind, parameters)
         self.rates = _agreed(exact.kind.derivative, (exact.a, exact.b), p)
-        self.parts = [(states.tolist(), _picked(self.rates, states.tolist())) for states in moved_together(exact.a)]
+        self.parts = [
+            (states.tolist(), _picked(self.rates, states.tolist())) for states in moved_together(exact.a)
+        ]
         self.steps: dict[Fraction, list[tuple[list[int], Any, Any]]] = {}
         self.ticks = [
             _agreed(clock.tick, (one.x, one.u, one.m, one.r), p)
@@ -200,7 +202,7 @@ class _Stepped:
         ]
 
     def propagated(self, x: list[Any], u: list[Any], duration: Fraction) -> list[Any]:
-        """Return x after `duration` seconds: dx/dt = A x + c with c = B u constant, x⁺ = e^{AT} x + φ₁(AT) T c."""
+        """Return x after `duration` seconds: dx/dt = A x + c, c = B u constant: e^{AT} x + φ₁(AT) T c."""
         import flint
 
         n = len(x)
@@ -238,9 +240,13 @@ def _step(rates: Any, seconds: Any) -> tuple[Any, Any]:
 
 
 def _probes(columns: int) -> Iterator[NDArray[np.int64]]:
-    """Yield inputs that tell the slopes: each column by itself or, of many, a few at once by random weights."""
+    """Yield inputs that tell the slopes: each column by itself or, of many, a few at once."""
     together = -(-columns // MOST_PROBES)
-    weights = np.random.default_rng(SEED).integers(1, 2**16, columns) if together > 1 else np.ones(columns, np.int64)
+    weights = (
+        np.random.default_rng(SEED).integers(1, 2**16, columns)
+        if together > 1
+        else np.ones(columns, np.int64)
+    )
     for first in range(MOST_PROBES):
         probe = np.zeros(columns, np.int64)
         probe[first::MOST_PROBES] = weights[first::MOST_PROBES]

@@ -37,7 +37,7 @@ PRECISIONS = (128, 256, 512, 1024, 2048)
 RADIUS = 2.0**-80
 
 
-# States whose exponential is one: its cost is their cube, half a minute for so many. Inputs beside fewer states.
+# States whose exponential is one, at a cost of their cube: half a minute for so many. Inputs beside fewer.
 MOST_TOGETHER = 600
 FEWEST_INPUTS = 8
 
@@ -77,7 +77,11 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
     """
     n_x = len(a)
     pieces = [
-        (states, np.concatenate([states, n_x + inputs]), _generator(a[np.ix_(states, states)], b[np.ix_(states, inputs)]))
+        (
+            states,
+            np.concatenate([states, n_x + inputs]),
+            _generator(a[np.ix_(states, states)], b[np.ix_(states, inputs)]),
+        )
         for states, inputs in _pieces(a, b)
     ]
     steps = []

@@ -38,7 +38,9 @@ from apc.runtime.frame.schedule import (
 from apc.runtime.frame.site import LinearSite
 
 MOST_PACKETS = 100_000  # of one peer: each has a name
-MOST_HELD = 1000  # values of one peer, computed and not acting yet: each is a row and a column of the frame's map
+MOST_HELD = (
+    1000  # values of one peer, computed and not acting yet: each is a row and a column of the frame's map
+)
 
 # What happens when: the instant, the rank of its like among what happens at once, and itself; None only stops
 # the propagation there.
@@ -74,7 +76,7 @@ def build_schedules(
     Raises
     ------
     ApcError
-        E801 a mean, maximum or minimum over nobody; E805 too many ticks, packets or delayed values in a frame.
+        E801 a mean, maximum or minimum over nobody; E805 too many ticks, packets or delayed values.
     """
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
     rank = {name: place for place, name in enumerate(order)}
@@ -126,11 +128,13 @@ def _check_held(
         longest = max(held, key=lambda name: held[name])
         seconds = times.delays[longest] * times.quantum
         what = (
-            f"with {longest} = {float(seconds):.6g} s each peer keeps {number:,} values that are computed and "
-            f"do not act yet; at most {MOST_HELD:,} can be analysed"
+            f"with {longest} = {float(seconds):.6g} s each peer keeps {number:,} values that are computed "
+            f"and do not act yet; at most {MOST_HELD:,} can be analysed"
         )
         left = MOST_HELD - (number - held[longest])
-        fits = f"{longest}: {float(seconds * left / held[longest]):.3g} s, or a slower clock" if left > 0 else ""
+        fits = (
+            f"{longest}: {float(seconds * left / held[longest]):.3g} s, or a slower clock" if left > 0 else ""
+        )
         hint = fits or "shorter delays of all forces, or a slower clock"
         raise ApcError(Mistake("E805", Place(system.name), what, hint=hint))
 
