@@ -1,7 +1,7 @@
 """Numbers as a person writes them to a program: ASCII digits, a sign, a point, an exponent, and nothing else.
 
 Takes: texts. Gives: `plain_float`, `plain_int`.
-Guarantees: what Python's own functions also read is refused: `1_0`, digits of other scripts, `nan`, `infinity`.
+Guarantees: what Python's own functions also read is refused: `1_0`, digits of other scripts, `nan`.
 Does not: know units (see `language.units`), or say where the text stood.
 """
 

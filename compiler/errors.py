@@ -1,7 +1,8 @@
 """What a user is told when the input is at fault.
 
 Takes: nothing. Gives: `Place` and `place_in`, `Mistake`, `ApcError` and the collector `Mistakes`; `visible`.
-Guarantees: mistakes of one file come out together, in file order, each once; no control character is told as it is.
+Guarantees: mistakes of one file come out together, in file order, each once; no control character is
+told as it is.
 Does not: print, or decide exit codes.
 """
 

@@ -1,10 +1,11 @@
 """What is read from disk and written to it, whoever named the file.
 
-Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `is_bounded`; `write_file`, `check_target`, and for what is
-written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`; `same_file`.
-Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is waited
-for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a link stays
-and its file is written; a device or pipe is written to, never replaced.
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `is_bounded`, `same_file`;
+`write_file`, `check_target`, and for what is written piece by piece `begin_file`, `finish_file`, `drop_file`,
+`partial_name`.
+Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
+waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a
+link stays and its file is written; a device or pipe is written to, never replaced.
 Does not: know a format, or say at which line a file was named.
 """
 
@@ -113,7 +114,9 @@ def _reason(error: OSError | ValueError) -> str:
 
 
 def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
-    """Return the files of a folder and the folders in it by their suffix, in order; links to folders are not followed.
+    """Return the files of a folder and the folders in it by their suffix, in order.
+
+    Links to folders are not followed.
 
     Raises
     ------
@@ -191,7 +194,7 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def check_target(path: Path) -> None:
-    """Refuse a place where nothing can be written, before what is to be written is computed: ApcError E601."""
+    """Refuse a place where nothing can be written, before anything is computed: ApcError E601."""
     try:
         drop_file(begin_file(path))
     except (OSError, ValueError) as error:

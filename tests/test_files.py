@@ -261,7 +261,8 @@ def test_two_files_that_define_one_name_are_refused_naming_both(
         Path(f"parts/{name}.yaml").write_text(text, encoding="utf-8")
     Path("scene.yaml").write_text(f"library: ./parts\n{AVERAGE}", encoding="utf-8")
     assert failed(capsys, "check") == (
-        "parts/two.yaml:1:1: E218 Rest is defined in parts/one.yaml already. Write: another name in one of the two"
+        "parts/two.yaml:1:1: E218 Rest is defined in parts/one.yaml already. "
+        "Write: another name in one of the two"
     )
     Path("scene.yaml").write_text(f"library: [./parts, ./parts/]\n{AVERAGE}", encoding="utf-8")
     Path("parts/two.yaml").unlink()

@@ -15,6 +15,8 @@ from apc.runtime.analysis.selfcheck import check_frame
 from apc.runtime.frame import discretize as discretizing
 from apc.runtime.frame import scheduling
 from apc.runtime.frame.discretize import discretize, moved_together
+from apc.runtime.vary import delays
+from apc.runtime.vary.critical import critical
 from tests.topologies import AVERAGE, compiled, replaced, told
 
 NOWHERE = Place("scene.yaml", 7, 9)
@@ -63,8 +65,8 @@ def test_delays_of_forces_are_refused_by_what_they_keep(monkeypatch: pytest.Monk
     monkeypatch.setattr(scheduling, "_build", lambda *_: pytest.fail("a schedule is built"))
     late = compiled(replaced(AVERAGE, ("clock: haptic, delay: 1 ms}", "clock: haptic, delay: 10 s}")))
     assert told(check_frame, late) == [
-        "three-users-average: E805 with contact.delay = 10 s each peer keeps 10,001 values that are computed and "
-        "do not act yet; at most 1,000 can be analysed. Write: contact.delay: 0.999 s, or a slower clock"
+        "three-users-average: E805 with contact.delay = 10 s each peer keeps 10,001 values that are computed "
+        "and do not act yet; at most 1,000 can be analysed. Write: contact.delay: 0.999 s, or a slower clock"
     ]
 
 
@@ -77,7 +79,7 @@ def test_what_moves_together_has_a_limit_and_what_is_apart_has_none(monkeypatch:
     assert step[:, :4] == pytest.approx(np.diag(decay), rel=1e-15)
     assert step[:, 4:] == pytest.approx(np.outer((1 - decay) / np.arange(1.0, 5), np.ones(20)), rel=1e-15)
     monkeypatch.setattr(discretizing, "_step", lambda *_: pytest.fail("an exponential is taken"))
-    with pytest.raises(ApcError, match="E812 4 states of one peer move together .*, and 3 are the most"):
+    with pytest.raises(ApcError, match=r"E812 4 states of one peer move together .*, and 3 are the most"):
         discretize(np.full((4, 4), Fraction(1)), np.ones((4, 1)), [Fraction(1)])
 
 
@@ -85,3 +87,24 @@ def test_states_move_together_where_one_enters_the_rate_of_another() -> None:
     rates = np.zeros((6, 6))
     rates[0, 3] = rates[3, 5] = rates[1, 1] = rates[4, 2] = 1
     assert [one.tolist() for one in moved_together(rates)] == [[0, 3, 5], [1], [2, 4]]
+
+
+def test_a_delay_is_searched_only_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(delays, "_piece", lambda *_: pytest.fail("a piece is built"))
+    (message,) = told(lambda: critical(compiled(AVERAGE), "lan.delay", upper="1e6 s"))
+    assert message == (
+        "critical value: E846 from 0 to 1e+06 (SI) events coincide at more than 10,000 values of lan.delay, "
+        "the most that are searched. Write: a range up to 10"
+    )
+
+
+@pytest.mark.parametrize("graph", ["ring", "star", "{edges: [[1, 2], [2, 3]]}"])
+def test_peers_on_a_graph_have_a_limit_and_those_on_a_complete_one_none(graph: str) -> None:
+    many = replaced(AVERAGE, ("count: 3", "count: 1000000000"))
+    joined = replaced(many, ("network, delay: 8 ms}", f"network, delay: 8 ms, graph: {graph}}}"))
+    (message,) = told(compiled, joined)
+    assert message.endswith(
+        "E208 a graph wants at most 1,000,000 peers where it isn't complete, got 1,000,000,000. "
+        "Write: graph: complete"
+    )
+    assert told(compiled, many) == []

@@ -178,6 +178,6 @@ def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytes
             os.kill(worker, signal.SIGCONT)
     assert heard == [f"nothing has come from those who compute for {s} s; still waiting" for s in (0.1, 0.2)]
     assert message == (
-        "sweep: E889 nothing has come from those who compute for 0.3 s: they are stuck, or a part takes longer. "
-        'Write: --patience "0.6 s"'
+        "sweep: E889 nothing has come from those who compute for 0.3 s: they are stuck, or a part takes "
+        'longer. Write: --patience "0.6 s"'
     )

@@ -105,7 +105,7 @@ def read_table(path: Path, named_at: Place) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """A CSV file whose headings are read, each a name, a unit and a place; `rows` reads what is below them."""
+    """A CSV file whose headings are read, each a name, a unit and a place; `rows` reads the rest."""
 
     file: str
     digest: str
@@ -127,8 +127,8 @@ def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iter
     Raises
     ------
     ApcError
-        E701 it can't be read, E702 its headings; E703 its rows are no CSV. What the body raises passes, but of
-        a file that does not begin as a table does only that is told: its text may be somebody's.
+        E701 it can't be read, E702 its headings; E703 its rows are no CSV. What the body raises passes, but
+        of a file that does not begin as a table does only that is told: its text may be somebody's.
     """
     data = _bytes(path, named_at)
     file = str(path)

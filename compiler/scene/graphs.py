@@ -22,6 +22,8 @@ from apc.compiler.language.values import Value
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import add_unknown, brief, check_keys, entries, form, read_mapping, read_text
 
+# On a graph that isn't complete each peer has a place of its own in several arrays: gigabytes for more.
+MOST_PLACED = 1_000_000
 SHAPES = ("complete", "ring", "star")
 _PEER = re.compile(r"(?P<group>[A-Za-z]\w*)\[(?P<number>\d{1,10})\]\Z", re.ASCII)
 
@@ -57,6 +59,13 @@ def read_graph(
         The digests of files read, added to.
     """
     if node is None:
+        return COMPLETE
+    peers = sum(counts.values())
+    if peers > MOST_PLACED and not (isinstance(node, Scalar) and node.text == COMPLETE.shape):
+        expected = f"at most {MOST_PLACED:,} peers where it isn't complete"
+        mistakes.add(
+            "E208", node.place, "a graph", expected=expected, got=f"{peers:,}", hint="graph: complete"
+        )
         return COMPLETE
     if isinstance(node, Scalar):
         if node.text in SHAPES:

@@ -202,7 +202,7 @@ class _Stepped:
         ]
 
     def propagated(self, x: list[Any], u: list[Any], duration: Fraction) -> list[Any]:
-        """Return x after `duration` seconds: dx/dt = A x + c with c = B u constant, x⁺ = e^{AT} x + φ₁(AT) T c."""
+        """Return x after `duration` seconds: dx/dt = A x + c, c = B u constant: e^{AT} x + φ₁(AT) T c."""
         import flint
 
         n = len(x)
@@ -240,7 +240,7 @@ def _step(rates: Any, seconds: Any) -> tuple[Any, Any]:
 
 
 def _probes(columns: int) -> Iterator[NDArray[np.int64]]:
-    """Yield inputs that tell the slopes: each column by itself or, of many, a few at once by random weights."""
+    """Yield inputs that tell the slopes: each column by itself or, of many, a few at once."""
     together = -(-columns // MOST_PROBES)
     weights = (
         np.random.default_rng(SEED).integers(1, 2**16, columns)

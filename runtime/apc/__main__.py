@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import io
 import os
 import sys
 import tempfile
@@ -48,8 +49,8 @@ def run(arguments: list[str]) -> int:
             click.echo(str(mistake), err=True)
         return 1
     except click.ClickException as error:
-        error.message = visible(error.message)
-        error.show()
+        error.show(shown := io.StringIO())
+        click.echo(visible(shown.getvalue()), err=True, nl=False)
         return 2
     except (click.Abort, KeyboardInterrupt):
         click.echo("stopped", err=True)

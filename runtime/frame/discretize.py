@@ -37,7 +37,7 @@ PRECISIONS = (128, 256, 512, 1024, 2048)
 RADIUS = 2.0**-80
 
 
-# States whose exponential is one: its cost is their cube, half a minute for so many. Inputs beside fewer states.
+# States whose exponential is one, at a cost of their cube: half a minute for so many. Inputs beside fewer.
 MOST_TOGETHER = 600
 FEWEST_INPUTS = 8
 

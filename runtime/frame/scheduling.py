@@ -76,7 +76,7 @@ def build_schedules(
     Raises
     ------
     ApcError
-        E801 a mean, maximum or minimum over nobody; E805 too many ticks, packets or delayed values in a frame.
+        E801 a mean, maximum or minimum over nobody; E805 too many ticks, packets or delayed values.
     """
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
     rank = {name: place for place, name in enumerate(order)}
@@ -128,8 +128,8 @@ def _check_held(
         longest = max(held, key=lambda name: held[name])
         seconds = times.delays[longest] * times.quantum
         what = (
-            f"with {longest} = {float(seconds):.6g} s each peer keeps {number:,} values that are computed and "
-            f"do not act yet; at most {MOST_HELD:,} can be analysed"
+            f"with {longest} = {float(seconds):.6g} s each peer keeps {number:,} values that are computed "
+            f"and do not act yet; at most {MOST_HELD:,} can be analysed"
         )
         left = MOST_HELD - (number - held[longest])
         fits = (

@@ -1,9 +1,9 @@
 """Trajectories as files, written as they come: CSV, Parquet, MAT, NPZ.
 
 Takes: the blocks of a simulation. Gives: `Recording`, `open_recording`, `SUFFIXES`.
-Guarantees: a file is there whole or not at all (see `files`); of a run that is cut short, by whatever it be or
-as the disk is full, what was done is kept in a file that can be read: NAME.partial.csv and so on, where a file
-of the name was there before.
+Guarantees: a file is there whole or not at all (see `files`); of a run that is cut short, by whatever it
+be or as the disk is full, what was done is kept in a file that can be read: NAME.partial.csv and so on, where
+a file of the name was there before.
 Does not: compute, or know how a format is written (see `formats`).
 
 Every file says what made it: in the schema's metadata (Parquet), the variable `provenance` (MAT, NPZ), or
@@ -26,7 +26,7 @@ SUFFIXES = tuple(WRITERS)
 
 
 class Recording:
-    """A file being written. `take` each block, then `close`; `path` appears when it is closed, and says where.
+    """A file being written. `take` each block, then `close`; `path`, which appears then, says where.
 
     When no more can be written, as the disk is full, `take` raises ApcError (E879) and the file is closed
     with what was written until then; without a row there is none.

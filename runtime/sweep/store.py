@@ -11,7 +11,7 @@ Beside `results.csv` stands the folder `results.csv.parts`:
 
     manifest.json   that `apc sweep` made the folder, and for which sweep: model, axes, versions
     lock            held by the process at work, freed by the system when it ends, however it ends
-    part-7.json     the SHA-256 of the rest of the file, a line; and the rows of part 7, with the sweep's digest
+    part-7.json     the SHA-256 of the rest of the file, a line; the rows of part 7, with the sweep's digest
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def open_parts(target: Path, description: Mapping[str, Any]) -> Iterator[Parts]:
     Raises
     ------
     ApcError
-        E601 the folder can't be written; E885 it is no folder of `apc sweep`'s or holds parts of another sweep,
-        or a process works on it.
+        E601 the folder can't be written; E885 it is no folder of `apc sweep`'s or holds parts of another
+        sweep, or a process works on it.
     """
     folder = target.with_name(target.name + SUFFIX)
     whole = json.dumps({**_MARK, **description}, ensure_ascii=False, indent=1)
@@ -169,7 +169,7 @@ def _check(folder: Path, target: Path, mine: Mapping[str, Any]) -> None:
 
 
 def _foreign(folder: Path, target: Path) -> ApcError:
-    what = f"is there and was not made by apc sweep, which keeps the parts of {target.name} in a folder of that name"
+    what = "is there and was not made by apc sweep, which keeps its parts in a folder of that name"
     return ApcError(Mistake("E885", Place(str(folder)), what, hint=f"another --out than {target}"))
 
 

@@ -246,7 +246,7 @@ def _kept(out: Path | None, made_of: Mapping[str, Any]) -> Iterator[_Kept]:
 
 @dataclass(frozen=True, slots=True)
 class Whose:
-    """Who computes: so many processes here, or a cluster at this address; and how long they are waited for."""
+    """Who computes: so many processes here, or a cluster at this address; and the patience with them."""
 
     jobs: int
     cluster: str | None

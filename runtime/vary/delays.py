@@ -31,6 +31,9 @@ from apc.runtime.frame.schedule import Propagate, Schedule
 from apc.runtime.frame.scheduling import build_schedules
 from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
 
+# Pieces of one search: each is some schedules and matrices, a hundredth of a second and more.
+MOST_PIECES = 10_000
+
 # Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal
 # there by accident. No time of a scene is a multiple of one part in this prime number.
 INSIDE = (Fraction(28_571, 104_729), Fraction(56_393, 104_729))
@@ -97,14 +100,32 @@ def delay_pieces(
     Raises
     ------
     ApcError
-        E844 a period or phase, or what is not linear in the parameter.
+        E844 a period or phase, or what is not linear in the parameter; E846 too many pieces up to `high`.
     """
     following = borders(system, free, place=place)
+    if high is not None:
+        _check_range(free, low, high, following, place)
     known: dict[tuple[object, ...], BatchEvaluator] = {}
     while high is None or low < high:
         end = following(low)
         yield _piece(system, free, low, end, prepared, known)
         low = end
+
+
+def _check_range(
+    free: Free, low: Fraction, high: Fraction, following: Callable[[Fraction], Fraction], place: Place
+) -> None:
+    """Refuse a range of which nobody will see the end, before any of it is searched."""
+    at = low
+    for _ in range(MOST_PIECES):
+        at = following(at)
+        if at >= high:
+            return
+    what = (
+        f"from {float(low):.6g} to {float(high):.6g} (SI) events coincide at more than {MOST_PIECES:,} "
+        f"values of {free.label}, the most that are searched"
+    )
+    raise ApcError(Mistake("E846", place, what, hint=f"a range up to {float(at):.6g}"))
 
 
 def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fraction], Fraction]:
