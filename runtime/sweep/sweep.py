@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, with_unit, wrapped
-from apc.runtime.frame.names import Free
 from apc.runtime.frame.jacobians import jacobians
+from apc.runtime.frame.names import Free
 from apc.runtime.network.nominal import left_out, refuse_channel_number
 from apc.runtime.sweep.grid import Grid, build_grid, check_size, parse_axis
 from apc.runtime.sweep.local import Workers, cores, local_processes, this_process
