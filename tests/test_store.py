@@ -75,7 +75,8 @@ def rewritten(model: Path, member: str, content: str) -> None:
 def test_a_changed_array_is_refused_by_its_name(model: Path) -> None:
     rewritten(model, "array0", "garbage")
     assert told(store.load, model) == [
-        f"{model}: E604 is damaged: its member array0 was changed. Write: apc compile scene.yaml"
+        f"{model}: E604 is damaged: its member array0 was changed. "
+        f"Write: apc compile {model.with_suffix('.yaml')}"
     ]
 
 
@@ -85,7 +86,7 @@ def test_another_format_version_is_refused_by_number(model: Path) -> None:
     rewritten(model, "model.json", json.dumps({**document, "format": 99}))
     assert told(store.load, model) == [
         f"{model}: E603 has format version 99, this program reads version {store.FORMAT}. "
-        "Write: apc compile scene.yaml"
+        f"Write: apc compile {model.with_suffix('.yaml')}"
     ]
 
 
@@ -104,7 +105,8 @@ def test_another_format_version_is_refused_by_number(model: Path) -> None:
 def test_a_document_of_another_shape_is_refused(model: Path, content: str) -> None:
     rewritten(model, "model.json", content)
     assert told(store.load, model) == [
-        f"{model}: E604 is damaged: it is not what apc compile writes. Write: apc compile scene.yaml"
+        f"{model}: E604 is damaged: it is not what apc compile writes. "
+        f"Write: apc compile {model.with_suffix('.yaml')}"
     ]
 
 
