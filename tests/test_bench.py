@@ -325,8 +325,8 @@ def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_measured
     for plot, message in (
         (str(tmp_path / "nowhere" / "bench.png"), "E601 can't be written: No such file or directory"),
         (str(folder), "E601 can't be written: it is a folder"),
-        (".", "--plot: E878 the file wants a name like bench.png, got none"),
-        ("", "--plot: E878 the file wants a name like bench.png, got none"),
+        (".", "E601 can't be written: it is a folder"),
+        ("", "E601 can't be written: it is a folder"),
     ):
         assert run(["bench", str(SCENES / "template.yaml"), "--plot", plot]) == 1
         assert message in capsys.readouterr().err

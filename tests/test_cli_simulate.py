@@ -69,7 +69,7 @@ def test_json_is_one_document_with_what_made_it(capsys: pytest.CaptureFixture[st
         (["--duration", "-1 s"], "three-users-average: E877 the duration wants more than 0 s, got -1 s."),
         (["--duration", "1 s", "--signals", "cube.y"], "three-users-average: E873 no signal fits 'cube.y';"),
         (["--duration", "1 s", "--out", "run.doc"], "run.doc: E878 the suffix of --out wants one of .csv,"),
-        (["--duration", "1 s", "--out", "no/run.csv"], "no/run.csv: E879 can't be written: No such file"),
+        (["--duration", "1 s", "--out", "no/run.csv"], "no/run.csv: E601 can't be written: No such file"),
         (["--duration", "1 s", "--method", "euler:1ms"], "--method: E910 the method wants one of exact,"),
         (
             ["--duration", "1 s", "--method", "rk4:-1 ms"],
