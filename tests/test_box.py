@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from apc.runtime.analysis.box import parse_range
 from apc.runtime.analysis.box_proof import BoxProof, prove_box
 from apc.runtime.frame.overrides import Override, apply
 from tests.sites import columned, grouped, paper
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, library, replaced
 
 TRANSLATING = "stable up to a common translation"
 
@@ -167,3 +168,23 @@ def test_scenes_that_are_no_rational_function_of_the_parameter_are_refused() -> 
     assert _message(replace(system, parameters=parameters), "kt=±1%").startswith(
         "E832 coordination.stiffness"
     )
+
+
+def test_a_memory_that_nobody_reads_is_no_translation_of_a_box(tmp_path: Path) -> None:
+    part = """\
+component: Sum
+about: A spring, and a sum of errors that nothing reads while ki is 0.
+connectors: {a: Flange, b: Flange}
+parameters: {k: {unit: N/m}, ki: {unit: N/m}, clock: clock}
+variables: {s: {unit: m, start: 0 m}}
+equations:
+  - s = previous(s) + sample(a.x) - sample(b.x)
+  - a.f = hold(k*(sample(a.x) - sample(b.x)) + ki*s)
+  - b.f = -a.f
+"""
+    text = ONE_MASS.replace("peers:", "clocks: {tick: 1 ms}\npeers:", 1)
+    text += "couplers:\n  own: {type: Sum, a: device, b: ground, k: 100 N/m, ki: 0 N/m, clock: tick}\n"
+    system = compiled(text, library(tmp_path, part))
+    found = _proof(system, "own.k=±1%")
+    assert (found.verdict, found.stable) == ("stable", True)
+    assert analyze(system).verdict == "stable"

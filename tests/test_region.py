@@ -232,6 +232,7 @@ def test_the_points_are_a_table(paper: Region) -> None:
         ("user.count=2:5", Y, "--x: E882 user.count is a number of peers, which can't vary"),
         ("haptic.period=1 ms:2 ms", Y, "E903 haptic.period can't be an axis"),
         (Y, Y, "E902 coordination.stiffness is on both axes"),
+        (Y, f"user.{Y}", "E902 coordination.stiffness and user.coordination.stiffness are not apart"),
     ],
 )
 def test_an_axis_that_cannot_be_is_told(

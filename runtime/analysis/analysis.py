@@ -198,8 +198,9 @@ def analyze(
         if unfelt and verdict in (STABLE_TRANSLATING, DRIFTS):
             verdict, stable = judge([True], translations, drifts)
         proof = spectrum.proof if verdict == DRIFTS else spectrum.proof.replace(TO_DRIFT, "stable")
-        if proof and linearized:
-            proof += ", of the linearization"
+        of = (("linearization", linearized), ("nominal network", bool(left_out(system))))
+        if proof and any(is_so for _, is_so in of):
+            proof += f", of the {' on the '.join(name for name, is_so in of if is_so)}"
     return Analysis(
         topology=system.name,
         peers=exchange.peers,

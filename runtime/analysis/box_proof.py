@@ -42,7 +42,7 @@ from apc.runtime.eigen.closing import ClosedSystem
 from apc.runtime.eigen.duals import Dual, mapped, slope_of, step_duals
 from apc.runtime.eigen.pseudospectrum import balance
 from apc.runtime.eigen.ratios import Ratio
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid
+from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid, what_stands
 from apc.runtime.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
 from apc.runtime.frame.site import LinearSite, entrywise
 from apc.runtime.threads import single_threaded
@@ -159,10 +159,10 @@ def _prove_box(name: str, box: Box) -> BoxProof:
     whole: Cell = tuple((one.low, one.high) for one in box.ranges)
     questions: list[_Question] = []
     notes: list[str] = []
-    rigid = 0
+    translations = 0
     for system, sites in zip(box.systems, box.sites, strict=True):
         free = find_rigid_modes(system)
-        rigid += len(free.names)
+        translations += what_stands(system, with_drifts=False).translations
         if free.drifts or not stays_rigid(system, sites):
             what = "drifts" if free.drifts else "moves freely in a direction that changes with the parameters"
             notes.append(f"{system.name} {what}: nothing can be proved for a whole box")
@@ -182,7 +182,7 @@ def _prove_box(name: str, box: Box) -> BoxProof:
             left, where = found.open_share, found.point
     if left:
         return _answer(name, box, UNDECIDED, None, cells, left, where, notes)
-    return _answer(name, box, STABLE_TRANSLATING if rigid else STABLE, True, cells, 0.0, ())
+    return _answer(name, box, STABLE_TRANSLATING if translations else STABLE, True, cells, 0.0, ())
 
 
 @dataclass(frozen=True, slots=True)

@@ -118,6 +118,8 @@ def analysis_report(result: Analysis) -> str:
         lines += _note(note)
     lines.append("")
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
+    if result.linearized:
+        words = words.replace("Nothing ties", "To first order, nothing ties", 1)
     if not result.states_per_peer:
         words = "Nothing here is free to move."
     lines += [f"  {line}" for line in words.splitlines()]

@@ -65,8 +65,11 @@ def parse_axes(
         _refuse_period(system, axis.name, axis.label)
         found.append(Range(axis.name, axis.group, axis.unit, axis.values[0], axis.values[-1]))
     first, second = found
-    if (first.name, first.group) == (second.name, second.group):
-        raise ApcError(Mistake("E902", PLACE, f"{first.label} is on both axes; a region has two parameters"))
+    if first.name == second.name and (first.group == second.group or None in (first.group, second.group)):
+        what = f"{first.label} is on both axes; a region has two parameters"
+        if first.group != second.group:
+            what = f"{first.label} and {second.label} are not apart: without a group it is that of all groups"
+        raise ApcError(Mistake("E902", PLACE, what))
     return first, replace(second, low=second.low / scale, high=second.high / scale)
 
 

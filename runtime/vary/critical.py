@@ -99,7 +99,8 @@ class Critical:
                 f"{'several values' if value is None else with_unit(f'{value:.6g}', self.unit)} at {group}"
                 for group, value in self.groups
             ]
-            lines = [f"{self.topology}: {self.parameter}, one value for all groups"]
+            whom = "groups" if len(self.groups) > 1 else "its peers"
+            lines = [f"{self.topology}: {self.parameter}, one value for all {whom}"]
             lines += wrapped(f"now {', '.join(own)}", "  ", "    ")
         for note in self.left_out:
             lines += wrapped(note, "  ", "    ")
@@ -200,13 +201,15 @@ def critical(
         enters=found.enters,
         verdict="" if chosen else verdict,
         left_out=left_out(system, linear=linear),
-        groups=_by_group(system, known) if group is None else (),
+        groups=_by_group(system, known, group),
     )
 
 
-def _by_group(system: CompiledSystem, name: str) -> tuple[tuple[str, float | None], ...]:
-    """Return what each group has of a parameter, where not all have everybody's."""
+def _by_group(system: CompiledSystem, name: str, only: str | None) -> tuple[tuple[str, float | None], ...]:
+    """Return what each group has of a parameter, or one if its peers differ, where not all have one value."""
     several = {group.name for group in system.groups if name in {one.name for one in group.columns}}
+    if only is not None:
+        return ((only, None),) if only in several else ()
     own = {group.name for group in system.groups if name in {one.name for one in group.values}}
     if not several | own:
         return ()
