@@ -21,9 +21,7 @@ from apc.compiler.source.reading import add_unknown, brief, check_keys, read_tex
 
 GROUND = "ground"
 LARGEST_ARRAY = 500
-MOST_PARTS = (
-    1000  # of one peer, those inside parts included; a compile of so many takes half a minute and 1 GB
-)
+MOST_PARTS = 1000  # of one peer, those inside parts included; half a minute and 1 GB of compiling
 _TARGET = re.compile(
     r"(?P<part>[A-Za-z]\w*)(\[(?P<first>\d{1,6})(:(?P<last>\d{1,6}))?\])?(\.(?P<connector>[A-Za-z]\w*))?\Z",
     re.ASCII,
