@@ -21,7 +21,8 @@ from apc.compiler.source.reading import add_unknown, brief, check_keys, read_tex
 
 GROUND = "ground"
 LARGEST_ARRAY = 500
-MOST_PARTS = 1000  # of one peer, those inside parts included; half a minute and 1 GB of compiling
+# Of one peer, those inside parts included: half a minute and 1 GB of compiling.
+MOST_PARTS = 1000
 _TARGET = re.compile(
     r"(?P<part>[A-Za-z]\w*)(\[(?P<first>\d{1,6})(:(?P<last>\d{1,6}))?\])?(\.(?P<connector>[A-Za-z]\w*))?\Z",
     re.ASCII,
