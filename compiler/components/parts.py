@@ -20,8 +20,9 @@ from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import add_unknown, brief, check_keys, read_text
 
 GROUND = "ground"
-LARGEST_ARRAY = 1000
-MOST_PARTS = 2000  # of one peer, those inside parts included; a compile of so many takes seconds
+LARGEST_ARRAY = 500
+# Of one peer, those inside parts included: half a minute and 1 GB of compiling.
+MOST_PARTS = 1000
 _TARGET = re.compile(
     r"(?P<part>[A-Za-z]\w*)(\[(?P<first>\d{1,6})(:(?P<last>\d{1,6}))?\])?(\.(?P<connector>[A-Za-z]\w*))?\Z",
     re.ASCII,

@@ -282,8 +282,12 @@ def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) ->
         assert (apart <= allowed).all(), (
             f"the slopes of {function.name()} are not what it multiplies its inputs by"
         )
-    entries = [flint.arb(flint.fmpq(one.numerator, one.denominator)) for one in whole.ravel()]
-    return flint.arb_mat(rows, columns, entries)
+    balls = flint.arb_mat(rows, columns)
+    for column, touched in enumerate(filled):
+        for row in touched.tolist():
+            one = whole[row, column]
+            balls[row, column] = flint.arb(flint.fmpq(one.numerator, one.denominator))
+    return balls
 
 
 def _picked(matrix: Any, places: list[int]) -> Any:
