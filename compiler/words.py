@@ -42,8 +42,8 @@ def measured(value: float, error: float, unit: str = "1") -> str:
     """
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{with_unit(f'{value:.6g}', unit)} ± {error:.0e}"
-    if value == error == 0:
-        return f"{with_unit('0', unit)} ± 0"
+    if value == 0 and error < 10.0**-_DIGITS:
+        return f"{with_unit('0', unit)} ± {f'{error:.0e}' if error else '0'}"
     exact, off = Decimal(repr(value)), Decimal(repr(error))
     place = max(off.adjusted(), exact.adjusted() - _DIGITS) if error else exact.adjusted() - _DIGITS
     while True:

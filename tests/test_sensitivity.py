@@ -125,3 +125,17 @@ def test_eigenvalues_that_change_alike_are_told_in_one_row() -> None:
     assert len(names) == len(set(names))
     assert not any("mode" in line or "+0.00e+00" in line for line in lines[1:-1])
     assert lines[-1] == "  2 eigenvalues share the radius: the largest of their changes decides"
+
+
+def test_a_radius_below_every_float_has_no_derivative() -> None:
+    """Rates of 10⁶/s over a frame of 1 s: e^(−10⁶) is no float."""
+    found = sensitivities(
+        compiled(
+            "topology: gone\npeers: {user: {count: 1}}\n"
+            "masses:\n  device: {mass: 0.1 g, damping: 100 N*s/m}\n  cube: {mass: 0.1 g, damping: 100 N*s/m}\n"
+            "couplers: {pad: {type: SpringDamper, a: device, b: cube, stiffness: 1 N/um, damping: 1 N*s/m}}\n"
+            "hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 1 N/um, damping: 100 N*s/m}}\n"
+        )
+    )
+    assert (found.radius, found.rows) == (0.0, ())
+    assert str(found) == "  what moves it most: nothing, as every motion dies out to 0 within a frame"

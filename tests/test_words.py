@@ -89,3 +89,4 @@ def test_digits_that_an_error_leaves_open_are_not_shown() -> None:
 
 def test_nothing_is_measured_as_nothing() -> None:
     assert measured(0.0, 0.0) == "0 ± 0"
+    assert measured(0.0, 5e-307) == "0 ± 5e-307"

@@ -209,6 +209,10 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
     if not clusters:
         return Sensitivities(0.0, (), (), "nothing moves: there is no eigenvalue")
     radius = max(float(np.abs(one.values).max()) for one in clusters)
+    if not radius:  # e^(λT) is below every float
+        return Sensitivities(
+            0.0, (), (), "what moves it most: nothing, as every motion dies out to 0 within a frame"
+        )
     leading = [
         one for one in clusters if np.abs(one.values).max() > radius - SHARED - np.ptp(np.abs(one.values))
     ]
@@ -259,6 +263,9 @@ def _defective(one: _Cluster) -> str:
     what = f"{counted(len(one.values), 'eigenvalue')} of {one.moved.name} at magnitude {size:.6f}"
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
+
+NONE_LEFT = "what moves it most: nothing, as every motion"
+NONE_TOLD = "what moves the radius most: no change of it can be told from rounding"
 
 # Digits of a change.
 DIGITS = 3
@@ -389,7 +396,7 @@ def sensitivity_report(found: Sensitivities) -> str:
     shown = list(alike.items())[:SHOWN]
     if not shown:
         note = found.note if len(found.active) < 2 else ""
-        return "\n".join(wrapped(note or "no parameter moves the spectral radius", "  ", "    "))
+        return "\n".join(wrapped(note or NONE_TOLD, "  ", "    "))
     width = max(len(name) for (name, _), _ in shown)
     lines = ["  what moves it most" + " " * max(width - 16, 2) + "value            per percent"]
     for (name, change), rows in shown:

@@ -126,6 +126,14 @@ def check(found: Analysis, radius: flint.arb, rigid: int) -> str:
     )
 
 
+def _looked_into(system: CompiledSystem, found: Analysis) -> list[str]:
+    """Return what is wrong with what an analysis tells beside its verdict."""
+    try:
+        return [check_sensitivities(system, found), check_frequencies(system, found)]
+    except Exception as error:  # whatever it is, it is a bug
+        return [repr(error)]
+
+
 def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws: int = DRAWS) -> Tally:
     """Analyse so many random scenes by each method.
 
@@ -182,7 +190,7 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
                 told = [check(found, *known)]
                 if method == "auto" and number % draws == 0:
                     tally.looked_into += 1
-                    told += [check_sensitivities(system, found), check_frequencies(system, found)]
+                    told += _looked_into(system, found)
                 tally.wrong += [f"{method}: {wrong}\n{text}{values}" for wrong in told if wrong]
     return tally
 
