@@ -54,7 +54,7 @@ def measured(value: float, error: float, unit: str = "1") -> str:
             break
         place = whole.adjusted()
     digits = max(exact.adjusted() - place, 0)
-    text = f"{shown:f}" if -5 < exact.adjusted() < _DIGITS else f"{float(shown):.{digits}e}"
+    text = f"{shown:f}" if -5 < exact.adjusted() < _DIGITS else f"{shown:.{digits}e}"
     return f"{with_unit(text, unit)} ± {float(whole):.0e}"
 
 

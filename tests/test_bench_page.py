@@ -22,6 +22,7 @@ HELPERS = {  # not run by themselves
     "paper_scene",
     "contact_reference",
     "sensitivity_truth",
+    "shapes",
 }
 
 

@@ -106,7 +106,7 @@ def test_of_a_run_cut_short_the_finished_part_is_kept(
 
 def test_an_unknown_suffix_is_refused_before_anything_runs(simulation: Simulation, tmp_path: Path) -> None:
     with pytest.raises(
-        ApcError, match=r"E878 the suffix of --out wants one of .*, got \.xls\. Write: run\.csv"
+        ApcError, match=r"E878 the suffix of --out wants one of .*, got \.xls\. Write: --out .*run\.csv"
     ):
         open_recording(tmp_path / "run.xls", simulation)
 

@@ -146,7 +146,7 @@ def test_a_schema_is_written_as_json_alone(tmp_path: Path, capsys: pytest.Captur
     path = tmp_path / "schema.yaml"
     assert run(["schema", "--out", str(path)]) == 1
     assert capsys.readouterr().err == (
-        f"{path}: E878 the suffix of --out wants .json, got .yaml. Write: schema.json\n"
+        f"{path}: E878 the suffix of --out wants .json, got .yaml. Write: --out {path.with_suffix('.json')}\n"
     )
     assert not path.exists()
 

@@ -132,7 +132,8 @@ def test_a_radius_below_every_float_has_no_derivative() -> None:
     found = sensitivities(
         compiled(
             "topology: gone\npeers: {user: {count: 1}}\n"
-            "masses:\n  device: {mass: 0.1 g, damping: 100 N*s/m}\n  cube: {mass: 0.1 g, damping: 100 N*s/m}\n"
+            "masses:\n  device: {mass: 0.1 g, damping: 100 N*s/m}\n"
+            "  cube: {mass: 0.1 g, damping: 100 N*s/m}\n"
             "couplers: {pad: {type: SpringDamper, a: device, b: cube, stiffness: 1 N/um, damping: 1 N*s/m}}\n"
             "hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 1 N/um, damping: 100 N*s/m}}\n"
         )

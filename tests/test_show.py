@@ -297,10 +297,10 @@ def test_the_file_says_the_format(
 @pytest.mark.parametrize(
     ("words", "name", "wanted"),
     [
-        ((), "scene.pdf", "one of .txt, .json, .dot, .gv, .svg, got .pdf. Write: scene.txt"),
-        ((), "scene", "one of .txt, .json, .dot, .gv, .svg, got none. Write: scene.txt"),
-        (("--format", "svg"), "scene.png", ".svg, got .png. Write: scene.svg"),
-        (("--format", "dot"), "scene.svg", "one of .dot, .gv, got .svg. Write: scene.dot"),
+        ((), "scene.pdf", "one of .txt, .json, .dot, .gv, .svg, got .pdf. Write: --out scene.txt"),
+        ((), "scene", "one of .txt, .json, .dot, .gv, .svg, got none. Write: --out scene.txt"),
+        (("--format", "svg"), "scene.png", ".svg, got .png. Write: --out scene.svg"),
+        (("--format", "dot"), "scene.svg", "one of .dot, .gv, got .svg. Write: --out scene.dot"),
     ],
 )
 def test_no_file_is_written_as_what_its_name_does_not_say(
@@ -308,6 +308,7 @@ def test_no_file_is_written_as_what_its_name_does_not_say(
 ) -> None:
     out = tmp_path / name
     assert run(["show", str(AVERAGE_FILE), *words, "--out", str(out)]) == 1
+    wanted = wanted.replace("--out ", f"--out {tmp_path}/")
     assert capsys.readouterr().err == f"{out}: E878 the suffix of --out wants {wanted}\n"
     assert list(tmp_path.iterdir()) == []
 

@@ -153,7 +153,7 @@ def test_a_missing_distributed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert told(lambda: sweep(MODEL, OVER, cluster="tcp://host:1")) == [
         "tcp://host:1: E888 a cluster needs Dask's distributed, here and on its workers. "
-        "Write: pip install '.[cluster]'  (in the folder of apc's own pyproject.toml)"
+        "Write: pip install '.[cluster]'  # in the folder of apc's own pyproject.toml"
     ]
 
 

@@ -61,7 +61,7 @@ def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib, "import_module", missing)
     assert told(check_table_path, Path("t.parquet")) == [
         "t.parquet: E887 is a Parquet file, which needs pyarrow; without it, --out can end in .csv. "
-        "Write: pip install '.[data]'  (in the folder of apc's own pyproject.toml)"
+        "Write: pip install '.[data]'  # in the folder of apc's own pyproject.toml"
     ]
     assert told(check_table_path, Path("t.csv")) == []
 

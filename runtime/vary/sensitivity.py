@@ -264,7 +264,6 @@ def _defective(one: _Cluster) -> str:
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
 
-NONE_LEFT = "what moves it most: nothing, as every motion"
 NONE_TOLD = "what moves the radius most: no change of it can be told from rounding"
 
 # Digits of a change.
