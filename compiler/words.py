@@ -43,7 +43,8 @@ def measured(value: float, error: float, unit: str = "1") -> str:
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{with_unit(f'{value:.6g}', unit)} ± {error:.0e}"
     if value == 0 and error < 10.0**-_DIGITS:
-        return f"{with_unit('0', unit)} ± {f'{error:.0e}' if error else '0'}"
+        whole = Context(prec=1, rounding=ROUND_UP).plus(Decimal(repr(error)))
+        return f"{with_unit('0', unit)} ± {f'{float(whole):.0e}' if error else '0'}"
     exact, off = Decimal(repr(value)), Decimal(repr(error))
     place = max(off.adjusted(), exact.adjusted() - _DIGITS) if error else exact.adjusted() - _DIGITS
     while True:
@@ -54,8 +55,14 @@ def measured(value: float, error: float, unit: str = "1") -> str:
             break
         place = whole.adjusted()
     digits = max(exact.adjusted() - place, 0)
-    text = f"{shown:f}" if -5 < exact.adjusted() < _DIGITS else f"{shown:.{digits}e}"
+    text = f"{shown:f}" if -5 < exact.adjusted() < _DIGITS else _scientific(shown, digits)
     return f"{with_unit(text, unit)} ± {float(whole):.0e}"
+
+
+def _scientific(number: Decimal, digits: int) -> str:
+    """Return a decimal with so many digits behind the point, in the form that Python gives floats."""
+    mantissa, _, exponent = f"{number:.{digits}e}".partition("e")
+    return f"{mantissa}e{int(exponent):+03d}"
 
 
 def known_digits(value: float, error: float, most: int) -> str:
