@@ -14,7 +14,8 @@ from apc.runtime.frame.overrides import Override, apply
 from apc.runtime.vary.batch import BatchEvaluator
 from apc.runtime.vary.evaluator import evaluator
 from apc.runtime.vary.sensitivity import sensitivities, sensitivity_report
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.bench.sensitivity_truth import check_sensitivities
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 FINGER = (SCENES / "finger.yaml").read_text(encoding="utf-8")
 
@@ -140,3 +141,17 @@ def test_a_radius_below_every_float_has_no_derivative() -> None:
     )
     assert (found.radius, found.rows) == (0.0, ())
     assert str(found) == "  what moves it most: nothing, as every motion dies out to 0 within a frame"
+
+
+@pytest.mark.parametrize("name", ["contact.stiffness", "coordination.stiffness"])
+def test_where_more_is_free_than_nearby_no_derivative_is_wrong(name: str) -> None:
+    """With `delays: own` what is free follows the stiffnesses; without one of them there is more of it."""
+    graph = "graph: {edges: [[1, 2, 0.3], [1, 3, 0.3], [2, 3, 0.5]]}"
+    text = replaced(
+        MESH, ("delay: 8 ms}", f"delay: 8 ms, {graph}}}"), ("link: lan}", "link: lan, delays: own}")
+    )
+    text = replaced(text, (f"stiffness: {1000 if name[3] == 't' else 500} N/m", "stiffness: 0 N/m"))
+    system = compiled(text)
+    found = sensitivities(system)
+    assert found.rows or found.note
+    assert check_sensitivities(system, found) == ""

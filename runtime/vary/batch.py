@@ -69,6 +69,9 @@ STEP = 1e-60
 GENERIC_POINT = 0.7390851332151607
 GENERIC_RATIO = 0.6180339887498949
 
+# An error from which nothing stands out; it is finite, so that 0 times it is 0.
+NO_USE = 1e200
+
 # A step shorter than this share of the delays it is the difference of is none.
 VANISHING = 1e-14
 
@@ -436,7 +439,7 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
             below = off[:, held[:, None], rest] + 8 * (len(held) + 2) * UNIT * moved[:, held[:, None], rest]
             own = own + np.abs(weights.real) @ below
             if wiring.moving:
-                inverse = np.abs(np.linalg.inv(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest]))
+                inverse = _inverse_size(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest])
                 heavy = np.abs(weights.real)
                 late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ heavy + error @ turned
                 late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ heavy)
@@ -503,6 +506,14 @@ def _large_step(site: LinearSite, seconds: float) -> tuple[Matrices, float]:
     return np.maximum(np.abs(step), size) + 1j * seconds * slope, charge
 
 
+def _inverse_size(matrices: Floats) -> Floats:
+    """Return |M⁻¹| of matrices (k, n, n); `NO_USE` where one has none, as more is free at these values."""
+    try:
+        return np.abs(np.linalg.inv(matrices))
+    except np.linalg.LinAlgError:
+        return np.full(matrices.shape, NO_USE)
+
+
 def _relative_errors(wiring: Wiring, matrix: Floats, error: Floats) -> tuple[Floats, Floats]:
     """Return W at each point and a bound on its error, to first order where the directions follow.
 
@@ -513,7 +524,7 @@ def _relative_errors(wiring: Wiring, matrix: Floats, error: Floats) -> tuple[Flo
         return weights, 8 * (len(wiring.held) + 2) * UNIT * np.abs(weights)[None]
     rest, held = wiring.rest, wiring.held
     system = np.eye(len(rest)) - matrix[:, rest[:, None], rest]
-    size = np.abs(np.linalg.inv(system))
+    size = _inverse_size(system)
     left = error[:, rest[:, None], held] + error[:, rest[:, None], rest] @ np.abs(weights)
     left = left + 8 * (len(rest) + 2) * UNIT * (np.abs(system) @ np.abs(weights))
     return weights, size @ left

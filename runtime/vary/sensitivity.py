@@ -198,6 +198,8 @@ def _rigid_here(wiring: Wiring, system: ClosedSystem, matrix: Floats) -> Floats:
         return np.zeros((len(matrix), 0))
     weights, _ = relative_weights(wiring, system.matrix[None])
     weights = weights if weights.ndim == 2 else weights[0]
+    if not np.isfinite(weights).all():  # nor is the matrix: what follows the parameters has no one direction
+        return np.zeros((len(matrix), 0))
     relative = free.basis[wiring.rest] - weights @ free.basis[wiring.held]
     return np.linalg.svd(relative, full_matrices=False)[0][:, :more]
 
