@@ -270,8 +270,45 @@ def test_a_scene_that_is_not_linear_is_bounded_in_floats_and_says_so() -> None:
     found = critical(compiled(text), "wall.stiffness", lower="2000 N/m", upper="9000 N/m")
     assert found.crossings
     assert found.crossings[0].proof == "bounded in floats"
-    with pytest.raises(ApcError, match="E845"):
-        critical(compiled(text), "wall.delay")
+
+
+def test_delays_of_a_scene_with_contact_are_those_of_the_springs_it_starts_with() -> None:
+    """Pressed at the start, a contact that only pushes is a spring; let go, it is none."""
+    contact = "type: OneSidedContact, a: device, b: cube, half_width: 20 mm, side: left"
+    pressed = replaced(
+        AVERAGE,
+        ("count: 3", "count: 3, set: {device.x: -10 mm}"),
+        ("type: SampledSpringDamper, a: device, b: cube", contact),
+    )
+    springs, contacts = (
+        critical(compiled(text), "contact.delay", upper="4 ms") for text in (AVERAGE, pressed)
+    )
+    assert contacts.value == pytest.approx(springs.value, abs=springs.error + contacts.error)
+    assert contacts.left_out
+    assert not springs.left_out
+    apart = replaced(pressed, ("device.x: -10 mm", "device.x: -30 mm"))
+    assert critical(compiled(apart), "contact.delay", upper="4 ms").crossings == ()
+    rows = {one.parameter: one.value for one in margins(compiled(pressed)).rows}
+    assert rows["contact.delay"] == pytest.approx(springs.value, rel=1e-12)
+
+
+def test_verdicts_on_both_sides_of_a_delay_are_those_of_linearizations_there() -> None:
+    text = (SCENES / "finger.yaml").read_text(encoding="utf-8").partition("\n")[2]
+    limit = critical(compiled(text), "wall.stiffness", lower="2000 N/m", upper="9000 N/m").value
+    assert limit is not None
+    system = apply(compiled(text), [Override("wall.stiffness", None, Fraction(0.8 * limit))])
+    found = critical(system, "wall.delay", upper="3 ms")
+    assert found.crossings
+    for one in found.crossings:
+        for side, factor in (("below", 1 - 1e-6), ("above", 1 + 1e-6)):
+            beside = Override("wall.delay", None, Fraction(one.value * factor))
+            assert analyze(apply(system, [beside])).stable is (one.stable_side == side)
+
+
+def test_a_delay_where_what_is_heard_at_the_start_decides_is_refused() -> None:
+    text = replaced(MESH, ("type: FullMesh", "type: SaturatedMesh, limit: 3 N"))
+    with pytest.raises(ApcError, match="E845 how the scene moves hangs on what is heard at the start"):
+        critical(compiled(text), "contact.delay")
 
 
 def test_many_packets_on_their_way_give_the_crossings_that_few_give(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,7 @@
 """Is it stable, and by how much: the whole road from a compiled system to its spectrum.
 
 Takes: a `CompiledSystem`.
-Gives: `Analysis`, `analyze`; `Prepared`, `prepare` for many analyses of one system.
+Gives: `Analysis`, `analyze`; `Prepared`, `prepare` and `prepare_at_start` for many analyses of one system.
 Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
 delay; of equal input comes equal output.
 Does not: read files, or draw.
@@ -10,7 +10,7 @@ Does not: read files, or draw.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -40,6 +40,7 @@ from apc.runtime.frame.jacobians import SiteJacobians, jacobians
 from apc.runtime.frame.parameters import Numbers, resolve
 from apc.runtime.frame.schedule import ORDER, Schedule
 from apc.runtime.frame.scheduling import build_schedules
+from apc.runtime.frame.start import at_start
 from apc.runtime.network.nominal import left_out
 from apc.runtime.threads import single_threaded
 from apc.runtime.trouble import finite_equations
@@ -142,6 +143,30 @@ def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared
     built = tuple(jacobians(kind) for kind in system.kinds)
     timings = {timing.name: timing.value for timing in system.timings}
     return _scheduled(system, built, timings, tuple(order))
+
+
+def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | None:
+    """Return what was prepared with every kind linearized where it starts, as its parameters say.
+
+    None where that does not follow from the parameters alone (see `start.at_start`).
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    prepared
+        From `prepare`, of this system.
+
+    Raises
+    ------
+    ApcError
+        As `plan.refuse_varying`.
+    """
+    refuse_varying(system, prepared.jacobians)
+    used = {group.kind for group in system.groups}
+    sites = [at_start(site) if kind in used else site for kind, site in enumerate(prepared.jacobians)]
+    found = tuple(site for site in sites if site is not None)
+    return replace(prepared, jacobians=found) if len(found) == len(sites) else None
 
 
 def analyze(

@@ -1,7 +1,7 @@
 """A site at the start of time: its states, what it remembers, what it sends and what it hears.
 
 Takes: a kind's Jacobians and a parameter vector, in any kind of number.
-Gives: `start_values`, `start_sends`, `start_arguments`; `Listening`.
+Gives: `start_values`, `start_sends`, `start_arguments`; `at_start`; `Listening`.
 Guarantees: holds put out zero.
 Does not: ask who hears whom (see `peers`).
 """
@@ -9,7 +9,7 @@ Does not: ask who hears whom (see `peers`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -57,6 +57,25 @@ def start_sends(
         dense = casadi.Function("send", symbols, [casadi.densify(sending.send(*symbols))])
         sent[sending.link] = evaluate_exact(dense, [x, u, parameters, [number(0.0)]], number=number)[0]
     return sent
+
+
+def at_start(site: SiteJacobians) -> SiteJacobians | None:
+    """Return a kind's Jacobians where it starts, which follow from its parameters alone.
+
+    Start values are parameters, too. None where what is heard decides as well, or a nonlinear loop does.
+    """
+    if site.parameters_suffice:
+        return site
+    if site.edges or not site.walkable:
+        return None
+    symbols = site.function.sx_in()
+    parameters, heard = symbols[4], symbols[3]
+    x, u, memories = start_values(site, casadi.vertsplit(parameters) if parameters.numel() else [])
+    m = [value for one in memories for value in one]
+    flat = site.function(casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m), heard, parameters, 0)
+    if flat.numel() and casadi.depends_on(flat, heard):
+        return None
+    return replace(site, function=casadi.Function("jacobians", symbols, [flat]), affine=True, timed=False)
 
 
 def start_arguments(

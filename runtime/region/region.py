@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.words import counted
-from apc.runtime.analysis.analysis import Prepared, analyze, prepare
+from apc.runtime.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.runtime.analysis.ranges import Range
 from apc.runtime.eigen.spectrum import finite
 from apc.runtime.frame.names import Free
@@ -272,7 +272,6 @@ def region(
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]
-        closed_form = all(site.parameters_suffice for site in used)
         affine = all(site.affine for site in used)
         times = [place for place, one in enumerate(free) if reaches_time(system, one)]
         source: BatchEvaluator | PointEvaluator
@@ -281,10 +280,9 @@ def region(
         else:
             source = evaluator(system, free, prepared=prepared)
         found: Striped | None = None
-        if closed_form and len(times) == 1:
-            found = trace_strips(
-                system, axes, times[0], prepared, cells=cells, tolerance=tolerance, told=told
-            )
+        start = prepare_at_start(system, prepared) if len(times) == 1 else None
+        if start is not None:
+            found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
         stepped = bool(times) and found is None
         if found is None:
             found = _surveyed(source, rectangle, bool(times), cells, tolerance, told)

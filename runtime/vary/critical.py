@@ -19,7 +19,7 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, in_hertz, measured, with_unit, wrapped
-from apc.runtime.analysis.analysis import Prepared, analyze, prepare
+from apc.runtime.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.runtime.frame.names import Free, find, parameter_of, unit_of
 from apc.runtime.given import given
 from apc.runtime.network.nominal import left_out, refuse_channel_number
@@ -170,8 +170,8 @@ def critical(
         prepared = prepare(system)
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
         if timed:
-            _refuse_moving_start(system, prepared)
-            found = search_delay(system, free, limits[0] or Fraction(0), limits[1], prepared, told=told)
+            start = _at_start(system, prepared)
+            found = search_delay(system, free, limits[0] or Fraction(0), limits[1], start, told=told)
         else:
             low, high = (None if one is None else float(one) for one in limits)
             found = search(system, free, low, high, prepared, told=told)
@@ -219,14 +219,14 @@ def _by_group(system: CompiledSystem, name: str, only: str | None) -> tuple[tupl
     )
 
 
-def _refuse_moving_start(system: CompiledSystem, prepared: Prepared) -> None:
-    """Refuse a delay of a scene whose matrices don't follow from its parameters in closed form."""
-    used = [prepared.jacobians[group.kind] for group in system.groups]
-    if not all(site.parameters_suffice for site in used):
-        what = "the scene is linearized at its start: the critical value of a delay can't be searched"
-        raise ApcError(
-            Mistake("E845", Place(system.name), what, hint="apc critical of a stiffness or damping")
-        )
+def _at_start(system: CompiledSystem, prepared: Prepared) -> Prepared:
+    """Return what was prepared, as the parameters say; refuse a delay of a scene where they don't suffice."""
+    found = prepare_at_start(system, prepared)
+    if found is None:
+        what = "how the scene moves hangs on what is heard at the start: a delay can't be searched"
+        hint = "apc critical of a stiffness or damping"
+        raise ApcError(Mistake("E845", Place(system.name), what, hint=hint))
+    return found
 
 
 def _limit(option: str, text: str | None, free: Free, unit: str) -> Fraction | None:

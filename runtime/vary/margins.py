@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import in_hertz, known_digits, wrapped
-from apc.runtime.analysis.analysis import Prepared, prepare
+from apc.runtime.analysis.analysis import Prepared, prepare, prepare_at_start
 from apc.runtime.eigen.spectrum import finite
 from apc.runtime.frame.names import Free, named_times, parameter_of
 from apc.runtime.threads import single_threaded
@@ -112,10 +112,11 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Marg
         found = _parameter_margins(system, free, prepared)
         if isinstance(found, str):
             return Margins((), found)
-        used = [prepared.jacobians[group.kind] for group in system.groups]
-        if not all(site.parameters_suffice for site in used):
-            return Margins(tuple(found), "delays were not varied: the scene is linearized at its start")
-        delays = [_delay_margin(system, one, prepared) for one in _delays(system)]
+        start = prepare_at_start(system, prepared)
+        if start is None:
+            why = "how the scene moves hangs on what is heard at the start"
+            return Margins(tuple(found), f"delays were not varied: {why}")
+        delays = [_delay_margin(system, one, start) for one in _delays(system)]
         return Margins((*found, *delays), "")
 
 
