@@ -509,7 +509,7 @@ def _large_step(site: LinearSite, seconds: float) -> tuple[Matrices, float]:
 def _inverse_size(matrices: Floats) -> Floats:
     """Return |M⁻¹| of matrices (k, n, n); `NO_USE` where one has none, as more is free at these values."""
     try:
-        return np.abs(np.linalg.inv(matrices))
+        return np.asarray(np.abs(np.linalg.inv(matrices)))
     except np.linalg.LinAlgError:
         return np.full(matrices.shape, NO_USE)
 
