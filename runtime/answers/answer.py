@@ -1,7 +1,7 @@
 """The whole answer of `apc analyze`: the verdict, and what stands beside it.
 
 Takes: a `CompiledSystem`.
-Gives: `Answer`, `answer`, `judge`.
+Gives: `Answer`, `answer`, `judge`; `sensitivities_of`.
 Guarantees: what stands beside the verdict never changes it; what could not be had is said in a note.
 Does not: compute any of it itself.
 """
@@ -23,6 +23,9 @@ from apc.runtime.vary.sensitivity import Sensitivities, sensitivities
 if TYPE_CHECKING:
     from apc.runtime.analysis.box_proof import BoxProof
     from apc.runtime.analysis.ranges import Range
+
+# How far the radius that is differentiated may be from that of the analysis, relative to 1.
+SAME_RADIUS = 1e-11
 
 # More peers than this, that differ or stand on a graph, are more than can be differentiated in passing.
 FEW_PEERS = 100
@@ -129,7 +132,7 @@ def answer(
         notes = (*notes, compared.not_repeated)
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
-        sensitivities=_sensitivities(system, prepared, found),
+        sensitivities=sensitivities_of(system, prepared, found),
         margins=_margins(system, prepared, found),
         contact_modes=modes,
         conventions=compared,
@@ -145,16 +148,30 @@ def _prove_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:
     return prove_box(system, box)
 
 
-def _sensitivities(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:
-    """Return what moves the spectral radius most, or only why it couldn't be had."""
+def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:
+    """Return what moves the spectral radius of an analysis most, or only why it couldn't be had.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    found
+        Its analysis.
+    """
     if _is_large(system, found):
         note = "what moves it most: not looked for in so large a population"
         return Sensitivities(found.spectral_radius, (), (), note)
     try:
-        return sensitivities(system, prepared=prepared)
+        told = sensitivities(system, prepared=prepared)
     except ApcError as error:
         note = f"what moves it most: not looked for: {error.mistakes[0].what}"
         return Sensitivities(found.spectral_radius, (), (), note)
+    # Derivatives are of matrices in floats, the analysis is of exact exponentials: both have one radius.
+    apart = abs(told.radius - found.spectral_radius) - found.spectral_radius_error
+    if told.active and not apart <= SAME_RADIUS * max(1.0, found.spectral_radius):
+        note = "what moves it most: not told: floats lose the digits of what would be differentiated"
+        return Sensitivities(found.spectral_radius, (), (), note)
+    return told
 
 
 def _is_large(system: CompiledSystem, found: Analysis) -> bool:

@@ -232,11 +232,14 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
             continue
         first = len(active)
         active += [(complex(value), one.moved.name) for value in one.values]
+        rounded = 16 * len(one.moved.matrix) * UNIT * float(np.abs(one.values).max())
         for number, (growth, doubt) in enumerate(rates):
             parameter = parameter_of(system, free[number])
             if growth is None:
                 untied[free[number].label] = None
                 continue
+            # A change by all of the value that is less than the matrix is rounded by can't be told.
+            doubt += rounded / abs(parameter.value) if parameter.value else 0.0
             rows += [
                 Sensitivity(
                     free[number].label,

@@ -24,7 +24,8 @@ import flint
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import Analysis, analyze
+from apc.runtime.analysis.analysis import Analysis, analyze, prepare
+from apc.runtime.answers.answer import sensitivities_of
 from apc.runtime.bench.reference import RIGID, classes_of, eigenvalues, frame_matrices
 from apc.runtime.bench.timing import timed
 from apc.runtime.eigen.balls import precision
@@ -129,7 +130,8 @@ def check(found: Analysis, radius: flint.arb, rigid: int) -> str:
 def _looked_into(system: CompiledSystem, found: Analysis) -> list[str]:
     """Return what is wrong with what an analysis tells beside its verdict."""
     try:
-        return [check_sensitivities(system, found), check_frequencies(system, found)]
+        told = sensitivities_of(system, prepare(system), found)
+        return [check_sensitivities(system, told), check_frequencies(system, found)]
     except Exception as error:  # whatever it is, it is a bug
         return [repr(error)]
 

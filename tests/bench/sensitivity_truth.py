@@ -137,7 +137,7 @@ def check_sensitivities(
     with precision(BITS):
         here = _matrices(system)
         radius = max((float(abs(v)) for m in here for v in _values(m) if not _is_rigid(v)), default=0.0)
-        if abs(radius - said.radius) > SAME:
+        if abs(radius - said.radius) > SAME * max(1.0, radius):
             return f"the radius of the derivatives is {said.radius}, truth {radius}"
         tops = [_top(here, value) for value, _ in said.active]
         if any(not top for top in tops):
@@ -183,7 +183,8 @@ def _top(here: Sequence[Any], value: complex) -> list[tuple[int, list[Any], Any,
     for place, matrix in enumerate(here):
         middle = flint.acb_mat(matrix.mid())
         values = _values(matrix)
-        own = [one for one in values if not _is_rigid(one) and abs(complex(one) - value) < SAME]
+        reach = SAME * max(1.0, abs(value))
+        own = [one for one in values if not _is_rigid(one) and abs(complex(one) - value) < reach]
         groups = [own] if own else []
         if any(float(abs(one - own[0])) > APART for one in own):
             groups += [[one] for one in own]
@@ -278,6 +279,7 @@ def check_frequencies(system: CompiledSystem, found: Analysis) -> str:
                 near = [
                     one for one in listed if abs(complex(one) - mode.eigenvalue) <= max(2 * mode.error, 1e-12)
                 ]
+                near.sort(key=lambda one: abs(complex(one) - mode.eigenvalue))
                 if near:
                     _, right = _vectors(flint.acb_mat(matrix.mid()), near[:1])
                     turns = _turns(scene, frame, [right[i, 0] for i in range(right.nrows())])
