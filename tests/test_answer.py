@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,9 +11,9 @@ import pytest
 
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis.analysis import analyze
+from apc.runtime.analysis.analysis import analyze, prepare
 from apc.runtime.analysis.box import parse_range
-from apc.runtime.answers.answer import answer, judge
+from apc.runtime.answers.answer import answer, judge, sensitivities_of
 from apc.runtime.frame.overrides import Override, apply, parse_override
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
@@ -110,3 +111,14 @@ def test_a_stiffness_of_zero_lets_copies_apart_and_the_rest_is_told_all_the_same
     assert slope == pytest.approx((moved[1] - moved[0]) / float(2 * step), rel=1e-5)
     margin = {row.parameter: row.value for row in found.margins.rows}["coordination.stiffness"]
     assert margin == pytest.approx(1096.411, rel=1e-6)  # what holds below it with any stiffness
+
+
+def test_derivatives_of_a_matrix_whose_digits_are_lost_are_not_told() -> None:
+    system = compile_topology(SCENES / "three-users-average.yaml")
+    prepared = prepare(system)
+    found = analyze(system, prepared=prepared)
+    assert sensitivities_of(system, prepared, found).rows
+    other = replace(found, spectral_radius=found.spectral_radius + 1e-10)
+    told = sensitivities_of(system, prepared, other)
+    assert told.rows == ()
+    assert told.note.startswith("what moves it most: not told: floats lose the digits")

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from apc.runtime.analysis.box_proof import BoxProof
     from apc.runtime.analysis.ranges import Range
 
-# How far the radius that is differentiated may be from that of the analysis, relative to 1.
+# How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
+# well-conditioned frame stay below 1e-12; beyond ten times that, floats have lost what derivatives need.
 SAME_RADIUS = 1e-11
 
 # More peers than this, that differ or stand on a graph, are more than can be differentiated in passing.

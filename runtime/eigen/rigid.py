@@ -80,10 +80,7 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     with_drifts
         Whether to look for drifts, which is most of the work.
     """
-    exact = [group.exact for group in system.sites]
-    numbering = _Numbering(system.sites)
-    still = _standing_solutions(system, exact, numbering)
-    vectors = [_standing_state(system, exact, numbering, solution) for solution in still]
+    exact, numbering, still, vectors = _standing_motions(system)
     pairs = [state for _, state in _drifts(system, exact, numbering, still)] if still and with_drifts else []
     n = len(system.names)
     return RigidModes(
@@ -124,10 +121,7 @@ def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Sta
     with_drifts
         Whether to look for drifts, which is most of the work.
     """
-    exact = [group.exact for group in system.sites]
-    numbering = _Numbering(system.sites)
-    still = _standing_solutions(system, exact, numbering)
-    vectors = [_standing_state(system, exact, numbering, solution) for solution in still]
+    exact, numbering, still, vectors = _standing_motions(system)
     moving = _moving_places(system.sites, len(system.names))
     basis: dict[int, list[Fraction]] = {}
     unfelt = [left for vector in vectors if (left := _beyond(basis, vector, moving)) is not None]
@@ -203,6 +197,16 @@ def stays_rigid(
         if any(one - other for one, other in moved):
             return False
     return True
+
+
+def _standing_motions(
+    system: ClosedSystem | Loop,
+) -> tuple[list[LinearSite], _Numbering, list[list[Fraction]], list[list[Fraction]]]:
+    """Return the exact sites, the numbers of the unknowns, the standing solutions, and the state of each."""
+    exact = [group.exact for group in system.sites]
+    numbering = _Numbering(system.sites)
+    still = _standing_solutions(system, exact, numbering)
+    return exact, numbering, still, [_standing_state(system, exact, numbering, one) for one in still]
 
 
 def _standing_solutions(
