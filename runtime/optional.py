@@ -11,7 +11,7 @@ import importlib
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.distribution import install_line
+from apc.distribution import install_line
 
 
 def need(module: str, extra: str) -> Any:

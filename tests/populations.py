@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import prepare
-from apc.runtime.frame.exchange import Exchange, build_exchange
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.large.crowds import Crowd, crowds
+from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.parameters import resolve
+from apc.large.crowds import Crowd, crowds
 from tests.sites import columned, linked, paper
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import ORDER, Schedule
-from apc.runtime.frame.scheduling import build_schedules
+from apc.frame.jacobians import jacobians
+from apc.frame.parameters import resolve
+from apc.frame.schedule import ORDER, Schedule
+from apc.frame.scheduling import build_schedules
 
 
 def schedules(system: CompiledSystem, order: Sequence[str] = ORDER) -> tuple[Schedule, ...]:

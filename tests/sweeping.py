@@ -28,7 +28,7 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
 _WAITING = """\
 import sys, time
 from apc.__main__ import run
-from apc.runtime.sweep.store import Parts
+from apc.sweeps.store import Parts
 kept, write = [], Parts.write
 
 def write_and_wait(*arguments):

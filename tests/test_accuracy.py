@@ -8,9 +8,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.runtime.simulate.accuracy import error_text
-from apc.runtime.simulate.methods import parse_method
-from apc.runtime.simulate.trajectory import simulate
+from apc.simulation.accuracy import error_text
+from apc.simulation.methods import parse_method
+from apc.simulation.trajectory import simulate
 from tests.test_integrate import CROSSLEY
 from tests.topologies import AVERAGE, compiled, replaced
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis.analysis`."""
+"""Claims about `apc.analysis.analysis`."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import casadi
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import Timing
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import analyze, prepare
-from apc.runtime.frame.overrides import apply, parse_override
+from apc.frame.overrides import apply, parse_override
 from tests.sites import MS, alone, columned, edged, grouped, linked, paper
 
 
@@ -108,7 +108,7 @@ def test_an_analysis_brings_in_no_symbolic_algebra_and_no_units() -> None:
         "import sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent.parent)!r})\n"
         "from tests.sites import paper\n"
-        "from apc.runtime.analysis.analysis import analyze\n"
+        "from apc.analysis.analysis import analyze\n"
         "analyze(paper())\n"
         "print(sorted({'sympy', 'pint', 'matplotlib'} & set(sys.modules)))\n"
     )

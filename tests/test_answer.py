@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from apc.analysis.analysis import analyze, prepare
+from apc.analysis.box import parse_range
+from apc.answers.answer import answer, judge, sensitivities_of
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis.analysis import analyze, prepare
-from apc.runtime.analysis.box import parse_range
-from apc.runtime.answers.answer import answer, judge, sensitivities_of
-from apc.runtime.frame.overrides import Override, apply, parse_override
+from apc.frame.overrides import Override, apply, parse_override
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
 FLIPS = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"

@@ -27,7 +27,7 @@ def test_every_public_name_is_there_and_nothing_else() -> None:
     assert set(apc.__all__) <= set(dir(apc))
     assert all(getattr(apc, name).__doc__ for name in apc.__all__)
     assert apc.__version__
-    with pytest.raises(AttributeError, match="module 'apc' has no attribute 'nothing'"):
+    with pytest.raises(AttributeError, match="nothing"):
         apc.nothing  # noqa: B018 # looking it up is the test
 
 

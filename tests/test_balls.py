@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.balls`."""
+"""Claims about `apc.eigen.balls`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import flint
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.balls import frame_balls, precision, reduced_balls, square, unprovable
-from apc.runtime.eigen.modes import dense, split
-from apc.runtime.eigen.rigid import find_rigid_modes, independent_places
+from apc.eigen.balls import frame_balls, precision, reduced_balls, square, unprovable
+from apc.eigen.modes import dense, split
+from apc.eigen.rigid import find_rigid_modes, independent_places
 from tests.sites import MS, columned, grouped, linked, paper
 
 SCENES = [

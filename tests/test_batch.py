@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.vary.batch`, `evaluator` and `eigenvalues`."""
+"""Claims about `apc.vary.batch`, `evaluator` and `eigenvalues`."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import analyze, lifted_groups
-from apc.runtime.eigen.balls import frame_balls, precision
-from apc.runtime.eigen.modes import split
-from apc.runtime.frame.names import Free
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
-from apc.runtime.vary.eigenvalues import eigenvalues
-from apc.runtime.vary.evaluator import evaluator, reaches_time
+from apc.eigen.balls import frame_balls, precision
+from apc.eigen.modes import split
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
+from apc.vary.batch import BatchEvaluator, matrix_errors
+from apc.vary.eigenvalues import eigenvalues
+from apc.vary.evaluator import evaluator, reaches_time
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 NAMES = ("contact.stiffness", "coordination.stiffness", "coordination.damping", "device.mass", "cube.damping")

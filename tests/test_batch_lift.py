@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.batch_lift`: many sites at once are the sites one by one."""
+"""Claims about `apc.frame.batch_lift`: many sites at once are the sites one by one."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.runtime.frame.batch_lift import compose_rows, exponential_rows, lift_rows
-from apc.runtime.frame.discretize import UNIT, discretize
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.lift import lift
-from apc.runtime.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import Propagate
-from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.frame.site import every_matrix
-from apc.runtime.large.crowds import Crowd
+from apc.frame.batch_lift import compose_rows, exponential_rows, lift_rows
+from apc.frame.discretize import UNIT, discretize
+from apc.frame.jacobians import jacobians
+from apc.frame.lift import lift
+from apc.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
+from apc.frame.overrides import Override, apply
+from apc.frame.parameters import resolve
+from apc.frame.schedule import Propagate
+from apc.frame.scheduling import build_schedules
+from apc.frame.site import every_matrix
+from apc.large.crowds import Crowd
 from tests.populations import crowded, different
 from tests.sites import MS
 from tests.test_selfcheck import STIFF

@@ -13,8 +13,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.bench.bench import (
+from apc.benchmark.bench import (
     MOST_PLAYED,
     SAME,
     Bench,
@@ -24,10 +23,11 @@ from apc.runtime.bench.bench import (
     bench_simulation,
     pareto_front,
 )
-from apc.runtime.bench.figure import draw_bench, save_bench
-from apc.runtime.bench.reference import MOST_MOVING
-from apc.runtime.bench.report import bench_report, scale_report
-from apc.runtime.bench.scale import scale, with_count
+from apc.benchmark.figure import draw_bench, save_bench
+from apc.benchmark.reference import MOST_MOVING
+from apc.benchmark.report import bench_report, scale_report
+from apc.benchmark.scale import scale, with_count
+from apc.compiler.errors import ApcError, Mistake, Place
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 
@@ -166,14 +166,14 @@ def test_a_matrix_of_all_peers_that_is_too_large_is_left_out_with_the_reason_of_
         assert "system of 8,000,000 states; the matrix of one may have 1,000" in reasons[name]
     assert not any("Write:" in reason for reason in reasons.values())
     assert {"modes", "certified"} <= {one.name for one in found.measured}
-    monkeypatch.setattr("apc.runtime.analysis.openloop.MOST_ROWS", 5)
+    monkeypatch.setattr("apc.analysis.openloop.MOST_ROWS", 5)
     [(name, reason)] = bench_analysis(compiled(AVERAGE), rounds=1).refused
     assert name == "paper"
     assert reason.endswith("have more than 5 rows")
 
 
 def test_a_proof_that_was_not_had_is_left_out_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("apc.runtime.eigen.spectrum.MOST_PROVED", 3)
+    monkeypatch.setattr("apc.eigen.spectrum.MOST_PROVED", 3)
     found = bench_analysis(compiled(AVERAGE), rounds=1)
     assert "not proved, as it has" in dict(found.refused)["certified"]
     assert "certified" not in {one.name for one in found.measured}
@@ -182,7 +182,7 @@ def test_a_proof_that_was_not_had_is_left_out_and_says_why(monkeypatch: pytest.M
 def test_what_is_too_large_to_be_played_is_analysed_all_the_same(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("apc.runtime.simulate.simulation.MOST_NUMBERS", 10)
+    monkeypatch.setattr("apc.simulation.simulation.MOST_NUMBERS", 10)
     found = bench(compiled(AVERAGE), rounds=1)
     analysis, simulation = found.comparisons
     assert analysis.measured
@@ -307,7 +307,7 @@ def test_a_list_that_is_none_of_peers_is_refused(words: str, capsys: pytest.Capt
 def test_a_picture_that_cannot_be_drawn_is_refused_before_anything_is_measured(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: pytest.fail("it is measured"))
+    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: pytest.fail("it is measured"))
     words = ["bench", str(SCENES / "template.yaml"), "--plot"]
     assert run([*words, "bench.txt"]) == 1
     assert "E878 the suffix of --plot" in capsys.readouterr().err
@@ -319,7 +319,7 @@ def test_a_picture_that_cannot_be_drawn_is_refused_before_anything_is_measured(
 def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_measured(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: pytest.fail("it is measured"))
+    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: pytest.fail("it is measured"))
     folder = tmp_path / "folder.png"
     folder.mkdir()
     for plot, message in (
@@ -338,8 +338,8 @@ def test_a_picture_that_could_not_be_written_in_the_end_costs_no_figures(
     def full(*_: object) -> None:
         raise ApcError(Mistake("E601", Place("bench.png"), "can't be written: no space"))
 
-    monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: found)
-    monkeypatch.setattr("apc.runtime.bench.figure.save_bench", full)
+    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: found)
+    monkeypatch.setattr("apc.benchmark.figure.save_bench", full)
     assert run(["bench", str(SCENES / "template.yaml"), "--plot", str(tmp_path / "bench.png")]) == 1
     printed = capsys.readouterr()
     assert "E601 can't be written" in printed.err
@@ -353,7 +353,7 @@ def test_a_bound_that_does_not_hold_ends_with_code_1_after_the_figures(
     note = "WRONG: the bound of dense does not hold"
     first, *rest = found.comparisons
     broken = replace(found, comparisons=(replace(first, notes=(note,)), *rest))
-    monkeypatch.setattr("apc.runtime.bench.bench.bench", lambda *_: broken)
+    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: broken)
     assert run(["bench", str(SCENES / "template.yaml")]) == 1
     printed = capsys.readouterr()
     assert "E922" in printed.err and note in printed.err

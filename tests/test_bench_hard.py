@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from apc.__main__ import run
+from apc.analysis.analysis import Analysis, analyze
+from apc.benchmark.hard import HardReport, compare, run_hard_cases
+from apc.benchmark.report import hard_report
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis.analysis import Analysis, analyze
-from apc.runtime.bench.hard import HardReport, compare, run_hard_cases
-from apc.runtime.bench.report import hard_report
 from tests.hard.truths import HERE, TRUTHS, truth_of
 
 NAMES = sorted(path.stem for path in HERE.glob("*.yaml"))

@@ -12,12 +12,12 @@ import mpmath
 import numpy as np
 import pytest
 
+from apc.benchmark.bench import bench_simulation
+from apc.benchmark.events import refusal
+from apc.benchmark.reference import Truth, exact_course, spectral_truth
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.bench.bench import bench_simulation
-from apc.runtime.bench.events import refusal
-from apc.runtime.bench.reference import Truth, exact_course, spectral_truth
-from apc.runtime.eigen.balls import precision
+from apc.eigen.balls import precision
 from tests.topologies import SCENES, compiled, library
 
 MASS, DAMPING = 0.25, 2.0  # kg, N·s/m: numbers of a few bits, so that text and closed form mean the same

@@ -12,12 +12,12 @@ import flint
 import numpy as np
 import pytest
 
+from apc.benchmark import events
+from apc.benchmark import reference as fifty_digits
+from apc.benchmark.events import refusal
+from apc.benchmark.reference import Truth, classes_of, exact_course, spectral_truth
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.bench import events
-from apc.runtime.bench import reference as fifty_digits
-from apc.runtime.bench.events import refusal
-from apc.runtime.bench.reference import Truth, classes_of, exact_course, spectral_truth
-from apc.runtime.eigen.balls import precision
+from apc.eigen.balls import precision
 from tests.bench.contact_reference import Bounce, positions, reference
 from tests.bruteforce import Scene, frame_matrix
 from tests.eventwise import experiment, play
@@ -127,7 +127,7 @@ def test_the_reference_shares_with_the_runtime_what_it_says_and_no_more() -> Non
         tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             module_name = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
-            if module_name.startswith("apc.runtime.") and "apc.runtime.bench" not in module_name:
+            if module_name.startswith("apc.") and "apc.benchmark" not in module_name:
                 shared |= {alias.name for alias in node.names}  # type: ignore[attr-defined] # it is an import
     functions = {"evaluate_exact", "is_rational", "guards_of", "rational_ball", "precision"}
     assert shared == functions | {"resolve", "exact_numbers", "arcs", "ROW"}

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.vary.bends`: nothing of the equations hides between the points of a scan."""
+"""Claims about `apc.vary.bends`: nothing of the equations hides between the points of a scan."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import analyze, prepare
-from apc.runtime.frame.names import Free, value_now
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.vary.batch import BatchEvaluator
-from apc.runtime.vary.bends import STRAIGHT, Bends, bends
-from apc.runtime.vary.critical import critical
-from apc.runtime.vary.evaluator import evaluator
+from apc.frame.names import Free, value_now
+from apc.frame.overrides import Override, apply
+from apc.vary.batch import BatchEvaluator
+from apc.vary.bends import STRAIGHT, Bends, bends
+from apc.vary.critical import critical
+from apc.vary.evaluator import evaluator
 from tests.topologies import AVERAGE, compiled, library, replaced
 
 SPRING = """\

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.blocks`."""
+"""Claims about `apc.simulation.blocks`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import prepare
+from apc.simulation.blocks import blocks
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
 from tests.lossy import unreliable
 from tests.sites import alone
 from tests.topologies import AVERAGE, compiled

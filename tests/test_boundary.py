@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from apc.runtime.region.boundary import Arc, trace
-from apc.runtime.region.cells import Survey, survey
-from apc.runtime.region.curves import area_beside, between
-from apc.runtime.region.eigenpairs import leading, log_magnitudes
+from apc.regions.boundary import Arc, trace
+from apc.regions.cells import Survey, survey
+from apc.regions.curves import area_beside, between
+from apc.regions.eigenpairs import leading, log_magnitudes
 from tests.fields import Fields, cusp, disc, plane
 
 TOLERANCE = 1e-9

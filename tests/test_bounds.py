@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.bounds`."""
+"""Claims about `apc.frame.bounds`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.overrides import apply, parse_override
-from apc.runtime.frame.parameters import resolve
+from apc.frame.overrides import apply, parse_override
+from apc.frame.parameters import resolve
 from tests.sites import columned, derived, grouped, paper
 
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis.box` and `apc.runtime.analysis.box_proof`."""
+"""Claims about `apc.analysis.box` and `apc.analysis.box_proof`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import analyze
+from apc.analysis.box import parse_range
+from apc.analysis.box_proof import BoxProof, prove_box
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.analysis.box import parse_range
-from apc.runtime.analysis.box_proof import BoxProof, prove_box
-from apc.runtime.frame.overrides import Override, apply
+from apc.frame.overrides import Override, apply
 from tests.sites import columned, grouped, paper
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, library, replaced
 
@@ -79,7 +79,7 @@ def test_an_instability_inside_the_box_is_found() -> None:
 
 def test_what_can_not_be_proved_is_left_open_and_says_where(monkeypatch: pytest.MonkeyPatch) -> None:
     """At K_T = 0 nothing ties the copies: no box that holds this point is stable in the same sense."""
-    monkeypatch.setattr("apc.runtime.analysis.box_proof.MOST_CELLS", 100)
+    monkeypatch.setattr("apc.analysis.box_proof.MOST_CELLS", 100)
     found = _proof(compiled(AVERAGE), "coordination.stiffness=0 N/m:200 N/m")
     assert (found.stable, found.verdict) == (None, "undecided")
     assert 0 < found.open_share < 0.1

@@ -1,11 +1,11 @@
-"""Claims about `apc.runtime.vary.bracket`: what holds a crossing, in balls and in floats."""
+"""Claims about `apc.vary.bracket`: what holds a crossing, in balls and in floats."""
 
 from __future__ import annotations
 
 import pytest
 
-from apc.runtime.vary import bracket as brackets
-from apc.runtime.vary.critical import critical
+from apc.vary import bracket as brackets
+from apc.vary.critical import critical
 from tests.topologies import AVERAGE, ROOT, compiled
 
 LIMIT = 1096.410868365630  # tests.reference, of the paper's scene

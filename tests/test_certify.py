@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.certify` and what `apc.runtime.eigen.spectrum` makes of it."""
+"""Claims about `apc.eigen.certify` and what `apc.eigen.spectrum` makes of it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import flint
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import Analysis, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import Analysis, analyze, lifted_groups
-from apc.runtime.eigen.balls import precision
-from apc.runtime.eigen.certify import prove, schur_cohn
-from apc.runtime.eigen.modes import split
-from apc.runtime.eigen.rigid import find_rigid_modes, independent_places
+from apc.eigen.balls import precision
+from apc.eigen.certify import prove, schur_cohn
+from apc.eigen.modes import split
+from apc.eigen.rigid import find_rigid_modes, independent_places
 from tests.sites import MS, alone, columned, grouped, linked, paper
 
 TRANSLATING = "stable up to a common translation"

@@ -12,17 +12,17 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.runtime.region import files as region_files
-from apc.runtime.region.axes import parse_axes
-from apc.runtime.region.figure import stable_outlines
-from apc.runtime.region.panels import (
+from apc.regions import files as region_files
+from apc.regions.axes import parse_axes
+from apc.regions.figure import stable_outlines
+from apc.regions.panels import (
     compare_regions,
     gain_factor,
     panel_letter,
     parse_panel,
     parse_vary,
 )
-from apc.runtime.region.region import region
+from apc.regions.region import region
 from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced
 
 X = "contact.stiffness=10 N/m:3000 N/m"

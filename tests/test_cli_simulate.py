@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from apc.__main__ import run
-from apc.runtime.simulate import blocks, simulation
+from apc.simulation import blocks, simulation
 from tests.topologies import AVERAGE, SCENES, replaced
 
 MOVED = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: 5 mm}}"))

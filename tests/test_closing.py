@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.closing`."""
+"""Claims about `apc.eigen.closing`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.closing import close_loop
-from apc.runtime.eigen.modes import complete_loops, dense_loop
+from apc.analysis.analysis import lifted_groups
+from apc.eigen.closing import close_loop
+from apc.eigen.modes import complete_loops, dense_loop
 from tests.sites import MS, paper
 
 

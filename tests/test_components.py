@@ -1,11 +1,11 @@
-"""Claims about `apc.runtime.eigen.components`."""
+"""Claims about `apc.eigen.components`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from apc.runtime.eigen.components import components
+from apc.eigen.components import components
 
 
 def _listed(driven: np.ndarray) -> list[list[int]]:

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis.contact_modes`."""
+"""Claims about `apc.analysis.contact_modes`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import analyze, prepare
-from apc.runtime.analysis.contact_modes import ContactMode, ContactModes, contact_modes
+from apc.analysis.analysis import analyze, prepare
+from apc.analysis.contact_modes import ContactMode, ContactModes, contact_modes
 from tests import bruteforce
 from tests.sites import alone
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced

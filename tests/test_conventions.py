@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis.conventions`."""
+"""Claims about `apc.analysis.conventions`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import analyze, prepare
-from apc.runtime.analysis.conventions import Conventions, Outcome, conventions
-from apc.runtime.frame.schedule import ORDER
+from apc.analysis.analysis import analyze, prepare
+from apc.analysis.conventions import Conventions, Outcome, conventions
+from apc.frame.schedule import ORDER
 from tests import bruteforce
 from tests.sites import MS, columned, edged, paper
 from tests.topologies import AVERAGE, SCENES, compiled

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.coupling`."""
+"""Claims about `apc.eigen.coupling`."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.coupling import complete_degrees, couple
-from apc.runtime.eigen.loop import Coupling
-from apc.runtime.frame.schedule import Way
+from apc.eigen.coupling import complete_degrees, couple
+from apc.eigen.loop import Coupling
+from apc.frame.schedule import Way
 from tests.sites import MS, columned, edged, grouped, linked, paper
 
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.course`: the frequency a mode has, however long the frame."""
+"""Claims about `apc.frame.course`: the frequency a mode has, however long the frame."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.course import turned_along
-from apc.runtime.vary.critical import critical
+from apc.analysis.analysis import analyze
+from apc.frame.course import turned_along
+from apc.vary.critical import critical
 from tests.topologies import compiled
 
 # Textbook: m x″ + d x′ + k x = 0.

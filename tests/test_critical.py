@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.vary.critical` and what it searches with: limits, islands, jumps, errors."""
+"""Claims about `apc.vary.critical` and what it searches with: limits, islands, jumps, errors."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from apc.__main__ import run
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.vary.critical import critical
-from apc.runtime.vary.crossings import scan, scan_lines
-from apc.runtime.vary.margins import margins
+from apc.frame.overrides import Override, apply
+from apc.vary.critical import critical
+from apc.vary.crossings import scan, scan_lines
+from apc.vary.margins import margins
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
@@ -315,8 +315,8 @@ def test_many_packets_on_their_way_give_the_crossings_that_few_give(monkeypatch:
     """Without a matrix that holds the packets: the argument principle instead, from this many on."""
     system = with_values(compiled(AVERAGE), {"coordination.stiffness": "690", "contact.stiffness": "100"})
     by_matrix = critical(system, "lan.delay", upper="16 ms")
-    monkeypatch.setattr("apc.runtime.vary.delays.LONG_LINES", 0)
-    monkeypatch.setattr("apc.runtime.analysis.plan.LONG_LINES", 0)
+    monkeypatch.setattr("apc.vary.delays.LONG_LINES", 0)
+    monkeypatch.setattr("apc.analysis.plan.LONG_LINES", 0)
     by_count = critical(system, "lan.delay", upper="16 ms")
     assert by_matrix.crossings
     for one, other in zip(by_matrix.crossings, by_count.crossings, strict=True):

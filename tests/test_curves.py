@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from apc.runtime.region.curves import area_beside, between, fill, off_an_arc, stencils, through_four
+from apc.regions.curves import area_beside, between, fill, off_an_arc, stencils, through_four
 
 Floats = NDArray[np.float64]
 

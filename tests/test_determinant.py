@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import Analysis, analyze, lifted_groups
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis.analysis import Analysis, analyze, lifted_groups
-from apc.runtime.eigen.modes import arrange, complete_loops, dense, split
-from apc.runtime.eigen.spectrum import Spectrum
-from apc.runtime.frame.overrides import apply, parse_override
-from apc.runtime.large.characteristic import characteristic_ball, refine
-from apc.runtime.large.circles import beyond
-from apc.runtime.large.determinant import of_crowds
-from apc.runtime.large.determinant_spectrum import solve_crowds, solve_loops
-from apc.runtime.large.translation import count_translations
-from apc.runtime.large.zeros import find_zeros, near_poles
+from apc.eigen.modes import arrange, complete_loops, dense, split
+from apc.eigen.spectrum import Spectrum
+from apc.frame.overrides import apply, parse_override
+from apc.large.characteristic import characteristic_ball, refine
+from apc.large.circles import beyond
+from apc.large.determinant import of_crowds
+from apc.large.determinant_spectrum import solve_crowds, solve_loops
+from apc.large.translation import count_translations
+from apc.large.zeros import find_zeros, near_poles
 from tests.bruteforce import Scene, frame_matrix
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.discretize import UNIT, discretize
+from apc.frame.discretize import UNIT, discretize
 
 DAMPINGS = (0.0, 1e-12, 1e-6, 5.0, 1e6)
 MASSES = (1e-6, 0.1, 1e3)

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.duals`."""
+"""Claims about `apc.eigen.duals`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from fractions import Fraction
 import flint
 import numpy as np
 
-from apc.runtime.eigen.balls import precision
-from apc.runtime.eigen.duals import Dual, mapped, slope_of, step_duals, value_of
-from apc.runtime.frame.discretize import step_balls
+from apc.eigen.balls import precision
+from apc.eigen.duals import Dual, mapped, slope_of, step_duals, value_of
+from apc.frame.discretize import step_balls
 
 
 def test_the_slope_of_a_step_is_the_slope() -> None:

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.ensemble`."""
+"""Claims about `apc.simulation.ensemble`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.runtime.simulate.ensemble import PART, Ensemble, Run, play_many, share_interval
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import prepare
-from apc.runtime.simulate.trajectory import play
+from apc.simulation.ensemble import PART, Ensemble, Run, play_many, share_interval
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
+from apc.simulation.trajectory import play
 from tests.test_gathering import apart
 from tests.topologies import AVERAGE, compiled
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.exact`."""
+"""Claims about `apc.frame.exact`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import casadi
 import mpmath
 import pytest
 
-from apc.runtime.frame.exact import evaluate_exact, is_rational
+from apc.frame.exact import evaluate_exact, is_rational
 
 
 def _function(build: Any, size: int = 2) -> casadi.Function:

@@ -1,10 +1,10 @@
-"""Claims about `apc.runtime.frame.exchange`."""
+"""Claims about `apc.frame.exchange`."""
 
 from __future__ import annotations
 
 from apc.compiler.compiled import Graph
-from apc.runtime.frame.exchange import arcs, build_exchange
-from apc.runtime.frame.parameters import resolve
+from apc.frame.exchange import arcs, build_exchange
+from apc.frame.parameters import resolve
 from tests.sites import COMPLETE, MS, grouped, linked, paper
 
 

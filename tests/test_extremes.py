@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import analyze, lifted_groups
-from apc.runtime.eigen.closing import close_loop
-from apc.runtime.eigen.graph_loops import graph_loop, graph_scale
-from apc.runtime.eigen.graph_modes import ring_mode, ring_values
-from apc.runtime.eigen.peer_group import used_ways
-from apc.runtime.large.extremes import find_extremes
-from apc.runtime.large.graph import deciding_loops, is_large_ring
+from apc.analysis.analysis import analyze, lifted_groups
+from apc.eigen.closing import close_loop
+from apc.eigen.graph_loops import graph_loop, graph_scale
+from apc.eigen.graph_modes import ring_mode, ring_values
+from apc.eigen.peer_group import used_ways
+from apc.large.extremes import find_extremes
+from apc.large.graph import deciding_loops, is_large_ring
 from tests.sites import MS, grouped, linked, paper
 
 VARIED: list[dict[str, Any]] = [
@@ -51,8 +51,8 @@ def test_no_system_left_out_is_above_the_bound(values: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("values", [{}, {"kt": 900.0}, {"kt": 0.0}])
 def test_a_large_ring_has_the_radius_of_all_its_systems(values: dict[str, Any]) -> None:
-    from apc.runtime.eigen.modes import split
-    from apc.runtime.eigen.spectrum import solve_spectrum
+    from apc.eigen.modes import split
+    from apc.eigen.spectrum import solve_spectrum
 
     system = linked(paper(peers=300, **values), "ring")
     groups, exchange = lifted_groups(system)

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.flow`."""
+"""Claims about `apc.simulation.flow`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.runtime.simulate.flow import flow_of, rows_to_move
-from apc.runtime.simulate.methods import DEFAULT, parse_method
+from apc.simulation.flow import flow_of, rows_to_move
+from apc.simulation.methods import DEFAULT, parse_method
 from tests.sites import alone, paper
 
 CUBIC = alone(lambda x, u: -(x**3)).kinds[0]

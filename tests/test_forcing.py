@@ -13,15 +13,15 @@ import mpmath
 import numpy as np
 import pytest
 
+from apc.benchmark.pushes import Push, impulse, push_of, switches
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.bench.pushes import Push, impulse, push_of, switches
-from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.simulate import forcing as forcings
-from apc.runtime.simulate.forcing import Forcing, SiteForcing, forcing_of, impulses
-from apc.runtime.simulate.propagate import rates, transitions
-from apc.runtime.simulate.quadrature import kernel_of
-from apc.runtime.simulate.trajectory import simulate
+from apc.eigen.balls import precision
+from apc.frame.parameters import resolve
+from apc.simulation import forcing as forcings
+from apc.simulation.forcing import Forcing, SiteForcing, forcing_of, impulses
+from apc.simulation.propagate import rates, transitions
+from apc.simulation.quadrature import kernel_of
+from apc.simulation.trajectory import simulate
 from tests.topologies import ONE_MASS, SCENES
 
 CLOCK = "clocks: {haptic: 10 ms}\n"

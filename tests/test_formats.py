@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.formats`; what is in a file is in `test_recording`."""
+"""Claims about `apc.simulation.formats`; what is in a file is in `test_recording`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.runtime.simulate import formats
-from apc.runtime.simulate.formats import Writer, keep_room
-from apc.runtime.simulate.signals import Signal
+from apc.simulation import formats
+from apc.simulation.formats import Writer, keep_room
+from apc.simulation.signals import Signal
 
 SIGNALS = [Signal("user", 1, "cube.x", "m", "state"), Signal("user", 2, "cube.x", "m", "state")]
 

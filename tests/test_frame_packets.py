@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.frame_packets`: what hearing costs."""
+"""Claims about `apc.simulation.frame_packets`: what hearing costs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from fractions import Fraction
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import prepare
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
 from tests.sites import grouped, linked, paper
 
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.network.gathering`: what unreliable links do to a scene that is played."""
+"""Claims about `apc.network.gathering`: what unreliable links do to a scene that is played."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.network.channel_law import channel_law
-from apc.runtime.network.packets import PacketSource
-from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import Simulation, prepare
+from apc.network.channel_law import channel_law
+from apc.network.packets import PacketSource
+from apc.simulation.blocks import blocks
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
 from tests.eventwise import MS, Play, User, coast, contact, pull
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 

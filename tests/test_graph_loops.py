@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.graph_loops`."""
+"""Claims about `apc.eigen.graph_loops`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.closing import close_loop
-from apc.runtime.eigen.graph_loops import common_graph, graph_loop, graph_scale
-from apc.runtime.eigen.graph_modes import graph_modes
-from apc.runtime.eigen.modes import complete_loops
-from apc.runtime.eigen.peer_group import used_ways
+from apc.eigen.closing import close_loop
+from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale
+from apc.eigen.graph_modes import graph_modes
+from apc.eigen.modes import complete_loops
+from apc.eigen.peer_group import used_ways
 from tests.sites import linked, paper
 
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.graph_modes`."""
+"""Claims about `apc.eigen.graph_modes`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import Graph
-from apc.runtime.eigen.graph_modes import GraphMode, graph_modes
-from apc.runtime.frame.exchange import arcs
+from apc.eigen.graph_modes import GraphMode, graph_modes
+from apc.frame.exchange import arcs
 from tests.sites import COMPLETE
 
 

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from apc.runtime.sweep.grid import GridAxis, build_grid, check_size, parse_axis
+from apc.sweeps.grid import GridAxis, build_grid, check_size, parse_axis
 from tests.topologies import AVERAGE, compiled, told
 
 MODEL = compiled(AVERAGE)

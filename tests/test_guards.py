@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi
 
-from apc.runtime.frame.guards import guards_of
+from apc.frame.guards import guards_of
 
 X, T = casadi.SX.sym("x"), casadi.SX.sym("t")
 

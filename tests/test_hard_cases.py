@@ -15,9 +15,9 @@ import flint
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
-from apc.runtime.analysis.analysis import Analysis, analyze
-from apc.runtime.eigen.balls import precision
+from apc.eigen.balls import precision
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, alone, columned, grouped, linked, paper
 

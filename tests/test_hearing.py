@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.hearing`."""
+"""Claims about `apc.frame.hearing`."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.hearing import hearing_of
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.liveness import live_outputs, live_receives
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import Way
+from apc.frame.exchange import build_exchange
+from apc.frame.hearing import hearing_of
+from apc.frame.jacobians import jacobians
+from apc.frame.liveness import live_outputs, live_receives
+from apc.frame.parameters import resolve
+from apc.frame.schedule import Way
 from tests.scheduled import schedules
 from tests.sites import MS, edged, grouped, linked, paper
 

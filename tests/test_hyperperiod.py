@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.hyperperiod`."""
+"""Claims about `apc.frame.hyperperiod`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from fractions import Fraction
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.hyperperiod import ClockGrid
-from apc.runtime.frame.schedule import Schedule
+from apc.frame.hyperperiod import ClockGrid
+from apc.frame.schedule import Schedule
 from tests.scheduled import schedules
 from tests.sites import MS, paper
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.instants`."""
+"""Claims about `apc.simulation.instants`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.runtime.simulate.instants import MOST, at_instants
+from apc.simulation.instants import MOST, at_instants
 
 PARAMETERS = np.array([0.7, -1.3])
 # Every way in which a force may hang on time.

@@ -15,13 +15,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from apc.compiler.errors import ApcError
-from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.integrate import integrated
-from apc.runtime.simulate.methods import Method, parse_method
-from apc.runtime.simulate.propagate import nonlinear_rows
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import prepare
-from apc.runtime.simulate.trajectory import Trajectory, simulate
+from apc.simulation.blocks import blocks
+from apc.simulation.integrate import integrated
+from apc.simulation.methods import Method, parse_method
+from apc.simulation.propagate import nonlinear_rows
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
+from apc.simulation.trajectory import Trajectory, simulate
 from tests.sites import alone
 from tests.topologies import compiled, library
 

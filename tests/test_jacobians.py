@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.jacobians`."""
+"""Claims about `apc.frame.jacobians`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import Kind
-from apc.runtime.frame.jacobians import edge_name, jacobians
-from apc.runtime.frame.linearize import linearize
-from apc.runtime.frame.parameters import resolve
+from apc.frame.jacobians import edge_name, jacobians
+from apc.frame.linearize import linearize
+from apc.frame.parameters import resolve
 from tests.sites import edged, paper, user
 
 

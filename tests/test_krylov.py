@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import analyze, lifted_groups
-from apc.runtime.eigen.modes import dense
-from apc.runtime.large.krylov import solve_sparse
-from apc.runtime.large.relative import relative_matrix, rigid_space
-from apc.runtime.large.sampled_count import argument_of, count_beyond
-from apc.runtime.large.sparse_system import small_matrix, sparse_system
-from apc.runtime.large.translation import free_motions
+from apc.analysis.analysis import analyze, lifted_groups
+from apc.eigen.modes import dense
+from apc.large.krylov import solve_sparse
+from apc.large.relative import relative_matrix, rigid_space
+from apc.large.sampled_count import argument_of, count_beyond
+from apc.large.sparse_system import small_matrix, sparse_system
+from apc.large.translation import free_motions
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper
 from tests.topologies import MESH, compiled, replaced

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.length`: how much a simulation will be is told before it is played."""
+"""Claims about `apc.simulation.length`: how much a simulation will be is told before it is played."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from fractions import Fraction
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.simulate.length import MOST_ROWS, check_length, size_note
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import prepare
+from apc.simulation.length import MOST_ROWS, check_length, size_note
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
 from tests.topologies import AVERAGE, compiled
 
 SCENE = compiled(AVERAGE)

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.lift`."""
+"""Claims about `apc.frame.lift`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.frame.lift import LiftedSite
+from apc.analysis.analysis import lifted_groups
+from apc.frame.lift import LiftedSite
 from tests.sites import MS, alone, paper
 
 

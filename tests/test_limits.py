@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apc.analysis.selfcheck import check_frame
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.language import tables
 from apc.compiler.language.tables import read_table
-from apc.runtime.analysis.selfcheck import check_frame
-from apc.runtime.frame import discretize as discretizing
-from apc.runtime.frame import scheduling
-from apc.runtime.frame.discretize import discretize, moved_together
-from apc.runtime.vary import delays
-from apc.runtime.vary.critical import critical
+from apc.frame import discretize as discretizing
+from apc.frame import scheduling
+from apc.frame.discretize import discretize, moved_together
+from apc.vary import delays
+from apc.vary.critical import critical
 from tests.topologies import AVERAGE, compiled, replaced, told
 
 NOWHERE = Place("scene.yaml", 7, 9)

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.linearize`."""
+"""Claims about `apc.frame.linearize`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from fractions import Fraction
 import casadi
 import numpy as np
 
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row, sites_of_rows
-from apc.runtime.frame.parameters import resolve
+from apc.frame.jacobians import jacobians
+from apc.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row, sites_of_rows
+from apc.frame.parameters import resolve
 from tests.sites import NAMES, paper, user
 
 

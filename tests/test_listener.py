@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.network.listener`."""
+"""Claims about `apc.network.listener`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import Tick
-from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.network.channel_law import ChannelLaw
-from apc.runtime.network.listener import START, Listener
-from apc.runtime.network.packets import PacketSource
+from apc.frame.jacobians import jacobians
+from apc.frame.parameters import resolve
+from apc.frame.schedule import Tick
+from apc.frame.scheduling import build_schedules
+from apc.network.channel_law import ChannelLaw
+from apc.network.listener import START, Listener
+from apc.network.packets import PacketSource
 from tests.lossy import BURSTS, JITTER, RELIABLE, delays, recorded
 from tests.sites import MS, paper
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.listening`: what is heard at the start, worked out by hand."""
+"""Claims about `apc.eigen.listening`: what is heard at the start, worked out by hand."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from fractions import Fraction
 
 import pytest
 
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.frame.start import Listening
+from apc.analysis.analysis import lifted_groups
+from apc.eigen.peer_group import PeerGroup
+from apc.frame.start import Listening
 from tests.sites import columned, edged, paper
 
 STARTS = [0.0, 0.25, 1.0]

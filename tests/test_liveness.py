@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.liveness`."""
+"""Claims about `apc.frame.liveness`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import casadi
 
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.liveness import live_holds, live_outputs, live_receives
-from apc.runtime.frame.site import LinearSite
+from apc.frame.jacobians import jacobians
+from apc.frame.liveness import live_holds, live_outputs, live_receives
+from apc.frame.site import LinearSite
 from tests.sites import NAMES, user
 
 

@@ -1,10 +1,10 @@
-"""Claims about `apc.runtime.eigen.loop`."""
+"""Claims about `apc.eigen.loop`."""
 
 from __future__ import annotations
 
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.loop import Packet, lay_out, packet_places
-from apc.runtime.eigen.modes import complete_loops, dense_loop
+from apc.analysis.analysis import lifted_groups
+from apc.eigen.loop import Packet, lay_out, packet_places
+from apc.eigen.modes import complete_loops, dense_loop
 from tests.sites import MS, paper
 
 

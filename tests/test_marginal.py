@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.vary.marginal`: the motion on the boundary is the one that decides."""
+"""Claims about `apc.vary.marginal`: the motion on the boundary is the one that decides."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from fractions import Fraction
 
 import pytest
 
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.vary.critical import critical
+from apc.analysis.analysis import analyze
+from apc.frame.overrides import Override, apply
+from apc.vary.critical import critical
 from tests.topologies import AVERAGE, SCENES, compiled
 
 

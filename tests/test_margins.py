@@ -1,13 +1,13 @@
-"""Claims about `apc.runtime.vary.margins`."""
+"""Claims about `apc.vary.margins`."""
 
 from __future__ import annotations
 
 import re
 from fractions import Fraction
 
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.vary.margins import margins, margins_report
+from apc.analysis.analysis import analyze
+from apc.frame.overrides import Override, apply
+from apc.vary.margins import margins, margins_report
 from tests.topologies import AVERAGE, compiled, replaced
 
 

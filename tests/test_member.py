@@ -1,14 +1,14 @@
-"""Claims about `apc.runtime.simulate.member`."""
+"""Claims about `apc.simulation.member`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.simulate.member import build_member
-from apc.runtime.simulate.propagate import rates, transitions
-from apc.runtime.simulate.writing import build_program
+from apc.frame.jacobians import jacobians
+from apc.frame.parameters import resolve
+from apc.simulation.member import build_member
+from apc.simulation.propagate import rates, transitions
+from apc.simulation.writing import build_program
 from tests.scheduled import schedules
 from tests.sites import columned, paper
 

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from apc.runtime.simulate.methods import DEFAULT, Method, check_step, finer, parse_method
+from apc.simulation.methods import DEFAULT, Method, check_step, finer, parse_method
 from tests.topologies import AVERAGE, compiled, told
 
 MS = Fraction(1, 1000)

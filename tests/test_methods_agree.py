@@ -13,11 +13,11 @@ from pathlib import Path
 import flint
 import pytest
 
+from apc.analysis.analysis import analyze
+from apc.benchmark.reference import Truth, spectral_truth
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.bench.reference import Truth, spectral_truth
 from tests.topologies import ROOT
 
 STORED = json.loads((ROOT / "tests" / "hard" / "truths.json").read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.modes`."""
+"""Claims about `apc.eigen.modes`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.modes import dense, split
+from apc.eigen.modes import dense, split
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, columned, edged, grouped, linked, paper
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.names`."""
+"""Claims about `apc.frame.names`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from fractions import Fraction
 
 import pytest
 
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import counts_peers
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.names import Free, find, is_named, named_times, parameter_of, unit_of
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.vary.evaluator import free_parameters
-from apc.runtime.vary.margins import margins
-from apc.runtime.vary.sensitivity import sensitivities
+from apc.frame.names import Free, find, is_named, named_times, parameter_of, unit_of
+from apc.frame.overrides import Override, apply
+from apc.vary.evaluator import free_parameters
+from apc.vary.margins import margins
+from apc.vary.sensitivity import sensitivities
 from tests.sites import grouped, paper
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 

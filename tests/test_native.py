@@ -13,8 +13,8 @@ import casadi
 import pytest
 
 from apc.compiler import seal
-from apc.runtime.simulate import native as module
-from apc.runtime.simulate.native import compiler, native
+from apc.simulation import native as module
+from apc.simulation.native import compiler, native
 from tests.topologies import ROOT
 
 

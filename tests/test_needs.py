@@ -6,8 +6,8 @@ from fractions import Fraction
 
 import pytest
 
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.analysis.needs import needs
+from apc.analysis.analysis import analyze
+from apc.analysis.needs import needs
 from tests.sites import columned, edged, linked, paper
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
 

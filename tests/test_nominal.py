@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.network.nominal`: what is left out is said first, and never answered for."""
+"""Claims about `apc.network.nominal`: what is left out is said first, and never answered for."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from apc.__main__ import run
-from apc.runtime.network.nominal import channel_numbers, left_out
-from apc.runtime.region.axes import parse_axes
-from apc.runtime.region.region import region
-from apc.runtime.vary.sensitivity import sensitivities
+from apc.network.nominal import channel_numbers, left_out
+from apc.regions.axes import parse_axes
+from apc.regions.region import region
+from apc.vary.sensitivity import sensitivities
 from tests.lossy import unreliable
 from tests.topologies import AVERAGE, compiled
 

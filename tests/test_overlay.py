@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apc.runtime.region.overlay import overlay_points, parse_overlay, symbol_values
+from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
 from tests.topologies import AVERAGE, compiled, told, wall
 
 COLGATE = "colgate:K=it.stiffness,B=it.damping,b=device.damping,T=tick.period"

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.overrides`."""
+"""Claims about `apc.frame.overrides`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 from apc.compiler.compiled import PEERS, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.frame.overrides import Override, apply, parse_override
-from apc.runtime.frame.parameters import resolve
+from apc.frame.overrides import Override, apply, parse_override
+from apc.frame.parameters import resolve
 from tests.sites import NAMES, columned, derived, grouped, paper
 from tests.topologies import SCENES, compiled, library
 

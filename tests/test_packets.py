@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.network.packets`."""
+"""Claims about `apc.network.packets`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from apc.runtime.network.packets import PacketSource
+from apc.network.packets import PacketSource
 from tests.lossy import BURSTS, RELIABLE, delays, recorded
 
 

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.network.channel_law import channel_law
-from apc.runtime.network.packets import PacketSource
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import prepare
-from apc.runtime.simulate.trajectory import simulate
+from apc.network.channel_law import channel_law
+from apc.network.packets import PacketSource
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
+from apc.simulation.trajectory import simulate
 from tests.eventwise import MS, coast
 from tests.sites import edged, paper
 from tests.test_gathering import effective

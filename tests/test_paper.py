@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis.paper` and `apc.runtime.analysis.openloop`."""
+"""Claims about `apc.analysis.paper` and `apc.analysis.openloop`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import linear_sum_assignment
 
+from apc.analysis.analysis import lifted_groups
+from apc.analysis.paper import PaperRoute, analyze_paper, paper_route
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.analysis.paper import PaperRoute, analyze_paper, paper_route
-from apc.runtime.eigen.modes import dense
+from apc.eigen.modes import dense
 from tests import bruteforce
 from tests.reference import OPERATORS, RADII
 from tests.sites import MS, linked, paper

@@ -1,10 +1,10 @@
-"""Claims about `apc.runtime.frame.parameters`."""
+"""Claims about `apc.frame.parameters`."""
 
 from __future__ import annotations
 
 from fractions import Fraction
 
-from apc.runtime.frame.parameters import resolve
+from apc.frame.parameters import resolve
 from tests.sites import NAMES, paper
 
 

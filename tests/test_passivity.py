@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.runtime.region.passivity import (
+from apc.regions.passivity import (
     CONDITIONS,
     abbott_limit,
     colgate_limit,

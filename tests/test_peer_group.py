@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.peer_group`."""
+"""Claims about `apc.eigen.peer_group`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.peer_group import MOST_STATES, check_size, states_of, used_ways
+from apc.eigen.peer_group import MOST_STATES, check_size, states_of, used_ways
 from tests.sites import edged, paper
 
 

@@ -1,13 +1,13 @@
-"""Claims about `apc.runtime.eigen.peers`."""
+"""Claims about `apc.eigen.peers`."""
 
 from __future__ import annotations
 
 import pytest
 
+from apc.analysis.analysis import lifted_groups, prepare
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import lifted_groups, prepare
-from apc.runtime.eigen.peers import group_of_row, more_differ
-from apc.runtime.frame.parameters import resolve
+from apc.eigen.peers import group_of_row, more_differ
+from apc.frame.parameters import resolve
 from tests.sites import columned, edged, grouped, linked, paper
 
 

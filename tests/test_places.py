@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from apc.analysis.analysis import analyze
+from apc.analysis.selfcheck import check_frame
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.analysis.selfcheck import check_frame
 
 SCENE = """
 topology: places

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis.plan`: the method that serves, chosen before anything is built."""
+"""Claims about `apc.analysis.plan`: the method that serves, chosen before anything is built."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import prepare
+from apc.analysis.needs import needs
+from apc.analysis.plan import Plan, make_plan
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import prepare
-from apc.runtime.analysis.needs import needs
-from apc.runtime.analysis.plan import Plan, make_plan
-from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.parameters import resolve
+from apc.frame.exchange import build_exchange
+from apc.frame.parameters import resolve
 from tests.populations import different
 from tests.sites import MS, columned, linked, paper
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.population`."""
+"""Claims about `apc.simulation.population`."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.modes import dense
-from apc.runtime.simulate.population import exchanges_within
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import Simulation, prepare
+from apc.eigen.modes import dense
+from apc.simulation.population import exchanges_within
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
 from tests.scheduled import schedules
 from tests.sites import MS, columned, grouped, linked, paper
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.program`."""
+"""Claims about `apc.simulation.program`."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import Value
-from apc.runtime.simulate.program import Layout, seconds_at
-from apc.runtime.simulate.propagate import rates, transitions
-from apc.runtime.simulate.writing import build_program
+from apc.frame.parameters import resolve
+from apc.frame.schedule import Value
+from apc.simulation.program import Layout, seconds_at
+from apc.simulation.propagate import rates, transitions
+from apc.simulation.writing import build_program
 from tests.scheduled import schedules
 from tests.sites import MS, alone, paper
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.progress`: only a terminal sees how far the work is, and nothing of it stays."""
+"""Claims about `apc.cli.progress`: only a terminal sees how far the work is, and nothing of it stays."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from apc.progress import progress_bar, status_line
+from apc.cli.progress import progress_bar, status_line
 
 
 def test_what_is_no_terminal_sees_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.propagate`."""
+"""Claims about `apc.simulation.propagate`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import Kind
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.simulate.propagate import nonlinear_rows, perturbed, rates, transitions
+from apc.frame.parameters import resolve
+from apc.simulation.propagate import nonlinear_rows, perturbed, rates, transitions
 from tests.sites import NAMES, alone, paper
 
 mpmath = pytest.importorskip("mpmath")

@@ -13,8 +13,8 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.modes import dense, split
+from apc.analysis.analysis import lifted_groups
+from apc.eigen.modes import dense, split
 from tests import bruteforce
 from tests.bruteforce import common_period
 from tests.topologies import compiled

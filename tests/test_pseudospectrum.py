@@ -1,11 +1,11 @@
-"""Claims about `apc.runtime.eigen.pseudospectrum`."""
+"""Claims about `apc.eigen.pseudospectrum`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from apc.runtime.eigen.pseudospectrum import balance, norms, pseudospectral_radius
+from apc.eigen.pseudospectrum import balance, norms, pseudospectral_radius
 
 
 def _reach(matrix: np.ndarray, error: float, angles: int = 720) -> float:

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.quadrature`."""
+"""Claims about `apc.simulation.quadrature`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.runtime.simulate.quadrature import (
+from apc.simulation.quadrature import (
     AGREE,
     NODES,
     Kernel,

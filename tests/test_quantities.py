@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.overrides import apply, parse_override
-from apc.runtime.sweep.quantities import QUANTITIES, faulty, find_quantity
-from apc.runtime.sweep.sweep import sweep
+from apc.frame.overrides import apply, parse_override
+from apc.sweeps.quantities import QUANTITIES, faulty, find_quantity
+from apc.sweeps.sweep import sweep
 from tests.sweeping import CHEAP
 from tests.topologies import compiled, told
 

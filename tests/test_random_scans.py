@@ -9,8 +9,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.vary.critical import critical
+from apc.analysis.analysis import analyze
+from apc.vary.critical import critical
 from tests.bench.random_scans import BUMP, check, draw, radii, run
 from tests.bruteforce import Scene, frame_matrices, frame_matrix
 from tests.topologies import compiled, library

@@ -7,7 +7,7 @@ from dataclasses import replace
 import flint
 import pytest
 
-from apc.runtime.analysis.analysis import analyze
+from apc.analysis.analysis import analyze
 from tests.bench.random_scenes import check, run
 from tests.sites import paper
 

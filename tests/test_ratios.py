@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.ratios`."""
+"""Claims about `apc.eigen.ratios`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from fractions import Fraction
 import flint
 import pytest
 
-from apc.runtime.eigen.balls import precision, rational_ball
-from apc.runtime.eigen.ratios import MOST_TERMS, NotRational, Ratio, Ratios
+from apc.eigen.balls import precision, rational_ball
+from apc.eigen.ratios import MOST_TERMS, NotRational, Ratio, Ratios
 
 
 def test_ratios_are_exact_and_differentiate() -> None:

@@ -116,7 +116,7 @@ def test_the_python_shown_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
 
 def test_every_command_of_the_program_stands_in_the_table() -> None:
-    from apc.cli import apc
+    from apc.cli.commands import apc
 
     help_text = CliRunner().invoke(apc, ["--help"]).output
     commands = re.findall(r"^  (\w+)  ", help_text.split("Commands:")[1], re.MULTILINE)

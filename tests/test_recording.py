@@ -16,12 +16,12 @@ import pytest
 import scipy.io
 
 from apc.compiler.errors import ApcError
-from apc.runtime.simulate import formats
-from apc.runtime.simulate.blocks import Block, blocks
-from apc.runtime.simulate.recording import SUFFIXES, open_recording
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import Simulation, prepare
-from apc.runtime.simulate.trajectory import simulate
+from apc.simulation import formats
+from apc.simulation.blocks import Block, blocks
+from apc.simulation.recording import SUFFIXES, open_recording
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+from apc.simulation.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
 
 SYSTEM = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 100, set: {device.x: 3 mm}}")))

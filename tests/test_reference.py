@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import apc
+from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.runtime.frame.overrides import Override, apply
+from apc.frame.overrides import Override, apply
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, RADII
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 

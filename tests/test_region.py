@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import apc
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.region.axes import parse_axes
-from apc.runtime.region.boundary import relative_to
-from apc.runtime.region.curves import between
-from apc.runtime.region.region import Region, region
+from apc.frame.overrides import Override, apply
+from apc.regions.axes import parse_axes
+from apc.regions.boundary import relative_to
+from apc.regions.curves import between
+from apc.regions.region import Region, region
 from tests.paper_limit import limit
 from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced

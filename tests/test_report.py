@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from apc.analysis.analysis import analyze
+from apc.analysis.needs import needs
+from apc.answers.report import analysis_report, compile_report
 from apc.compiler.words import WIDTH, measured
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.analysis.needs import needs
-from apc.runtime.answers.report import analysis_report, compile_report
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
 
 LONG = replaced(AVERAGE, ("user: {count: 3}", "a_long_name_of_a_group: {count: 2, set: {device.mass: 1 kg}}"))

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.residues`."""
+"""Claims about `apc.frame.residues`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.runtime.frame.residues import PRIMES, residues_of
+from apc.frame.residues import PRIMES, residues_of
 
 FIRST = np.array([0.1, -2.5, 1e-300, 1e300, 3.0, 0.0])
 SECOND = np.array([0.3, 1e-17, -7.0, 0.125, 1 / 3, 5.0])

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.rigid`."""
+"""Claims about `apc.eigen.rigid`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.modes import dense, split
-from apc.runtime.eigen.rigid import find_rigid_modes
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.modes import dense, split
+from apc.eigen.rigid import find_rigid_modes
 from tests.sites import MS, grouped, paper
 
 

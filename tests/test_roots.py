@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.roots`."""
+"""Claims about `apc.eigen.roots`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import flint
 import numpy as np
 import pytest
 
-from apc.runtime.eigen.balls import precision
-from apc.runtime.eigen.roots import approach_roots, root_discs
+from apc.eigen.balls import precision
+from apc.eigen.roots import approach_roots, root_discs
 
 
 def _polynomial(roots: list[complex]) -> flint.arb_poly:

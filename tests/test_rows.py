@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.rows`."""
+"""Claims about `apc.frame.rows`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.frame.names import Free
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.rows import free_rows
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
+from apc.frame.parameters import resolve
+from apc.frame.rows import free_rows
 from tests.sites import NAMES, columned, derived, paper
 
 

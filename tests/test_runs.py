@@ -1,10 +1,10 @@
-"""Claims about `apc.runtime.eigen.runs`."""
+"""Claims about `apc.eigen.runs`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from apc.runtime.eigen.runs import Runs, joined, shifted
+from apc.eigen.runs import Runs, joined, shifted
 
 
 def test_a_billion_peers_are_two_numbers() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.simulate.scales import UNKNOWN, state_scales
+from apc.frame.jacobians import jacobians
+from apc.frame.parameters import resolve
+from apc.simulation.scales import UNKNOWN, state_scales
 from tests.topologies import ONE_MASS, compiled, replaced
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import apc
+from apc.analysis.selfcheck import check_frame
 from apc.compiler.pipeline import compile_topology, run_stages
 from apc.compiler.scene.scene import Scene
-from apc.runtime.analysis.selfcheck import check_frame
 from tests.topologies import SCENES, compiled, replaced
 
 COMMON = "stable up to a common translation"

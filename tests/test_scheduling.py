@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.scheduling`: section by section, what an instant means."""
+"""Claims about `apc.frame.scheduling`: section by section, what an instant means."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from apc.runtime.frame.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, Tick, Value
+from apc.frame.schedule import ORDER, Act, Heard, Propagate, Schedule, Send, Tick, Value
 from tests.scheduled import schedules
 from tests.sites import MS, paper
 

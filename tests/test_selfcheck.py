@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis.selfcheck`."""
+"""Claims about `apc.analysis.selfcheck`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from apc.runtime.analysis import selfcheck
-from apc.runtime.analysis.selfcheck import check_frame, skipped
-from apc.runtime.frame.lift import LiftedSite, lift
+from apc.analysis import selfcheck
+from apc.analysis.selfcheck import check_frame, skipped
+from apc.frame.lift import LiftedSite, lift
 from tests.sites import MS, columned, edged, grouped, linked, paper
 from tests.topologies import compiled
 

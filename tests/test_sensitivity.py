@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.vary.sensitivity`."""
+"""Claims about `apc.vary.sensitivity`."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.names import Free
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.vary.batch import BatchEvaluator
-from apc.runtime.vary.evaluator import evaluator
-from apc.runtime.vary.sensitivity import sensitivities, sensitivity_report
+from apc.analysis.analysis import analyze
+from apc.eigen.balls import precision
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
+from apc.vary.batch import BatchEvaluator
+from apc.vary.evaluator import evaluator
+from apc.vary.sensitivity import sensitivities, sensitivity_report
 from tests.bench.sensitivity_truth import check_sensitivities
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
@@ -24,7 +24,7 @@ def test_derivatives_are_central_differences_in_50_digits() -> None:
     """Eigenvalues in balls at p ± h, h = 2^−20 p: what a difference cuts off is below 1e-12."""
     import flint
 
-    from apc.runtime.eigen.balls import frame_balls, reduced_balls
+    from apc.eigen.balls import frame_balls, reduced_balls
 
     system = compiled(replaced(AVERAGE, ("contact:      {", "contact:      {damping: 1 N*s/m, ")))
     found = sensitivities(system)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.frame.names import find
-from apc.runtime.frame.overrides import Override, apply, parse_override
-from apc.runtime.vary.sensitivity import sensitivities
+from apc.frame.names import find
+from apc.frame.overrides import Override, apply, parse_override
+from apc.vary.sensitivity import sensitivities
 from tests.bench.sensitivity_truth import check_frequencies, check_sensitivities, run, scene
 from tests.topologies import MESH, SCENES, compiled, library, replaced
 

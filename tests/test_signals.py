@@ -1,12 +1,12 @@
-"""Claims about `apc.runtime.simulate.signals`."""
+"""Claims about `apc.simulation.signals`."""
 
 from __future__ import annotations
 
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.simulate.local_signals import LocalSignal
-from apc.runtime.simulate.signals import choose, signals_of
+from apc.simulation.local_signals import LocalSignal
+from apc.simulation.signals import choose, signals_of
 from tests.sites import grouped, paper
 
 SYSTEM = grouped(paper(), ("left", 2, {}), ("right", 1, {}))

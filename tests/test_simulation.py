@@ -9,15 +9,15 @@ import casadi
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import analyze, lifted_groups
-from apc.runtime.eigen.modes import dense
-from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.methods import Method
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import prepare
-from apc.runtime.simulate.trajectory import Trajectory, simulate
+from apc.eigen.modes import dense
+from apc.simulation.blocks import blocks
+from apc.simulation.methods import Method
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
+from apc.simulation.trajectory import Trajectory, simulate
 from tests.eventwise import MS, Play, User, experiment, play
 from tests.sites import alone, paper
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, told
@@ -163,7 +163,7 @@ def test_what_is_remembered_starts_at_its_start_value_and_acts_as_zero_before_it
 )
 def test_graphs_groups_and_clocks_follow_the_frame_map(scene: str, shared: str) -> None:
     from apc.compiler.pipeline import compile_topology
-    from apc.runtime.frame.overrides import apply, parse_override
+    from apc.frame.overrides import apply, parse_override
 
     system = compile_topology(SCENES / f"{scene}.yaml")
     group = system.groups[0].name

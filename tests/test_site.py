@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.site`."""
+"""Claims about `apc.frame.site`."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.linearize import linearize
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.site import (
+from apc.frame.jacobians import jacobians
+from apc.frame.linearize import linearize
+from apc.frame.parameters import resolve
+from apc.frame.site import (
     LinearSite,
     assemble,
     cut,

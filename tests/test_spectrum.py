@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.spectrum`."""
+"""Claims about `apc.eigen.spectrum`."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import apc
+from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import Analysis, analyze
-from apc.runtime.eigen.enclosure import enclose_eigenvalues
-from apc.runtime.eigen.rigid import independent_places
-from apc.runtime.eigen.spectrum import _relative, oscillation
+from apc.eigen.enclosure import enclose_eigenvalues
+from apc.eigen.rigid import independent_places
+from apc.eigen.spectrum import _relative, oscillation
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS, RADII
 from tests.sites import MS, grouped, paper

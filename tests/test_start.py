@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.frame.start`."""
+"""Claims about `apc.frame.start`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.start import Listening, start_arguments, start_sends, start_values
+from apc.frame.jacobians import jacobians
+from apc.frame.start import Listening, start_arguments, start_sends, start_values
 from tests.sites import NAMES, edged, paper
 
 

@@ -10,10 +10,10 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.runtime.simulate.methods import Method, parse_method
-from apc.runtime.simulate.scales import integrals
-from apc.runtime.simulate.stepping import stepped
-from apc.runtime.simulate.trajectory import simulate
+from apc.simulation.methods import Method, parse_method
+from apc.simulation.scales import integrals
+from apc.simulation.stepping import stepped
+from apc.simulation.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
 
 S = Fraction(1)

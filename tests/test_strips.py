@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.region.strips`: over a delay the boundary is as right as over any parameter."""
+"""Claims about `apc.regions.strips`: over a delay the boundary is as right as over any parameter."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import analyze, prepare
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.region.axes import parse_axes
-from apc.runtime.region.figure import stable_outlines
-from apc.runtime.region.region import Region, region
-from apc.runtime.vary.critical import critical
+from apc.frame.overrides import Override, apply
+from apc.regions.axes import parse_axes
+from apc.regions.figure import stable_outlines
+from apc.regions.region import Region, region
+from apc.vary.critical import critical
 from tests.topologies import AVERAGE, compiled
 
 CONTACT = "contact.stiffness=500 N/m:3000 N/m"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apc.runtime.frame.names import Free
-from apc.runtime.region.surrogate import ChebyshevFamily, DirectFamily, Rectangle, resolve_family
-from apc.runtime.vary.batch import matrix_errors
-from apc.runtime.vary.evaluator import evaluator
+from apc.frame.names import Free
+from apc.regions.surrogate import ChebyshevFamily, DirectFamily, Rectangle, resolve_family
+from apc.vary.batch import matrix_errors
+from apc.vary.evaluator import evaluator
 from tests.topologies import AVERAGE, compiled
 
 RECTANGLE = Rectangle(np.array([10.0, 10.0]), np.array([2990.0, 2990.0]))

@@ -17,11 +17,11 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.analysis.analysis import Analysis
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import Analysis
-from apc.runtime.sweep import store as sweep_store
-from apc.runtime.sweep.sweep import Sweep, sweep
-from apc.runtime.sweep.work import Work, compute_part, model_bytes
+from apc.sweeps import store as sweep_store
+from apc.sweeps.sweep import Sweep, sweep
+from apc.sweeps.work import Work, compute_part, model_bytes
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
 from tests.topologies import AVERAGE, ONE_MASS, compiled, told
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from apc.compiler.errors import ApcError, Place
-from apc.runtime.sweep import cluster as sweep_cluster
-from apc.runtime.sweep import sweep as sweep_module
-from apc.runtime.sweep import work as sweep_work
-from apc.runtime.sweep.sweep import Patience, sweep
+from apc.sweeps import cluster as sweep_cluster
+from apc.sweeps import sweep as sweep_module
+from apc.sweeps import work as sweep_work
+from apc.sweeps.sweep import Patience, sweep
 from tests.sweeping import CHEAP, parts
 from tests.topologies import compiled, told
 
@@ -72,7 +72,7 @@ def test_workers_with_other_versions_are_refused(
     here = tuple(
         (name, "1.2.3" if name == "numpy" else found) for name, found in sweep_work.program_versions()
     )
-    monkeypatch.setattr("apc.runtime.sweep.sweep.program_versions", lambda: here)
+    monkeypatch.setattr("apc.sweeps.sweep.program_versions", lambda: here)
     address = cluster.scheduler_address
     with pytest.raises(ApcError, match=r"E888 a worker has numpy .* \(here 1\.2\.3\): the same numbers"):
         sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=address)

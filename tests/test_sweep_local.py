@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.runtime.sweep.grid import build_grid, parse_axis
-from apc.runtime.sweep.local import cores, local_processes, this_process
-from apc.runtime.sweep.sweep import sweep
-from apc.runtime.sweep.work import Work, compute_part, model_bytes
+from apc.sweeps.grid import build_grid, parse_axis
+from apc.sweeps.local import cores, local_processes, this_process
+from apc.sweeps.sweep import sweep
+from apc.sweeps.work import Work, compute_part, model_bytes
 from tests.sweeping import CHEAP, alive, children, parts
 from tests.topologies import compiled
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from apc.runtime.sweep import store as sweep_store
-from apc.runtime.sweep.store import open_parts, remove_parts
+from apc.sweeps import store as sweep_store
+from apc.sweeps.store import open_parts, remove_parts
 from tests.topologies import told
 
 ROWS = (("stable", 0.1 + 0.2, None, ""), ("error: E803", None, None, "why"))
@@ -72,7 +72,7 @@ def test_parts_of_another_sweep_are_never_mixed_in(tmp_path: Path) -> None:
 def test_a_second_process_on_the_same_target_is_refused(tmp_path: Path) -> None:
     target = tmp_path / "r.csv"
     code = (
-        "import sys\nfrom pathlib import Path\nfrom apc.runtime.sweep.store import open_parts\n"
+        "import sys\nfrom pathlib import Path\nfrom apc.sweeps.store import open_parts\n"
         "with open_parts(Path(sys.argv[1]), {}) as parts:\n"
         "    parts.write(0, ())\n    print('held', flush=True)\n    sys.stdin.read()\n"
     )

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.analysis.switches`."""
+"""Claims about `apc.analysis.switches`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import casadi
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import analyze
+from apc.analysis.switches import SwitchingPart, bind, find_switches, switching_parts
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.analysis.switches import SwitchingPart, bind, find_switches, switching_parts
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.linearize import linearize
-from apc.runtime.frame.site import LinearSite
+from apc.frame.jacobians import jacobians
+from apc.frame.linearize import linearize
+from apc.frame.site import LinearSite
 from tests.sites import alone
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 

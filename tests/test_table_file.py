@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from apc.runtime.sweep.table_file import BLOCK, check_table_path, write_table
+from apc.sweeps.table_file import BLOCK, check_table_path, write_table
 from tests.topologies import told
 
 HEADINGS = ("x [m]", "verdict", "modes")

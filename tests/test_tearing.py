@@ -22,8 +22,8 @@ from apc.compiler.errors import Mistakes, Place
 from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.language.expression import Name
 from apc.compiler.language.grammar import parse_equation
-from apc.runtime.frame.jacobians import jacobians
-from apc.runtime.frame.linearize import linearize
+from apc.frame.jacobians import jacobians
+from apc.frame.linearize import linearize
 
 PLACE = Place("test.yaml", 1, 1)
 

@@ -50,7 +50,9 @@ def test_a_name_in_a_file_does_not_act_on_the_terminal(
 
 
 def test_every_command_prints_by_what_escapes() -> None:
-    for path in sorted((ROOT / "runtime" / "apc").glob("cli*.py")):
+    for path in sorted((ROOT / "runtime" / "cli").glob("*.py")):
+        if path.name == "options.py":  # which does the escaping
+            continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             assert not (isinstance(node, ast.Attribute) and node.attr in ("echo", "secho")), path.name
 

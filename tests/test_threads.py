@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.threads`."""
+"""Claims about `apc.threads`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from apc.runtime.threads import POOLS, single_threaded, start_single_threaded
+from apc.threads import POOLS, single_threaded, start_single_threaded
 from tests.topologies import ROOT
 
 
@@ -41,7 +41,7 @@ def _begun(environment: dict[str, str]) -> str:
     """Start a process as a command does; return its numbers of threads and what its environment says."""
     code = (
         "import os\n"
-        "from apc.runtime.threads import POOLS, start_single_threaded\n"
+        "from apc.threads import POOLS, start_single_threaded\n"
         "start_single_threaded()\n"
         "import numpy, threadpoolctl\n"
         "print({p['num_threads'] for p in threadpoolctl.threadpool_info()}, end=' ')\n"
@@ -70,7 +70,7 @@ def test_the_environment_stays_once_the_libraries_are_loaded(monkeypatch: pytest
 _LATER = """
 import importlib, sys
 import numpy, threadpoolctl
-from apc.runtime.threads import load_pool, single_threaded
+from apc.threads import load_pool, single_threaded
 
 def threads():
     return {pool["num_threads"] for pool in threadpoolctl.threadpool_info()}

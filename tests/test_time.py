@@ -15,10 +15,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.modes import dense
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.modes import dense
 from tests.topologies import compiled
 
 MS = Fraction(1, 1000)

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from apc.analysis.analysis import analyze, lifted_groups, prepare
+from apc.analysis.needs import needs
+from apc.analysis.plan import refuse_varying
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import analyze, lifted_groups, prepare
-from apc.runtime.analysis.needs import needs
-from apc.runtime.analysis.plan import refuse_varying
-from apc.runtime.frame.names import Free
-from apc.runtime.vary.critical import critical
-from apc.runtime.vary.evaluator import evaluator
+from apc.frame.names import Free
+from apc.vary.critical import critical
+from apc.vary.evaluator import evaluator
 from tests.topologies import compiled, library
 
 SCENE = """\

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.network.timetable`."""
+"""Claims about `apc.network.timetable`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import pytest
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.network.channel_law import channel_law
-from apc.runtime.network.listener import Listener
-from apc.runtime.network.packets import PacketSource
-from apc.runtime.network.timetable import Timetable
+from apc.frame.exchange import build_exchange
+from apc.frame.parameters import resolve
+from apc.network.channel_law import channel_law
+from apc.network.listener import Listener
+from apc.network.packets import PacketSource
+from apc.network.timetable import Timetable
 from tests.sites import MS
 from tests.topologies import AVERAGE, compiled, replaced
 

@@ -13,8 +13,8 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.runtime.simulate.figures import draw, save, thinned
-from apc.runtime.simulate.trajectory import Trajectory, simulate
+from apc.simulation.figures import draw, save, thinned
+from apc.simulation.trajectory import Trajectory, simulate
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, replaced, told
 
 AVERAGE_RUN = simulate(compiled((SCENES / "experiment-average.yaml").read_text(encoding="utf-8")))

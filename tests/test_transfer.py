@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.large.response import differentiate, respond
-from apc.runtime.large.transfer import StateSpace, build_transfer
+from apc.large.response import differentiate, respond
+from apc.large.transfer import StateSpace, build_transfer
 
 
 def _sites(seed: int, *, error: float = 0.0, chain: int = 2) -> StateSpace:

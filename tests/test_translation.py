@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.large.translation`: what nothing holds back, each peer with its own numbers."""
+"""Claims about `apc.large.translation`: what nothing holds back, each peer with its own numbers."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.modes import dense
-from apc.runtime.eigen.rigid import find_rigid_modes
-from apc.runtime.large.translation import count_translations, free_motions
+from apc.analysis.analysis import lifted_groups
+from apc.eigen.modes import dense
+from apc.eigen.rigid import find_rigid_modes
+from apc.large.translation import count_translations, free_motions
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.eigen.twins`: sites that can change places make few small loops of one large."""
+"""Claims about `apc.eigen.twins`: sites that can change places make few small loops of one large."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import analyze, lifted_groups
-from apc.runtime.eigen.closing import close_loop
-from apc.runtime.eigen.modes import dense_loop
-from apc.runtime.eigen.twins import split_twins
+from apc.analysis.analysis import analyze, lifted_groups
+from apc.eigen.closing import close_loop
+from apc.eigen.modes import dense_loop
+from apc.eigen.twins import split_twins
 from tests.sites import grouped, linked, paper
 
 # A path of four with a fork at either end: 0 and 1 are twins, and 4 and 5.

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.weights import exact_weight, sum_weights
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.names import find
-from apc.runtime.frame.parameters import exact_numbers, resolve
+from apc.eigen.balls import precision
+from apc.frame.names import find
+from apc.frame.parameters import exact_numbers, resolve
 from tests.bench.random_scenes import check, truth
 from tests.topologies import MESH, compiled, library, replaced
 

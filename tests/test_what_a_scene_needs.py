@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
+from apc.analysis.analysis import analyze
+from apc.analysis.needs import needs
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.analysis.needs import needs
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import prepare
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
 from tests.bench.needs import Account, accounts
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.runtime.simulate.writing`."""
+"""Claims about `apc.simulation.writing`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.simulate.local_signals import local_signals
-from apc.runtime.simulate.program import Program
-from apc.runtime.simulate.propagate import rates, transitions
-from apc.runtime.simulate.writing import build_program
+from apc.analysis.analysis import lifted_groups
+from apc.frame.parameters import resolve
+from apc.simulation.local_signals import local_signals
+from apc.simulation.program import Program
+from apc.simulation.propagate import rates, transitions
+from apc.simulation.writing import build_program
 from tests.scheduled import schedules
 from tests.sites import MS, paper
 

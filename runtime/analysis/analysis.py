@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
+from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.analysis.plan import cannot_serve, make_plan, refuse_varying
-from apc.runtime.eigen.closing import close_loop
-from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.peer_group import PeerGroup, states_of, used_ways
-from apc.runtime.eigen.peers import group_of_row, peer_groups
-from apc.runtime.eigen.rigid import LENGTHS, what_stands
-from apc.runtime.eigen.spectrum import (
+from apc.eigen.closing import close_loop
+from apc.eigen.loop import Loop
+from apc.eigen.peer_group import PeerGroup, states_of, used_ways
+from apc.eigen.peers import group_of_row, peer_groups
+from apc.eigen.rigid import LENGTHS, what_stands
+from apc.eigen.spectrum import (
     DRIFTS,
     STABLE_TRANSLATING,
     TO_DRIFT,
@@ -34,16 +34,16 @@ from apc.runtime.eigen.spectrum import (
     judge,
     solve_spectrum,
 )
-from apc.runtime.frame.discretize import TOO_LARGE
-from apc.runtime.frame.exchange import Exchange, build_exchange
-from apc.runtime.frame.jacobians import SiteJacobians, jacobians
-from apc.runtime.frame.parameters import Numbers, resolve
-from apc.runtime.frame.schedule import ORDER, Schedule
-from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.frame.start import at_start
-from apc.runtime.network.nominal import left_out
-from apc.runtime.threads import single_threaded
-from apc.runtime.trouble import finite_equations
+from apc.frame.discretize import TOO_LARGE
+from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.parameters import Numbers, resolve
+from apc.frame.schedule import ORDER, Schedule
+from apc.frame.scheduling import build_schedules
+from apc.frame.start import at_start
+from apc.network.nominal import left_out
+from apc.threads import single_threaded
+from apc.trouble import finite_equations
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class Analysis:
 
     def __str__(self) -> str:
         """Return the verdict in words, the numbers, and the modes as a table."""
-        from apc.runtime.answers.report import analysis_report  # it needs this module
+        from apc.answers.report import analysis_report  # it needs this module
 
         return analysis_report(self)
 
@@ -306,7 +306,7 @@ def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: boo
 def _solve_determinant(loops: Sequence[Loop]) -> Spectrum:
     """Solve loops by the zeros of their characteristic functions."""
     # What serves large scenes is imported when one comes: all of it would cost every scene 30 ms.
-    from apc.runtime.large.determinant_spectrum import solve_loops
+    from apc.large.determinant_spectrum import solve_loops
 
     return solve_loops(loops)
 
@@ -315,7 +315,7 @@ def _solve_ring(
     system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, certify: bool
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve equal peers on a large ring: those of its loops that decide."""
-    from apc.runtime.large.graph import deciding_loops, with_the_rest
+    from apc.large.graph import deciding_loops, with_the_rest
 
     ring = deciding_loops(groups, exchange)
     spectrum = _solve_closed(system, ring.arrangement.loops, certify=certify)
@@ -326,10 +326,10 @@ def _solve_crowds(
     system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange, method: str
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve peers that all differ."""
-    from apc.runtime.large.crowds import crowds
-    from apc.runtime.large.determinant_spectrum import solve_crowds
-    from apc.runtime.large.krylov import solve_sparse
-    from apc.runtime.large.translation import count_translations
+    from apc.large.crowds import crowds
+    from apc.large.determinant_spectrum import solve_crowds
+    from apc.large.krylov import solve_sparse
+    from apc.large.translation import count_translations
 
     listed = crowds(system, prepared.jacobians, prepared.schedules, numbers)
     rounded = "what rounding does to the peers' own motion is estimated here, not bounded"

@@ -19,25 +19,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import lifted_groups, prepare
+from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.language.evaluation import OPERATORS, Operation, compute
 from apc.compiler.language.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not
-from apc.runtime.analysis.analysis import lifted_groups, prepare
-from apc.runtime.analysis.ranges import Range
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.modes import split
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.eigen.ratios import NotRational, Ratio, Ratios
-from apc.runtime.eigen.runs import Runs
-from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.linearize import site_of_row
-from apc.runtime.frame.names import Free, find
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.frame.parameters import exact_numbers
-from apc.runtime.frame.site import LinearSite
-from apc.runtime.network.nominal import refuse_channel_number
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.modes import split
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.ratios import NotRational, Ratio, Ratios
+from apc.eigen.runs import Runs
+from apc.frame.exact import evaluate_exact
+from apc.frame.linearize import site_of_row
+from apc.frame.names import Free, find
+from apc.frame.overrides import Override, apply
+from apc.frame.parameters import exact_numbers
+from apc.frame.site import LinearSite
+from apc.network.nominal import refuse_channel_number
 
 _PLACE = Place("box")
 

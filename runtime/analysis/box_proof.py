@@ -24,11 +24,11 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.box import Box, open_box
+from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import counted, with_unit, wrapped
-from apc.runtime.analysis.box import Box, open_box
-from apc.runtime.analysis.ranges import Range
-from apc.runtime.eigen.balls import (
+from apc.eigen.balls import (
     Balls,
     compose,
     frame_steps,
@@ -37,15 +37,15 @@ from apc.runtime.eigen.balls import (
     reduced_balls,
     square,
 )
-from apc.runtime.eigen.certify import schur_cohn
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.duals import Dual, mapped, slope_of, step_duals
-from apc.runtime.eigen.pseudospectrum import balance
-from apc.runtime.eigen.ratios import Ratio
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid, what_stands
-from apc.runtime.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
-from apc.runtime.frame.site import LinearSite, entrywise
-from apc.runtime.threads import single_threaded
+from apc.eigen.certify import schur_cohn
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.duals import Dual, mapped, slope_of, step_duals
+from apc.eigen.pseudospectrum import balance
+from apc.eigen.ratios import Ratio
+from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid, what_stands
+from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
+from apc.frame.site import LinearSite, entrywise
+from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Cell = tuple[tuple[Fraction, Fraction], ...]

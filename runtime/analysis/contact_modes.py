@@ -16,15 +16,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.words import in_hertz, measured, wrapped
-from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.runtime.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
-from apc.runtime.eigen.spectrum import UNSTABLE, finite
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.linearize import linearize
-from apc.runtime.frame.parameters import resolve
+from apc.eigen.spectrum import UNSTABLE, finite
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.linearize import linearize
+from apc.frame.parameters import resolve
 
 EVERYONE = "on at every peer"
 NOBODY = "on at no peer"

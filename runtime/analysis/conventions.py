@@ -23,14 +23,14 @@ from typing import Any
 import casadi
 import numpy as np
 
+from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError
 from apc.compiler.words import measured
-from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
-from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.frame.site import LinearSite
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
+from apc.frame.scheduling import build_schedules
+from apc.frame.site import LinearSite
 
 # The pairs of events whose order at one instant can change the frame, and what each order other than the
 # default means. Sending and ticking read the same instant and write different things: their order can't.

@@ -12,15 +12,15 @@ from fractions import Fraction
 
 import numpy as np
 
+from apc.analysis.analysis import prepare
+from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.words import counted
-from apc.runtime.analysis.analysis import prepare
-from apc.runtime.analysis.plan import make_plan
-from apc.runtime.frame.exchange import build_exchange
-from apc.runtime.frame.jacobians import edge_name
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.trouble import finite_equations
+from apc.frame.exchange import build_exchange
+from apc.frame.jacobians import edge_name
+from apc.frame.parameters import resolve
+from apc.trouble import finite_equations
 
 _NOUNS = {"determinant": "determinant", "krylov": "sparse system"}
 

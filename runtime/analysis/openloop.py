@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.analysis.analysis import lifted_groups
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.modes import dense
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.frame.discretize import discretize
-from apc.runtime.frame.schedule import Way
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.modes import dense
+from apc.eigen.peer_group import PeerGroup
+from apc.frame.discretize import discretize
+from apc.frame.schedule import Way
 
 Floats = NDArray[np.float64]
 

@@ -26,17 +26,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import Analysis
+from apc.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import Analysis
-from apc.runtime.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, independent_places
-from apc.runtime.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.lift import COEFFICIENT_ROUNDINGS
-from apc.runtime.network.nominal import left_out
-from apc.runtime.threads import single_threaded
-from apc.runtime.trouble import finite_equations
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.rigid import RigidModes, find_rigid_modes, independent_places
+from apc.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
+from apc.frame.discretize import UNIT
+from apc.frame.lift import COEFFICIENT_ROUNDINGS
+from apc.network.nominal import left_out
+from apc.threads import single_threaded
+from apc.trouble import finite_equations
 
 Floats = NDArray[np.float64]
 

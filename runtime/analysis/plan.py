@@ -11,18 +11,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from apc.analysis.switches import varying_slopes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.analysis.switches import varying_slopes
-from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.modes import arrange, dense_loop
-from apc.runtime.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
-from apc.runtime.eigen.peers import more_differ, peer_groups
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.parameters import Numbers
-from apc.runtime.frame.schedule import Schedule
-from apc.runtime.large.graph import is_large_ring
+from apc.eigen.loop import Loop
+from apc.eigen.modes import arrange, dense_loop
+from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
+from apc.eigen.peers import more_differ, peer_groups
+from apc.frame.exchange import Exchange
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.parameters import Numbers
+from apc.frame.schedule import Schedule
+from apc.large.graph import is_large_ring
 
 METHODS = ("auto", "modes", "dense", "determinant", "krylov")
 

@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.discretize import PRECISIONS, TOO_LARGE, UNIT, moved_together
-from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.jacobians import SiteJacobians, jacobians
-from apc.runtime.frame.lift import COEFFICIENT_ROUNDINGS, lift
-from apc.runtime.frame.linearize import linearize, linearize_exact
-from apc.runtime.frame.parameters import Numbers, exact_numbers, resolve
-from apc.runtime.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
-from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.frame.site import LinearSite
-from apc.runtime.threads import single_threaded
-from apc.runtime.trouble import finite_equations
+from apc.frame.discretize import PRECISIONS, TOO_LARGE, UNIT, moved_together
+from apc.frame.exact import evaluate_exact
+from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.lift import COEFFICIENT_ROUNDINGS, lift
+from apc.frame.linearize import linearize, linearize_exact
+from apc.frame.parameters import Numbers, exact_numbers, resolve
+from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
+from apc.frame.scheduling import build_schedules
+from apc.frame.site import LinearSite
+from apc.threads import single_threaded
+from apc.trouble import finite_equations
 
 Floats = NDArray[np.float64]
 

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.jacobians import SiteJacobians, jacobians
-from apc.runtime.frame.start import start_values
+from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.start import start_values
 
 # A part with more decisions than this is refused: its pieces are as many as 2 to that power.
 MOST_DECISIONS = 6

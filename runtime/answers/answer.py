@@ -12,17 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.analysis.contact_modes import ContactModes, contact_modes
+from apc.analysis.conventions import Conventions, conventions
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.runtime.analysis.contact_modes import ContactModes, contact_modes
-from apc.runtime.analysis.conventions import Conventions, conventions
-from apc.runtime.vary.margins import Margins, margins
-from apc.runtime.vary.sensitivity import Sensitivities, sensitivities
+from apc.vary.margins import Margins, margins
+from apc.vary.sensitivity import Sensitivities, sensitivities
 
 if TYPE_CHECKING:
-    from apc.runtime.analysis.box_proof import BoxProof
-    from apc.runtime.analysis.ranges import Range
+    from apc.analysis.box_proof import BoxProof
+    from apc.analysis.ranges import Range
 
 # How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
 # well-conditioned frame stay below 1e-12; beyond ten times that, floats have lost what derivatives need.
@@ -51,7 +51,7 @@ class Answer:
 
     def __str__(self) -> str:
         """Return the answer as text of at most 80 columns."""
-        from apc.runtime.answers.report import answer_report  # it needs this module
+        from apc.answers.report import answer_report  # it needs this module
 
         return answer_report(self)
 
@@ -92,7 +92,7 @@ def judge(
     if certify:
         what = "method paper gives no proof: its matrices hold every sample of a frame, rounded"
         raise ApcError(Mistake("E850", Place(system.origin.topology), what, hint="--method auto --certify"))
-    from apc.runtime.analysis.paper import analyze_paper  # rarely asked for
+    from apc.analysis.paper import analyze_paper  # rarely asked for
 
     return analyze_paper(system)
 
@@ -144,7 +144,7 @@ def answer(
 
 def _prove_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:
     """Return the proof over a box; imported here, as few analyses ask for one."""
-    from apc.runtime.analysis.box_proof import prove_box
+    from apc.analysis.box_proof import prove_box
 
     return prove_box(system, box)
 

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 from apc.compiler.words import WIDTH, counted, in_hertz, measured, wrapped
 
 if TYPE_CHECKING:
+    from apc.analysis.analysis import Analysis
+    from apc.analysis.needs import Needs
+    from apc.answers.answer import Answer
     from apc.compiler.compiled import CompiledSystem
-    from apc.runtime.analysis.analysis import Analysis
-    from apc.runtime.analysis.needs import Needs
-    from apc.runtime.answers.answer import Answer
-    from apc.runtime.eigen.spectrum import Mode
+    from apc.eigen.spectrum import Mode
 
 MOST_ROWS = 16
 DECIMALS = 6  # of a magnitude
@@ -74,7 +74,7 @@ def compile_report(system: CompiledSystem, needs: Needs, target: Path, differenc
 
 
 def _self_check(system: CompiledSystem, difference: float) -> str:
-    from apc.runtime.analysis.selfcheck import skipped  # an analysis checks nothing
+    from apc.analysis.selfcheck import skipped  # an analysis checks nothing
 
     left_out = skipped(system)
     compared = f"one frame event by event and lifted differ by {difference:.0e}"

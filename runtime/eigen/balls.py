@@ -22,14 +22,14 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.graph_modes import Surd
-from apc.runtime.eigen.loop import Packet, packet_places
-from apc.runtime.frame.discretize import step_balls
-from apc.runtime.frame.exact import is_rational
-from apc.runtime.frame.lift import follow
-from apc.runtime.frame.schedule import Propagate, Schedule, Way
-from apc.runtime.frame.site import LinearSite, entrywise
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.graph_modes import Surd
+from apc.eigen.loop import Packet, packet_places
+from apc.frame.discretize import step_balls
+from apc.frame.exact import is_rational
+from apc.frame.lift import follow
+from apc.frame.schedule import Propagate, Schedule, Way
+from apc.frame.site import LinearSite, entrywise
 
 Balls = NDArray[Any]  # of flint.arb, and the integers 0 and 1 where these are exact
 

@@ -21,12 +21,12 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.balls import Balls, frame_balls, precision, rational_ball, reduced_balls, square
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.components import components
-from apc.runtime.eigen.enclosure import discs
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, independent_places
-from apc.runtime.eigen.roots import approach_roots, root_discs
+from apc.eigen.balls import Balls, frame_balls, precision, rational_ball, reduced_balls, square
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.components import components
+from apc.eigen.enclosure import discs
+from apc.eigen.rigid import RigidModes, find_rigid_modes, independent_places
+from apc.eigen.roots import approach_roots, root_discs
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -17,11 +17,11 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.graph_modes import Surd
-from apc.runtime.eigen.loop import Coupling, Loop, Packet, StateLayout, lay_out
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.schedule import Way
+from apc.eigen.graph_modes import Surd
+from apc.eigen.loop import Coupling, Loop, Packet, StateLayout, lay_out
+from apc.eigen.peer_group import PeerGroup
+from apc.frame.discretize import UNIT
+from apc.frame.schedule import Way
 
 Floats = NDArray[np.float64]
 

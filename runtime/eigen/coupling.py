@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 
-from apc.runtime.eigen.loop import Coupling
-from apc.runtime.eigen.peer_group import PeerGroup, used_ways
-from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.schedule import Way
+from apc.eigen.loop import Coupling
+from apc.eigen.peer_group import PeerGroup, used_ways
+from apc.frame.exchange import Exchange, check_mean
+from apc.frame.schedule import Way
 
 
 def couple(

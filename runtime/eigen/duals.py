@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.discretize import step_balls
+from apc.frame.discretize import step_balls
 
 Balls = NDArray[Any]
 

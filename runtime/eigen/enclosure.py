@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.components import components
-from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
-from apc.runtime.eigen.rigid import independent_places
-from apc.runtime.frame.discretize import UNIT
+from apc.eigen.components import components
+from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
+from apc.eigen.rigid import independent_places
+from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

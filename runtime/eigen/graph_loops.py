@@ -18,11 +18,11 @@ from fractions import Fraction
 import numpy as np
 
 from apc.compiler.weights import sum_weights
-from apc.runtime.eigen.graph_modes import GraphMode, Surd
-from apc.runtime.eigen.loop import Coupling, Loop
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.schedule import Way
+from apc.eigen.graph_modes import GraphMode, Surd
+from apc.eigen.loop import Coupling, Loop
+from apc.eigen.peer_group import PeerGroup
+from apc.frame.exchange import Exchange, check_mean
+from apc.frame.schedule import Way
 
 
 def common_graph(ways: Sequence[Way], exchange: Exchange) -> str:

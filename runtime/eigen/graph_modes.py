@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
 from apc.compiler.weights import exact_weight, sum_weights
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.exchange import arcs
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import arcs
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

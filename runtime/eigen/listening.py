@@ -15,14 +15,14 @@ from typing import Any
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.weights import exact_weight
-from apc.runtime.eigen.peer_group import Gains
-from apc.runtime.eigen.runs import Peers
-from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.jacobians import SiteJacobians, edge_name
-from apc.runtime.frame.parameters import Numbers, exact_numbers
-from apc.runtime.frame.schedule import Schedule
-from apc.runtime.frame.start import Listening, start_sends, start_values
+from apc.eigen.peer_group import Gains
+from apc.eigen.runs import Peers
+from apc.frame.exact import evaluate_exact
+from apc.frame.exchange import Exchange, check_mean
+from apc.frame.jacobians import SiteJacobians, edge_name
+from apc.frame.parameters import Numbers, exact_numbers
+from apc.frame.schedule import Schedule
+from apc.frame.start import Listening, start_sends, start_values
 
 
 class StartClasses:

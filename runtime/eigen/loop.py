@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-from apc.runtime.eigen.graph_modes import Surd
-from apc.runtime.eigen.peer_group import PeerGroup, states_of
-from apc.runtime.frame.schedule import Way
+from apc.eigen.graph_modes import Surd
+from apc.eigen.peer_group import PeerGroup, states_of
+from apc.frame.schedule import Way
 
 # What site g hears of site h on a way: the weight on h's packet.
 Coupling = Mapping[Way, tuple[tuple[Fraction, ...], ...]]

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.eigen.runs import Peers, joined, shifted
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.lift import LiftedSite, lift
-from apc.runtime.frame.linearize import linearize_exact
-from apc.runtime.frame.schedule import Schedule, Way
-from apc.runtime.frame.site import LinearSite, rational_floats
-from apc.runtime.frame.start import Listening
+from apc.eigen.runs import Peers, joined, shifted
+from apc.frame.exchange import Exchange
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.lift import LiftedSite, lift
+from apc.frame.linearize import linearize_exact
+from apc.frame.schedule import Schedule, Way
+from apc.frame.site import LinearSite, rational_floats
+from apc.frame.start import Listening
 
 Floats = NDArray[np.float64]
 

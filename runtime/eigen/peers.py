@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.eigen.listening import StartClasses
-from apc.runtime.eigen.peer_group import PeerGroup, build_group, check_size, used_ways
-from apc.runtime.eigen.runs import Peers, Runs, joined
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.linearize import linearize, linearize_rows, site_of_row
-from apc.runtime.frame.parameters import Numbers
-from apc.runtime.frame.schedule import Schedule
+from apc.eigen.listening import StartClasses
+from apc.eigen.peer_group import PeerGroup, build_group, check_size, used_ways
+from apc.eigen.runs import Peers, Runs, joined
+from apc.frame.exchange import Exchange
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.linearize import linearize, linearize_rows, site_of_row
+from apc.frame.parameters import Numbers
+from apc.frame.schedule import Schedule
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

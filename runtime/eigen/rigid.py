@@ -29,12 +29,12 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.graph_modes import QUICK_PRIME
-from apc.runtime.eigen.loop import Coupling, Loop
-from apc.runtime.eigen.peer_group import PeerGroup, states_of
-from apc.runtime.frame.schedule import Act, Propagate, Send, Tick, Value
-from apc.runtime.frame.site import LinearSite
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.graph_modes import QUICK_PRIME
+from apc.eigen.loop import Coupling, Loop
+from apc.eigen.peer_group import PeerGroup, states_of
+from apc.frame.schedule import Act, Propagate, Send, Tick, Value
+from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.discretize import UNIT
+from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

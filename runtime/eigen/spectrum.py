@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.balls import unprovable
-from apc.runtime.eigen.certify import MOST_PROVED, prove
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.components import components
-from apc.runtime.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
-from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, independent_places, relative_places
-from apc.runtime.frame.course import turns
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.schedule import Propagate
+from apc.eigen.balls import unprovable
+from apc.eigen.certify import MOST_PROVED, prove
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.components import components
+from apc.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
+from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
+from apc.eigen.rigid import RigidModes, find_rigid_modes, independent_places, relative_places
+from apc.frame.course import turns
+from apc.frame.discretize import UNIT
+from apc.frame.schedule import Propagate
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

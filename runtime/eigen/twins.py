@@ -20,10 +20,10 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.peer_group import PeerGroup, group_name
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.schedule import Way
+from apc.eigen.loop import Loop
+from apc.eigen.peer_group import PeerGroup, group_name
+from apc.frame.exchange import Exchange
+from apc.frame.schedule import Way
 
 
 def split_twins(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:

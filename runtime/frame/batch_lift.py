@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.lift import COEFFICIENT_ROUNDINGS
-from apc.runtime.frame.linearize import sites_of_rows
-from apc.runtime.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
-from apc.runtime.frame.site import LinearSite, every_matrix, magnitudes
+from apc.frame.discretize import UNIT
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.lift import COEFFICIENT_ROUNDINGS
+from apc.frame.linearize import sites_of_rows
+from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
+from apc.frame.site import LinearSite, every_matrix, magnitudes
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]  # float64 or complex128

@@ -16,8 +16,8 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import Mistakes
 from apc.compiler.words import with_unit
-from apc.runtime.frame.names import OVERRIDE
-from apc.runtime.frame.rows import Columns
+from apc.frame.names import OVERRIDE
+from apc.frame.rows import Columns
 
 
 def check_bounds(system: CompiledSystem) -> None:

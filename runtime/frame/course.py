@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.batch_lift import exponential_rows
-from apc.runtime.frame.lift import follow
-from apc.runtime.frame.schedule import Propagate, Schedule
-from apc.runtime.frame.site import LinearSite
+from apc.frame.batch_lift import exponential_rows
+from apc.frame.lift import follow
+from apc.frame.schedule import Propagate, Schedule
+from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

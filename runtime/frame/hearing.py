@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from fractions import Fraction
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.jacobians import edge_name
-from apc.runtime.frame.schedule import Way
-from apc.runtime.frame.site import LinearSite
+from apc.frame.exchange import Exchange, check_mean
+from apc.frame.jacobians import edge_name
+from apc.frame.schedule import Way
+from apc.frame.site import LinearSite
 
 # For each clock partition and receive: the ways it hears, and the channel of the link on each.
 Hearing = tuple[tuple[tuple[tuple[Way, str], ...], ...], ...]

@@ -15,9 +15,9 @@ from fractions import Fraction
 from apc.compiler.compiled import Clock, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.multiples import common_divisor, common_multiple
-from apc.runtime.frame.hearing import Hearing
-from apc.runtime.frame.liveness import live_holds
-from apc.runtime.frame.site import LinearSite
+from apc.frame.hearing import Hearing
+from apc.frame.liveness import live_holds
+from apc.frame.site import LinearSite
 
 MOST_TICKS = 20_000  # in a frame: each is a step of the lifting
 

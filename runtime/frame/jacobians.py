@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import ClockPartition, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.guards import guards_of
-from apc.runtime.frame.site import LinearSite, Matrix, assemble, with_own_parts
+from apc.frame.guards import guards_of
+from apc.frame.site import LinearSite, Matrix, assemble, with_own_parts
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.discretize import UNIT, discretize
-from apc.runtime.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
-from apc.runtime.frame.site import LinearSite, magnitudes
+from apc.frame.discretize import UNIT, discretize
+from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
+from apc.frame.site import LinearSite, magnitudes
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]

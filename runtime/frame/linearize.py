@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.parameters import exact_numbers
-from apc.runtime.frame.site import LinearSite, assemble, cut, matrices_of, with_own_parts
-from apc.runtime.frame.start import Listening, start_arguments
+from apc.frame.exact import evaluate_exact
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.parameters import exact_numbers
+from apc.frame.site import LinearSite, assemble, cut, matrices_of, with_own_parts
+from apc.frame.start import Listening, start_arguments
 
 # Parameter vectors evaluated by one call: of many more at once, CasADi's copies take longer than its work.
 MAPPED = 1024

@@ -8,7 +8,7 @@ Does not: know other peers, or when anything happens.
 
 from __future__ import annotations
 
-from apc.runtime.frame.site import LinearSite
+from apc.frame.site import LinearSite
 
 
 def live_outputs(pattern: LinearSite) -> frozenset[tuple[int, int]]:

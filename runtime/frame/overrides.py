@@ -15,8 +15,8 @@ from fractions import Fraction
 
 from apc.compiler.compiled import CompiledSystem, Parameter, Timing
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.bounds import check_bounds
-from apc.runtime.frame.names import OVERRIDE, find, unit_of
+from apc.frame.bounds import check_bounds
+from apc.frame.names import OVERRIDE, find, unit_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.frame.rows import Floats, different_rows
+from apc.frame.overrides import Override, apply
+from apc.frame.rows import Floats, different_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)

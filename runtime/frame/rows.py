@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.names import OVERRIDE, Free
+from apc.frame.names import OVERRIDE, Free
 
 if TYPE_CHECKING:
     from apc.compiler.language.expression import Expr
@@ -46,7 +46,7 @@ class Columns:
     def _evaluated(self, name: str, text: str) -> Floats | None:
         from apc.compiler.language.expression import names
         from apc.compiler.language.grammar import parse_expression
-        from apc.runtime.frame.row_arithmetic import compute_rows
+        from apc.frame.row_arithmetic import compute_rows
 
         tree = parse_expression(text, Place(name, 1, 1, text))
         if all(self.of(".".join(node.parts)) is None for node in names(tree)):
@@ -104,7 +104,7 @@ def free_rows(
     -------
     The vectors (k, n_p), or (1, n_p) when none of the values reaches this peer.
     """
-    from apc.runtime.frame.row_arithmetic import compute_rows
+    from apc.frame.row_arithmetic import compute_rows
 
     listed = free_values(system, group, peer, values, compute_rows)
     count = max((len(one) for one in listed if np.ndim(one)), default=1)

@@ -17,11 +17,11 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.exchange import Exchange, build_exchange
-from apc.runtime.frame.hearing import Hearing, hearing_of
-from apc.runtime.frame.hyperperiod import ClockGrid, Times, times_in_use
-from apc.runtime.frame.liveness import live_holds, live_outputs, live_receives
-from apc.runtime.frame.schedule import (
+from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.hearing import Hearing, hearing_of
+from apc.frame.hyperperiod import ClockGrid, Times, times_in_use
+from apc.frame.liveness import live_holds, live_outputs, live_receives
+from apc.frame.schedule import (
     ORDER,
     Act,
     Event,
@@ -35,7 +35,7 @@ from apc.runtime.frame.schedule import (
     Value,
     Way,
 )
-from apc.runtime.frame.site import LinearSite
+from apc.frame.site import LinearSite
 
 MOST_PACKETS = 100_000  # of one peer: each has a name
 MOST_HELD = (

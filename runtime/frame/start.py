@@ -17,8 +17,8 @@ import casadi
 import numpy as np
 
 from apc.compiler.compiled import PEERS
-from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.jacobians import SiteJacobians
+from apc.frame.exact import evaluate_exact
+from apc.frame.jacobians import SiteJacobians
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,11 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.large.counting import Ball, wind
-from apc.runtime.large.response import differentiate, respond
-from apc.runtime.large.transfer import Transfer
+from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
+from apc.frame.discretize import UNIT
+from apc.large.counting import Ball, wind
+from apc.large.response import differentiate, respond
+from apc.large.transfer import Transfer
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.large.characteristic import Characteristic, characteristic_ball, count_around
-from apc.runtime.large.counting import FIRST_ARCS
+from apc.large.characteristic import Characteristic, characteristic_ball, count_around
+from apc.large.counting import FIRST_ARCS
 
 Complexes = NDArray[np.complex128]
 

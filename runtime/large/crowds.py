@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.frame.batch_lift import CHUNK, LiftedRows, lift_rows
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.lift import LiftedSite
-from apc.runtime.frame.linearize import linearize_rows, site_of_row
-from apc.runtime.frame.parameters import Numbers
-from apc.runtime.frame.schedule import Schedule
-from apc.runtime.frame.site import LinearSite
-from apc.runtime.large.transfer import StateSpace
+from apc.frame.batch_lift import CHUNK, LiftedRows, lift_rows
+from apc.frame.discretize import UNIT
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.lift import LiftedSite
+from apc.frame.linearize import linearize_rows, site_of_row
+from apc.frame.parameters import Numbers
+from apc.frame.schedule import Schedule
+from apc.frame.site import LinearSite
+from apc.large.transfer import StateSpace
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

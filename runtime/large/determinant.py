@@ -20,14 +20,14 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.loop import Coupling
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.schedule import Heard, Sent, Way
-from apc.runtime.large.characteristic import Characteristic
-from apc.runtime.large.crowds import Crowd, hear_themselves
-from apc.runtime.large.transfer import StateSpace, build_transfer
+from apc.eigen.loop import Coupling
+from apc.eigen.peer_group import PeerGroup
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange, check_mean
+from apc.frame.schedule import Heard, Sent, Way
+from apc.large.characteristic import Characteristic
+from apc.large.crowds import Crowd, hear_themselves
+from apc.large.transfer import StateSpace, build_transfer
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -15,19 +15,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.rigid import find_rigid_modes
-from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation
-from apc.runtime.frame.course import turns
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.schedule import Schedule
-from apc.runtime.frame.site import LinearSite
-from apc.runtime.large.characteristic import Characteristic, null_vectors, weights_at
-from apc.runtime.large.crowds import Crowd, hear_roughly, lines_of, site_one, some_rows
-from apc.runtime.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
-from apc.runtime.large.response import differentiate
-from apc.runtime.large.transfer import CHUNK
-from apc.runtime.large.zeros import Zero, Zeros, find_zeros, near_poles
+from apc.eigen.loop import Loop
+from apc.eigen.rigid import find_rigid_modes
+from apc.eigen.spectrum import Mode, Spectrum, judge, oscillation
+from apc.frame.course import turns
+from apc.frame.exchange import Exchange
+from apc.frame.schedule import Schedule
+from apc.frame.site import LinearSite
+from apc.large.characteristic import Characteristic, null_vectors, weights_at
+from apc.large.crowds import Crowd, hear_roughly, lines_of, site_one, some_rows
+from apc.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
+from apc.large.response import differentiate
+from apc.large.transfer import CHUNK
+from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS, norms
-from apc.runtime.frame.discretize import UNIT
+from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, norms
+from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -20,13 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.eigen.pseudospectrum import balance
-from apc.runtime.eigen.rigid import relative_coordinates
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.large.crowds import hear_themselves, rows_of
-from apc.runtime.large.diagonal import block_diagonal, block_norms, block_resolvent
-from apc.runtime.large.transfer import INNER
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.pseudospectrum import balance
+from apc.eigen.rigid import relative_coordinates
+from apc.frame.discretize import UNIT
+from apc.large.crowds import hear_themselves, rows_of
+from apc.large.diagonal import block_diagonal, block_norms, block_resolvent
+from apc.large.transfer import INNER
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from apc.runtime.eigen.graph_loops import common_graph, graph_loop, graph_scale
-from apc.runtime.eigen.graph_modes import ring_mode, ring_values
-from apc.runtime.eigen.modes import Arrangement
-from apc.runtime.eigen.peer_group import PeerGroup, used_ways
-from apc.runtime.eigen.rigid import find_rigid_modes
-from apc.runtime.eigen.spectrum import Spectrum, judge
-from apc.runtime.frame.exchange import Exchange
+from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale
+from apc.eigen.graph_modes import ring_mode, ring_values
+from apc.eigen.modes import Arrangement
+from apc.eigen.peer_group import PeerGroup, used_ways
+from apc.eigen.rigid import find_rigid_modes
+from apc.eigen.spectrum import Spectrum, judge
+from apc.frame.exchange import Exchange
 
 # From so many eigenvalues on.
 MANY = 128
@@ -63,7 +63,7 @@ def deciding_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> LargeGrap
     any_other = graph_loop(group, ring_mode(1, n, mean=scale.by_mean), scale)
     # What is rigid in one system that is not the common one hears nothing: it is rigid in all of them.
     free = find_rigid_modes(any_other, with_drifts=False)
-    from apc.runtime.large.extremes import find_extremes  # most scenes only ask `is_large_ring`
+    from apc.large.extremes import find_extremes  # most scenes only ask `is_large_ring`
 
     found = find_extremes(group, weights, values[1:], free.directions)
     places = [0, *(found.places + 1).tolist()]

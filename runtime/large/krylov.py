@@ -21,22 +21,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.spectrum import Mode, Spectrum, judge, oscillation
-from apc.runtime.frame.course import turns
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.large.crowds import Crowd, hear_roughly, site_one, some_rows
-from apc.runtime.large.relative import (
+from apc.eigen.spectrum import Mode, Spectrum, judge, oscillation
+from apc.frame.course import turns
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange
+from apc.large.crowds import Crowd, hear_roughly, site_one, some_rows
+from apc.large.relative import (
     RelativeMatrix,
     RigidSpace,
     nothing_rigid,
     relative_matrix,
     rigid_space,
 )
-from apc.runtime.large.sampled_count import argument_of, count_beyond
-from apc.runtime.large.sparse_system import SparseSystem, sparse_system
-from apc.runtime.large.translation import free_motions, may_drift
-from apc.runtime.threads import load_pool
+from apc.large.sampled_count import argument_of, count_beyond
+from apc.large.sparse_system import SparseSystem, sparse_system
+from apc.large.translation import free_motions, may_drift
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.large.sparse_system import SparseSystem
-from apc.runtime.large.translation import FreeMotions
-from apc.runtime.threads import load_pool
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange
+from apc.large.sparse_system import SparseSystem
+from apc.large.translation import FreeMotions
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

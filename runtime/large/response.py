@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.large.transfer import CHUNK, Transfer
+from apc.frame.discretize import UNIT
+from apc.large.transfer import CHUNK, Transfer
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

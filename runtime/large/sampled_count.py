@@ -22,9 +22,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.large.crowds import Crowd
-from apc.runtime.large.sparse_system import SparseSystem, small_matrix
-from apc.runtime.threads import load_pool
+from apc.large.crowds import Crowd
+from apc.large.sparse_system import SparseSystem, small_matrix
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

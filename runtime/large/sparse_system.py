@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.weights import sum_weights
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.schedule import Heard, Sent
-from apc.runtime.large.crowds import Crowd
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange
+from apc.frame.schedule import Heard, Sent
+from apc.large.crowds import Crowd
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.large.diagonal import block_diagonal, block_norms, block_norms_along, block_resolvent
+from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance
+from apc.frame.discretize import UNIT
+from apc.large.diagonal import block_diagonal, block_norms, block_norms_along, block_resolvent
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -23,18 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.weights import exact_weight
-from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.modes import complete_loops
-from apc.runtime.eigen.peer_group import PeerGroup, states_of, used_ways
-from apc.runtime.eigen.peers import group_of_row
-from apc.runtime.eigen.rigid import exact_columns, find_rigid_modes, stays_rigid
-from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.linearize import site_of_entries
-from apc.runtime.frame.residues import PRIMES, Residues, residues_of, residues_of_rounded
-from apc.runtime.frame.schedule import Way
-from apc.runtime.frame.site import LinearSite
-from apc.runtime.large.crowds import Crowd
+from apc.eigen.loop import Loop
+from apc.eigen.modes import complete_loops
+from apc.eigen.peer_group import PeerGroup, states_of, used_ways
+from apc.eigen.peers import group_of_row
+from apc.eigen.rigid import exact_columns, find_rigid_modes, stays_rigid
+from apc.frame.exact import evaluate_exact
+from apc.frame.exchange import Exchange
+from apc.frame.linearize import site_of_entries
+from apc.frame.residues import PRIMES, Residues, residues_of, residues_of_rounded
+from apc.frame.schedule import Way
+from apc.frame.site import LinearSite
+from apc.large.crowds import Crowd
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -20,14 +20,14 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.large.characteristic import (
+from apc.large.characteristic import (
     FARTHEST,
     Characteristic,
     characteristic_ball,
     count_around,
     refine,
 )
-from apc.runtime.large.circles import (
+from apc.large.circles import (
     CLEAR,
     FIRST_RADIUS,
     SMALL_ARCS,

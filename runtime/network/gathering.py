@@ -28,11 +28,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.weights import sum_weights
-from apc.runtime.frame.exchange import Exchange, check_mean
-from apc.runtime.frame.schedule import Heard, Kept, Schedule, Sent
-from apc.runtime.network.listener import START, Seen
-from apc.runtime.network.timetable import Route, Timetable
-from apc.runtime.network.weights import weight_matrix
+from apc.frame.exchange import Exchange, check_mean
+from apc.frame.schedule import Heard, Kept, Schedule, Sent
+from apc.network.listener import START, Seen
+from apc.network.timetable import Route, Timetable
+from apc.network.weights import weight_matrix
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

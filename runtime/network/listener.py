@@ -15,7 +15,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.network.packets import PacketSource
+from apc.network.packets import PacketSource
 
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.network.channel_law import ChannelLaw, deviates
+from apc.network.channel_law import ChannelLaw, deviates
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.network.channel_law import channel_law
-from apc.runtime.network.listener import Listener, Seen
-from apc.runtime.network.packets import PacketSource
+from apc.frame.exchange import Exchange
+from apc.network.channel_law import channel_law
+from apc.network.listener import Listener, Seen
+from apc.network.packets import PacketSource
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.eigen.closing import ClosedSystem, close_loop
-from apc.runtime.eigen.loop import Loop
-from apc.runtime.eigen.modes import split
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.eigen.rigid import find_rigid_modes
-from apc.runtime.frame.batch_lift import (
+from apc.eigen.closing import ClosedSystem, close_loop
+from apc.eigen.loop import Loop
+from apc.eigen.modes import split
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.rigid import find_rigid_modes
+from apc.frame.batch_lift import (
     HOPELESS,
     PERTURBED_FRAMES,
     SAFE,
@@ -36,16 +36,16 @@ from apc.runtime.frame.batch_lift import (
     lift_rows,
     roundings_of,
 )
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.exchange import Exchange
-from apc.runtime.frame.jacobians import SiteJacobians
-from apc.runtime.frame.lift import lift
-from apc.runtime.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
-from apc.runtime.frame.names import Free, value_now
-from apc.runtime.frame.rows import free_rows
-from apc.runtime.frame.schedule import Propagate, Schedule
-from apc.runtime.frame.site import LinearSite, every_matrix
-from apc.runtime.vary.wiring import (
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.lift import lift
+from apc.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
+from apc.frame.names import Free, value_now
+from apc.frame.rows import free_rows
+from apc.frame.schedule import Propagate, Schedule
+from apc.frame.site import LinearSite, every_matrix
+from apc.vary.wiring import (
     Lifted,
     Wiring,
     are_rigid,

@@ -22,9 +22,9 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.frame.exact import evaluate_exact
-from apc.runtime.frame.rows import free_values
-from apc.runtime.vary.batch import BatchEvaluator
+from apc.frame.exact import evaluate_exact
+from apc.frame.rows import free_values
+from apc.vary.batch import BatchEvaluator
 
 if TYPE_CHECKING:
     from apc.compiler.language.expression import Expr
@@ -170,7 +170,7 @@ def _bending(function: Any, value: Any, vector: Any) -> Any:
 
 def _symbolic(tree: Expr, value_of: Callable[[str], Any]) -> Any:
     """Return the value of an expression of parameters, some of which are CasADi's symbols."""
-    from apc.runtime.vary.symbols import compute_symbols  # few parameters follow from others
+    from apc.vary.symbols import compute_symbols  # few parameters follow from others
 
     return compute_symbols(tree, value_of)
 

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import flint
 import numpy as np
 
-from apc.runtime.eigen.balls import frame_balls, precision, reduced_balls, unprovable
-from apc.runtime.eigen.certify import MOST_PROVED, schur_cohn
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.rigid import RigidModes, relative_places
-from apc.runtime.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, solve_spectrum
-from apc.runtime.vary.crossings import Root
+from apc.eigen.balls import frame_balls, precision, reduced_balls, unprovable
+from apc.eigen.certify import MOST_PROVED, schur_cohn
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.rigid import RigidModes, relative_places
+from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, solve_spectrum
+from apc.vary.crossings import Root
 
 # Half the width asked of a bracket, relative to the value: half of 1e-12, rounding set aside.
 HALF = 4e-13

@@ -16,19 +16,19 @@ from typing import Any
 
 import numpy as np
 
+from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, in_hertz, measured, with_unit, wrapped
-from apc.runtime.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
-from apc.runtime.frame.names import Free, find, parameter_of, unit_of
-from apc.runtime.given import given
-from apc.runtime.network.nominal import left_out, refuse_channel_number
-from apc.runtime.threads import single_threaded
-from apc.runtime.trouble import finite_equations
-from apc.runtime.vary.crossings import CELL
-from apc.runtime.vary.delays import delay_now
-from apc.runtime.vary.evaluator import reaches_time
-from apc.runtime.vary.search import Crossing, Search, Told, search, search_delay
+from apc.frame.names import Free, find, parameter_of, unit_of
+from apc.given import given
+from apc.network.nominal import left_out, refuse_channel_number
+from apc.threads import single_threaded
+from apc.trouble import finite_equations
+from apc.vary.crossings import CELL
+from apc.vary.delays import delay_now
+from apc.vary.evaluator import reaches_time
+from apc.vary.search import Crossing, Search, Told, search, search_delay
 
 _PLACE = Place("critical value")
 

@@ -19,17 +19,17 @@ from fractions import Fraction
 
 import numpy as np
 
+from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.plan import LONG_LINES
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.multiples import common_divisor
-from apc.runtime.analysis.analysis import Prepared, lifted_groups
-from apc.runtime.analysis.plan import LONG_LINES
-from apc.runtime.frame.names import Free
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import Propagate, Schedule
-from apc.runtime.frame.scheduling import build_schedules
-from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
+from apc.frame.parameters import resolve
+from apc.frame.schedule import Propagate, Schedule
+from apc.frame.scheduling import build_schedules
+from apc.vary.batch import BatchEvaluator, batch_evaluator
 
 # Pieces of one search: each is some schedules and matrices, a hundredth of a second and more.
 MOST_PIECES = 10_000

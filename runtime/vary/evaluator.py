@@ -15,17 +15,17 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import Prepared, lifted_groups, prepare
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.modes import split
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.names import Free, is_named, parameter_of
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.frame.rows import free_rows
-from apc.runtime.vary.batch import BatchEvaluator, batch_evaluator
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.modes import split
+from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+from apc.frame.discretize import UNIT
+from apc.frame.names import Free, is_named, parameter_of
+from apc.frame.overrides import Override, apply
+from apc.frame.rows import free_rows
+from apc.vary.batch import BatchEvaluator, batch_evaluator
 
 Floats = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
-from apc.runtime.eigen.spectrum import angles_in_frame, whole_vectors
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+from apc.eigen.spectrum import angles_in_frame, whole_vectors
 
 # An eigenvalue of 1 leaves open how far the peers stand aside together; next to the boundary, where it is
 # this much larger, they stand where the motion takes them. Far above rounding, far below half a turn.

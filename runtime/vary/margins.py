@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import Prepared, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import in_hertz, known_digits, wrapped
-from apc.runtime.analysis.analysis import Prepared, prepare, prepare_at_start
-from apc.runtime.eigen.spectrum import finite
-from apc.runtime.frame.names import Free, named_times, parameter_of
-from apc.runtime.threads import single_threaded
-from apc.runtime.trouble import finite_equations
-from apc.runtime.vary.batch import BatchEvaluator
-from apc.runtime.vary.crossings import scan_lines
-from apc.runtime.vary.delays import delay_now
-from apc.runtime.vary.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size
-from apc.runtime.vary.search import (
+from apc.eigen.spectrum import finite
+from apc.frame.names import Free, named_times, parameter_of
+from apc.threads import single_threaded
+from apc.trouble import finite_equations
+from apc.vary.batch import BatchEvaluator
+from apc.vary.crossings import scan_lines
+from apc.vary.delays import delay_now
+from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size
+from apc.vary.search import (
     Crossing,
     Line,
     courses_of,

@@ -20,23 +20,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import Prepared, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
 from apc.compiler.words import counted
-from apc.runtime.analysis.analysis import Prepared, analyze, lifted_groups
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.modes import split
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes
-from apc.runtime.eigen.spectrum import DRIFTS, finite, solve_spectrum
-from apc.runtime.frame.names import Free, parameter_of
-from apc.runtime.vary.batch import BatchEvaluator
-from apc.runtime.vary.bends import bends
-from apc.runtime.vary.bracket import Bracket, bracket, bracket_in_floats
-from apc.runtime.vary.crossings import Courses, Root, Scan, scan
-from apc.runtime.vary.delays import Piece, borders, delay_now, delay_pieces, system_with_delay
-from apc.runtime.vary.eigenvalues import eigenvalues
-from apc.runtime.vary.evaluator import PointEvaluator, evaluator
-from apc.runtime.vary.marginal import marginal_motion, with_rigid
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.modes import split
+from apc.eigen.rigid import RigidModes, find_rigid_modes
+from apc.eigen.spectrum import DRIFTS, finite, solve_spectrum
+from apc.frame.names import Free, parameter_of
+from apc.vary.batch import BatchEvaluator
+from apc.vary.bends import bends
+from apc.vary.bracket import Bracket, bracket, bracket_in_floats
+from apc.vary.crossings import Courses, Root, Scan, scan
+from apc.vary.delays import Piece, borders, delay_now, delay_pieces, system_with_delay
+from apc.vary.eigenvalues import eigenvalues
+from apc.vary.evaluator import PointEvaluator, evaluator
+from apc.vary.marginal import marginal_motion, with_rigid
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -21,20 +21,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import counted, with_unit, wrapped
-from apc.runtime.analysis.analysis import Prepared, prepare
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.rigid import find_rigid_modes, relative_coordinates
-from apc.runtime.frame.discretize import UNIT
-from apc.runtime.frame.names import Free, parameter_of
-from apc.runtime.network.nominal import channel_numbers
-from apc.runtime.threads import single_threaded
-from apc.runtime.trouble import finite_equations
-from apc.runtime.vary.batch import BatchEvaluator, matrix_errors
-from apc.runtime.vary.batch import slope_errors as slope_errors_of
-from apc.runtime.vary.evaluator import PointEvaluator, evaluator, free_parameters
-from apc.runtime.vary.wiring import NEAR_ONE, Wiring, relative_weights
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.rigid import find_rigid_modes, relative_coordinates
+from apc.frame.discretize import UNIT
+from apc.frame.names import Free, parameter_of
+from apc.network.nominal import channel_numbers
+from apc.threads import single_threaded
+from apc.trouble import finite_equations
+from apc.vary.batch import BatchEvaluator, matrix_errors
+from apc.vary.batch import slope_errors as slope_errors_of
+from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters
+from apc.vary.wiring import NEAR_ONE, Wiring, relative_weights
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.eigen.closing import ClosedSystem
-from apc.runtime.eigen.loop import Packet, packet_places
-from apc.runtime.eigen.peer_group import PeerGroup
-from apc.runtime.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates, relative_places
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.loop import Packet, packet_places
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates, relative_places
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128

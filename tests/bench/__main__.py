@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from apc.runtime.bench.bench import machine
-from apc.runtime.bench.timing import waited
+from apc.benchmark.bench import machine
+from apc.benchmark.timing import waited
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]

@@ -33,14 +33,14 @@ import numpy as np
 from scipy.linalg import expm
 
 import apc
+from apc.analysis.analysis import analyze
+from apc.benchmark.reference import Truth, exact_course, spectral_truth
+from apc.benchmark.timing import median_time, take_turns
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import analyze
-from apc.runtime.bench.reference import Truth, exact_course, spectral_truth
-from apc.runtime.bench.timing import median_time, take_turns
-from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import Simulation, prepare
-from apc.runtime.threads import single_threaded
+from apc.simulation.blocks import blocks
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+from apc.threads import single_threaded
 from tests.bench.drake import played_by_drake
 from tests.bench.judge import Judge, parser_of
 from tests.bench.paper_scene import (

@@ -12,11 +12,11 @@ from functools import partial
 
 import mpmath
 
+from apc.benchmark.timing import median_time, timed
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.bench.timing import median_time, timed
-from apc.runtime.vary.critical import critical
-from apc.runtime.vary.margins import margins
-from apc.runtime.vary.sensitivity import sensitivities
+from apc.vary.critical import critical
+from apc.vary.margins import margins
+from apc.vary.sensitivity import sensitivities
 from tests.bench.judge import Judge, parser_of
 from tests.bench.paper_scene import K_C
 from tests.bruteforce import Scene, frame_matrix

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.bench.timing import timed
+from apc.benchmark.timing import timed
 from tests.bench.paper_scene import FRAME, K_C, K_T, START, TICK, USERS, user_plant
 
 

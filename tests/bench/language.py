@@ -13,12 +13,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from apc.benchmark.timing import median_time, timed
 from apc.compiler.components.library import Library
 from apc.compiler.errors import Place
 from apc.compiler.language.tables import read_table
 from apc.compiler.pipeline import STAGES, each_stage
-from apc.runtime.bench.timing import median_time, timed
-from apc.runtime.threads import single_threaded
+from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
 from tests.topologies import AVERAGE, SCENES, replaced
 

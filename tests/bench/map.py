@@ -15,12 +15,12 @@ from fractions import Fraction
 import flint
 import numpy as np
 
+from apc.analysis.analysis import Prepared, analyze, prepare
+from apc.benchmark.timing import timed
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import Prepared, analyze, prepare
-from apc.runtime.bench.timing import timed
-from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.threads import single_threaded
+from apc.eigen.balls import precision
+from apc.frame.overrides import Override, apply
+from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
 from tests.bench.paper_scene import CUBE_DAMPING, DEVICE_DAMPING, DEVICE_MASS, SHARED_MASS, TICKS, USERS
 from tests.bruteforce import Scene, frame_matrix

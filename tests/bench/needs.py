@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
+from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.equations.structure import SortedSystem
 from apc.compiler.functions.reached import Reached
 from apc.compiler.pipeline import each_stage
-from apc.runtime.analysis.analysis import prepare
-from apc.runtime.frame.parameters import resolve
-from apc.runtime.frame.schedule import Schedule
+from apc.frame.parameters import resolve
+from apc.frame.schedule import Schedule
 from tests.topologies import SCENES
 
 Reasons = tuple[tuple[str, str], ...]  # names, each with the reason

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.runtime.bench.timing import timed
+from apc.benchmark.timing import timed
 from tests.bench.drake import matrices
 from tests.bench.paper_scene import FRAME, START, TICK
 

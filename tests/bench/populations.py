@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from apc.runtime.analysis.analysis import Analysis, analyze, prepare
-from apc.runtime.bench.timing import median_time, waited
-from apc.runtime.threads import single_threaded
+from apc.analysis.analysis import Analysis, analyze, prepare
+from apc.benchmark.timing import median_time, waited
+from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
 from tests.populations import different
 from tests.sites import MS, grouped, linked, paper
@@ -32,7 +32,7 @@ PROCESS = """
 import resource, sys
 sys.path.insert(0, {root!r})
 from tests.bench.populations import scene
-from apc.runtime.analysis.analysis import analyze
+from apc.analysis.analysis import analyze
 found = analyze(scene({name!r}))
 memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 print(found.method, found.spectral_radius, found.spectral_radius_error, memory, found.verdict, sep="|")

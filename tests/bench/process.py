@@ -17,7 +17,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from apc.runtime.bench.timing import spread_of, waited
+from apc.benchmark.timing import spread_of, waited
 from tests.bench.judge import Judge, parser_of
 
 SCENES = Path(__file__).resolve().parents[2] / "models" / "scenes"

@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.benchmark.timing import timed
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.runtime.bench.timing import timed
-from apc.runtime.threads import single_threaded
-from apc.runtime.vary.critical import Critical, critical
+from apc.threads import single_threaded
+from apc.vary.critical import Critical, critical
 from tests.bench.judge import Judge, parser_of
 from tests.bruteforce import Scene, frame_matrices
 from tests.topologies import compiled, library

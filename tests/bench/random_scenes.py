@@ -21,17 +21,17 @@ from pathlib import Path
 
 import flint
 
+from apc.analysis.analysis import Analysis, analyze, prepare
+from apc.answers.answer import sensitivities_of
+from apc.benchmark.reference import RIGID, classes_of, eigenvalues, frame_matrices
+from apc.benchmark.timing import timed
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError
-from apc.runtime.analysis.analysis import Analysis, analyze, prepare
-from apc.runtime.answers.answer import sensitivities_of
-from apc.runtime.bench.reference import RIGID, classes_of, eigenvalues, frame_matrices
-from apc.runtime.bench.timing import timed
-from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.simulate.simulation import ROW
-from apc.runtime.threads import single_threaded
+from apc.eigen.balls import precision
+from apc.frame.overrides import Override, apply
+from apc.simulation.simulation import ROW
+from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
 from tests.bench.sensitivity_truth import check_frequencies, check_sensitivities
 from tests.bench.shapes import PARTS, Shape, draw_shape

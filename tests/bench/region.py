@@ -13,16 +13,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from apc.runtime.analysis.analysis import prepare
-from apc.runtime.bench.timing import median_time, timed
-from apc.runtime.frame.names import Free
-from apc.runtime.frame.overrides import apply, parse_override
-from apc.runtime.region.axes import parse_axes
-from apc.runtime.region.boundary import relative_to
-from apc.runtime.region.curves import between
-from apc.runtime.region.region import Region, region
-from apc.runtime.threads import single_threaded
-from apc.runtime.vary.evaluator import evaluator
+from apc.analysis.analysis import prepare
+from apc.benchmark.timing import median_time, timed
+from apc.frame.names import Free
+from apc.frame.overrides import apply, parse_override
+from apc.regions.axes import parse_axes
+from apc.regions.boundary import relative_to
+from apc.regions.curves import between
+from apc.regions.region import Region, region
+from apc.threads import single_threaded
+from apc.vary.evaluator import evaluator
 from tests.bench.judge import Judge, parser_of
 from tests.bench.naive_region import stable_grid
 from tests.paper_limit import limit

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from apc.benchmark.bench import bench
 from apc.compiler.pipeline import compile_topology
-from apc.runtime.bench.bench import bench
 from tests.bench.judge import Judge, parser_of
 from tests.topologies import SCENES
 

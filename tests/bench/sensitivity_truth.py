@@ -19,10 +19,9 @@ from typing import Any
 import flint
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem
-from apc.runtime.analysis.analysis import Analysis, analyze, prepare
-from apc.runtime.bench.events import Happening, Play, build_peers, refusal
-from apc.runtime.bench.reference import (
+from apc.analysis.analysis import Analysis, analyze, prepare
+from apc.benchmark.events import Happening, Play, build_peers, refusal
+from apc.benchmark.reference import (
     RIGID,
     _common_whom,
     _difference_whom,
@@ -30,10 +29,11 @@ from apc.runtime.bench.reference import (
     _to_state,
     classes_of,
 )
-from apc.runtime.eigen.balls import precision
-from apc.runtime.frame.names import Free, find, parameter_of
-from apc.runtime.frame.overrides import Override, apply
-from apc.runtime.vary.sensitivity import Sensitivities, sensitivities
+from apc.compiler.compiled import CompiledSystem
+from apc.eigen.balls import precision
+from apc.frame.names import Free, find, parameter_of
+from apc.frame.overrides import Override, apply
+from apc.vary.sensitivity import Sensitivities, sensitivities
 from tests.topologies import compiled
 
 BITS = 320

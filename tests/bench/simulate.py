@@ -14,14 +14,14 @@ from functools import partial
 import numpy as np
 from scipy.linalg import expm
 
-from apc.runtime.analysis.analysis import analyze, lifted_groups
-from apc.runtime.bench.timing import median_time, waited
-from apc.runtime.eigen.modes import dense
-from apc.runtime.simulate.blocks import Block, blocks
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import Simulation, prepare
-from apc.runtime.simulate.trajectory import simulate
-from apc.runtime.threads import single_threaded
+from apc.analysis.analysis import analyze, lifted_groups
+from apc.benchmark.timing import median_time, waited
+from apc.eigen.modes import dense
+from apc.simulation.blocks import Block, blocks
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+from apc.simulation.trajectory import simulate
+from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
 from tests.bench.paper_scene import (
     CUBE_DAMPING,

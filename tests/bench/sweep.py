@@ -13,14 +13,14 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
+from apc.benchmark.timing import timed, waited
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.store import save
-from apc.runtime.bench.timing import timed, waited
-from apc.runtime.frame.overrides import apply
-from apc.runtime.sweep.grid import build_grid, parse_axis
-from apc.runtime.sweep.quantities import find_quantity
-from apc.runtime.sweep.sweep import PART_POINTS
-from apc.runtime.threads import single_threaded
+from apc.frame.overrides import apply
+from apc.sweeps.grid import build_grid, parse_axis
+from apc.sweeps.quantities import find_quantity
+from apc.sweeps.sweep import PART_POINTS
+from apc.threads import single_threaded
 from tests.sweeping import parts, start, wait_for_parts
 from tests.topologies import SCENES
 

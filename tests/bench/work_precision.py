@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.benchmark.reference import exact_course
+from apc.benchmark.timing import median_time
 from apc.compiler.compiled import CompiledSystem
-from apc.runtime.bench.reference import exact_course
-from apc.runtime.bench.timing import median_time
-from apc.runtime.simulate.blocks import blocks
-from apc.runtime.simulate.methods import CVODES, EXACT, TOLERANCE, Method
-from apc.runtime.simulate.settings import Settings
-from apc.runtime.simulate.simulation import Simulation, prepare
-from apc.runtime.threads import single_threaded
+from apc.simulation.blocks import blocks
+from apc.simulation.methods import CVODES, EXACT, TOLERANCE, Method
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+from apc.threads import single_threaded
 from tests.bench.contact_reference import Bounce, reference
 from tests.bench.judge import Judge, parser_of
 from tests.topologies import compiled
@@ -151,7 +151,7 @@ def draw(results: dict[str, dict[Method, Point]], path: Path) -> None:
     """Draw a panel a scene."""
     from matplotlib.figure import Figure
 
-    from apc.runtime.simulate.figures import write_figure
+    from apc.simulation.figures import write_figure
 
     figure = Figure(figsize=(11, 4), layout="constrained")
     axes = figure.subplots(1, len(results), sharey=True)

@@ -17,9 +17,7 @@ from typing import Any
 import flint
 
 import apc
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.pipeline import compile_topology
-from apc.runtime.bench.reference import (
+from apc.benchmark.reference import (
     DIGITS,
     RIGID,
     Truth,
@@ -28,7 +26,9 @@ from apc.runtime.bench.reference import (
     frame_matrices,
     spectral_truth,
 )
-from apc.runtime.eigen.balls import precision
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.pipeline import compile_topology
+from apc.eigen.balls import precision
 
 HERE = Path(__file__).resolve().parent
 TRUTHS = HERE / "truths.json"

@@ -1,0 +1,71 @@
+# The public names, each with its home, once: a type checker reads them here, and `__init__.py` looks them up.
+from .analysis.analysis import Analysis as Analysis
+from .analysis.box_proof import BoxProof as BoxProof
+from .analysis.contact_modes import ContactModes as ContactModes
+from .analysis.conventions import Conventions as Conventions
+from .analysis.paper import PaperRoute as PaperRoute
+from .api import (
+    analyze as analyze,
+)
+from .api import (
+    bench as bench,
+)
+from .api import (
+    compile as compile,
+)
+from .api import (
+    contact_modes as contact_modes,
+)
+from .api import (
+    conventions as conventions,
+)
+from .api import (
+    critical as critical,
+)
+from .api import (
+    load as load,
+)
+from .api import (
+    margins as margins,
+)
+from .api import (
+    paper_route as paper_route,
+)
+from .api import (
+    prove_box as prove_box,
+)
+from .api import (
+    region as region,
+)
+from .api import (
+    save as save,
+)
+from .api import (
+    schema as schema,
+)
+from .api import (
+    sensitivities as sensitivities,
+)
+from .api import (
+    set_parameters as set_parameters,
+)
+from .api import (
+    show as show,
+)
+from .api import (
+    simulate as simulate,
+)
+from .api import (
+    sweep as sweep,
+)
+from .benchmark.bench import Bench as Bench
+from .compiler.compiled import CompiledSystem as CompiledSystem
+from .compiler.errors import ApcError as ApcError
+from .regions.region import Region as Region
+from .simulation.trajectory import Trajectory as Trajectory
+from .sweeps.sweep import Sweep as Sweep
+from .vary.critical import Critical as Critical
+from .vary.margins import Margins as Margins
+from .vary.sensitivity import Sensitivities as Sensitivities
+
+__version__: str

@@ -1,0 +1,105 @@
+"""The command line's way in and out: `apc …` or `python -m apc …`, and the exit codes.
+
+0 done (an unstable scene is an answer), 1 the input is at fault, 2 usage, 3 a bug of ours.
+"""
+
+from __future__ import annotations
+
+import errno
+import gc
+import io
+import os
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+
+# Every file a command reads or writes has its own message; these can only come from the terminal or a pipe.
+OUTPUT_ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG)
+
+
+# Objects made between two searches for garbage. The 50,000 to 100,000 that imports make all stay: Python's
+# own 700 has them looked through again and again, for a tenth of a short command's time.
+BETWEEN_COLLECTIONS = 100_000
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    gc.set_threshold(BETWEEN_COLLECTIONS)
+    code = run(sys.argv[1:])
+    gc.disable()  # the process ends, and its memory with it
+    sys.exit(code)
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command and return its exit code; no traceback reaches the terminal."""
+    import click
+
+    from apc.cli.commands import apc
+    from apc.compiler.errors import ApcError, visible
+
+    if sys.stdout is None:  # closed before we began
+        click.echo("apc: the output can't be written: there is no stdout", err=True)
+        return 1
+    try:
+        apc.main(arguments, prog_name="apc", standalone_mode=False)
+        sys.stdout.flush()
+    except ApcError as error:
+        for mistake in error.mistakes:
+            click.echo(str(mistake), err=True)
+        return 1
+    except click.ClickException as error:
+        error.show(shown := io.StringIO())
+        click.echo(visible(shown.getvalue()), err=True, nl=False)
+        return 2
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("stopped", err=True)
+        return 130
+    except SystemExit:
+        # click's answer to a broken pipe, and to nothing else here: whoever reads our output has gone.
+        return 0
+    except BrokenPipeError:
+        _silence_stdout()  # likewise, at the last flush
+        return 0
+    except OSError as error:
+        if error.errno not in OUTPUT_ERRORS:
+            return _bug(arguments)
+        _silence_stdout()
+        click.echo(f"apc: the output can't be written: {error.strerror}", err=True)
+        return 1
+    except Exception:
+        return _bug(arguments)
+    return 0
+
+
+def _silence_stdout() -> None:
+    """Let the flush at exit go nowhere: what could not be written once can't be written twice."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _bug(arguments: list[str]) -> int:
+    """Say where the report of a bug of ours is."""
+    import click
+
+    where = _report(arguments)
+    click.echo(f"apc: this is a bug of apc, not of your input; a report is in {where}", err=True)
+    return 3
+
+
+def _report(arguments: list[str]) -> str:
+    from apc.distribution import program_version
+
+    text = (
+        f"apc {program_version()}, Python {sys.version}\narguments: {arguments}\n\n{traceback.format_exc()}"
+    )
+    try:
+        handle, name = tempfile.mkstemp(prefix="apc-bug-", suffix=".txt")
+        os.close(handle)
+        Path(name).write_text(text, encoding="utf-8")
+    except OSError:
+        return f"no file, as none could be written:\n{text}"
+    return name
+
+
+if __name__ == "__main__":
+    main()

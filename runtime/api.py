@@ -1,0 +1,458 @@
+"""The public functions: plain, with frozen results.
+
+Takes: paths, compiled models, settings. Gives: compiled models and analyses.
+Guarantees: what a command does, the function of its name does.
+Does not: print.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from apc.compiler import store
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+
+if TYPE_CHECKING:
+    from apc.analysis.analysis import Analysis
+    from apc.analysis.box_proof import BoxProof
+    from apc.analysis.contact_modes import ContactModes
+    from apc.analysis.conventions import Conventions
+    from apc.analysis.paper import PaperRoute
+    from apc.benchmark.bench import Bench
+    from apc.regions.region import Region
+    from apc.simulation.trajectory import Trajectory
+    from apc.sweeps.sweep import Sweep
+    from apc.vary.critical import Critical
+    from apc.vary.margins import Margins
+    from apc.vary.sensitivity import Sensitivities
+
+Method = Literal["auto", "modes", "dense", "determinant", "krylov", "paper"]
+Format = Literal["text", "json", "dot", "svg"]
+
+
+def compile(path: str | Path) -> CompiledSystem:
+    """Compile a topology file and check the result: one frame event by event against the lifted map.
+
+    Parameters
+    ----------
+    path
+        The topology, a YAML file.
+
+    Returns
+    -------
+    CompiledSystem
+        The compiled model; nothing is written (see `save`).
+
+    Raises
+    ------
+    ApcError
+        The file is at fault; holds every mistake found.
+    """
+    from apc.analysis.selfcheck import check_frame
+    from apc.compiler.pipeline import compile_topology
+
+    system = compile_topology(Path(path))
+    check_frame(system)
+    return system
+
+
+def save(model: CompiledSystem, path: str | Path) -> None:
+    """Write a compiled model to a .apc file, whole or not at all. Raises ApcError if it can't be written."""
+    store.save(model, Path(path))
+
+
+def load(path: str | Path) -> CompiledSystem:
+    """Read a compiled model from a .apc file. Raises ApcError if it is damaged or older than its topology."""
+    from apc.inputs import load_fresh
+
+    return load_fresh(Path(path))
+
+
+def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> CompiledSystem:
+    """Return the model with other parameter values, without compiling again.
+
+    Parameters
+    ----------
+    model
+        The compiled model; it stays as it is.
+    values
+        Quantities by name: `{"contact.stiffness": "800 N/m", "lan.delay": "16 ms"}`.
+
+    Raises
+    ------
+    ApcError
+        A name is unknown, a unit is wrong, or a value lies outside its bounds.
+    """
+    from apc.frame.overrides import apply, parse_override
+
+    overrides = [parse_override(model, f"{name}={value}") for name, value in values.items()]
+    return apply(model, overrides)
+
+
+def analyze(
+    model: CompiledSystem | str | Path,
+    *,
+    set: Mapping[str, str] | None = None,
+    method: Method = "auto",
+    certify: bool = False,
+) -> Analysis:
+    """Say whether a scene is stable, by how much, and in which modes.
+
+    Parameters
+    ----------
+    model
+        A compiled model, or the path of a topology or compiled model.
+    set
+        Parameter values to change first, as in `set_parameters`.
+    method
+        "auto": what serves the scene; "modes": a few systems of a site's size, at a cost that does not grow
+        with the number of equal peers; "dense": every peer in one system, the check on the others;
+        "determinant": the zeros of a small determinant, for peers that all differ and for long delays;
+        "krylov": a sparse matrix, for peers that differ on a sparse graph; "paper": the lifted matrices of
+        Rakhsha and Constantinescu, eqs. (18) to (20).
+    certify
+        Prove the verdict in ball arithmetic.
+
+    Returns
+    -------
+    Analysis
+        Verdict, spectral radius per frame with its error bound, and the modes.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault, or the method can't serve the scene.
+    """
+    from apc.answers.answer import judge
+
+    return judge(_model(model, set), method=method, certify=certify)
+
+
+def critical(
+    model: CompiledSystem | str | Path,
+    parameter: str,
+    *,
+    set: Mapping[str, str] | None = None,
+    lower: str | None = None,
+    upper: str | None = None,
+) -> Critical:
+    """Find every value of a parameter or delay at which a scene becomes stable or unstable.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    parameter
+        Its name, such as "coordination.stiffness" or "lan.delay".
+    lower, upper
+        Quantities between which to look, such as "5000 N/m".
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.vary import critical as crossings
+
+    return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper)
+
+
+def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Margins:
+    """Say how far each coupler's stiffness and damping and each delay may grow, all else as it is.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.vary import margins as growth
+
+    return growth.margins(_model(model, set))
+
+
+def sensitivities(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+) -> Sensitivities:
+    """Differentiate the spectral radius with respect to every parameter.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.vary import sensitivity
+
+    return sensitivity.sensitivities(_model(model, set))
+
+
+def conventions(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Conventions:
+    """Repeat the analysis under every order of coincident events and both readings of the start.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.analysis import conventions as orders
+
+    return orders.conventions(_model(model, set))
+
+
+def contact_modes(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+) -> ContactModes:
+    """Analyse a scene whose couplers push and never pull in each of their modes.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.analysis import contact_modes as switched
+
+    return switched.contact_modes(_model(model, set))
+
+
+def prove_box(
+    model: CompiledSystem | str | Path, box: Mapping[str, str], *, set: Mapping[str, str] | None = None
+) -> BoxProof:
+    """Prove that a scene is stable for every value of some parameters within their ranges.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    box
+        Ranges by parameter, such as {"contact.stiffness": "±1%"} or "900 N/m:1100 N/m".
+    """
+    from apc.analysis import box_proof
+    from apc.analysis.box import parse_range
+
+    system = _model(model, set)
+    ranges = [parse_range(system, f"{name}={value}") for name, value in box.items()]
+    return box_proof.prove_box(system, ranges)
+
+
+def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> PaperRoute:
+    """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+
+    Raises
+    ------
+    ApcError
+        E861 the scene has not the form these matrices need.
+    """
+    from apc.analysis import paper
+
+    return paper.paper_route(_model(model, set))
+
+
+def region(
+    model: CompiledSystem | str | Path,
+    *,
+    x: str | None = None,
+    y: str | None = None,
+    set: Mapping[str, str] | None = None,
+) -> Region:
+    """Find the boundary of the stable region of two parameters, as curves with their errors.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    x, y
+        A parameter and its range, such as "contact.stiffness=10 N/m:3000 N/m"; those of the scene's
+        `studies: region:` if not given.
+
+    Returns
+    -------
+    Region
+        Its curves, `.stable_area`, `.contains(x, y)` in SI, `.to_dataframe()`, `.plot()`.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.regions import region as stable_region
+    from apc.regions.axes import parse_axes
+
+    system = _model(model, set)
+    return stable_region.region(system, parse_axes(system, x, y))
+
+
+def sweep(
+    model: CompiledSystem | str | Path,
+    over: Mapping[str, str | Sequence[str]],
+    *,
+    of: str = "analyze",
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    set: Mapping[str, str] | None = None,
+) -> Sweep:
+    """Compute a result at every combination of some parameters' values.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    over
+        Values by parameter: "500 N/m:1500 N/m:11" (lower end, upper end, how many), or a list of quantities.
+    of
+        "analyze", or "critical:PARAMETER".
+    out
+        A .parquet or .csv file; finished parts are kept beside it, and the same call takes up where it ended.
+    jobs
+        Processes; the number of cores if not given.
+    cluster
+        The address of a Dask scheduler.
+    """
+    from apc.sweeps import sweep as points
+
+    path = None if out is None else Path(out)
+    system = _model(model, set)
+    if path is not None and not isinstance(model, CompiledSystem):
+        from apc.inputs import check_outputs
+
+        check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out": path})
+    return points.sweep(system, over, of=of, out=path, jobs=jobs, cluster=cluster)
+
+
+def _model(model: CompiledSystem | str | Path, set: Mapping[str, str] | None) -> CompiledSystem:
+    """Return a compiled model, with the parameters set."""
+    if not isinstance(model, CompiledSystem):
+        from apc.inputs import load_or_compile
+
+        model = load_or_compile(Path(model))
+    return set_parameters(model, set) if set else model
+
+
+def simulate(
+    model: CompiledSystem | str | Path,
+    *,
+    duration: str | None = None,
+    set: Mapping[str, str] | None = None,
+    signals: Sequence[str] = (),
+    jit: bool = True,
+    seed: int | None = None,
+    method: str | None = None,
+    error: bool = False,
+) -> Trajectory:
+    """Play a scene in time.
+
+    Parameters
+    ----------
+    model
+        A compiled model, or the path of a topology or compiled model.
+    duration
+        How long, such as "2 s"; that of the scene's experiment if not given.
+    set
+        Parameter values to change first, as in `set_parameters`.
+    signals
+        Patterns of the signals to keep, such as "cube.x" or "left[2].*"; all if there is none.
+    jit
+        Whether to compile to machine code where there is a C compiler.
+    seed
+        Of the packets that get lost or come late; that of the scene's experiment if not given.
+    method
+        "exact", "rk4:STEP", "semi-implicit:STEP" or "cvodes:RTOL", such as "rk4:0.1 ms"; exact where linear
+        and by CVODES elsewhere if not given.
+    error
+        Whether to estimate the error, by a second run.
+
+    Returns
+    -------
+    Trajectory
+        A row for every tick of the fastest clock with the values before the tick, and a summary.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.simulation import trajectory
+    from apc.simulation.methods import DEFAULT, parse_method
+
+    return trajectory.simulate(
+        _model(model, set),
+        duration=trajectory.parse_duration(duration) if duration is not None else None,
+        signals=signals,
+        jit=jit,
+        seed=seed,
+        method=parse_method(method) if method is not None else DEFAULT,
+        error=error,
+    )
+
+
+def bench(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None, rounds: int | None = None
+) -> Bench:
+    """Measure every method of analysis and of simulation on a scene: time against true error.
+
+    Parameters
+    ----------
+    model
+        A compiled model, or the path of a topology file.
+    set
+        Parameters to change first, as `{"contact.stiffness": "800 N/m"}`.
+    rounds
+        Runs of each method, fewer of slow ones; 15 if not given.
+
+    Raises
+    ------
+    ApcError
+        The scene can't be analysed at all.
+    """
+    from apc.benchmark import bench as measuring
+
+    return measuring.bench(_model(model, set), rounds=measuring.ROUNDS if rounds is None else rounds)
+
+
+def show(path: str | Path, *, format: Format = "text") -> str:
+    """Tell what a scene is made of: its graph, its equations, and what happens in one frame.
+
+    Parameters
+    ----------
+    path
+        The topology, a YAML file.
+    format
+        "text" for a person; "json", the same as one document; "dot", the graph in Graphviz's language;
+        "svg", the graph as a picture.
+
+    Raises
+    ------
+    ApcError
+        The file is at fault, or is a compiled model, which no longer has the equations as written.
+    """
+    from apc.compiler.view import contents
+
+    path = Path(path)
+    if path.suffix == ".apc":
+        what = "is a compiled model, which no longer has the equations as they were written"
+        raise ApcError(Mistake("E615", Place(str(path)), what, hint=f"apc show {path.with_suffix('.yaml')}"))
+    match format:
+        case "text":
+            return contents.show_text(path)
+        case "json":
+            return json.dumps(contents.show_document(path), ensure_ascii=False, allow_nan=False, indent=2)
+        case "dot":
+            return contents.show_dot(path)
+        case "svg":
+            return contents.show_svg(path)
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of topologies, generated from the language and the library."""
+    from apc.compiler.components.library import Library
+    from apc.compiler.view.schema import topology_schema
+
+    return topology_schema(Library())

@@ -1,0 +1,441 @@
+"""Speed against error: every method on one scene, on this machine, beside the truth.
+
+Takes: a `CompiledSystem`.
+Gives: `Measured`, `Comparison`, `Bench`, `bench`; `pareto_front`.
+Guarantees: times are the processor's, medians over rounds in which all methods take turns; an error is the
+distance from a reference of fifty digits, and is left out where there is none.
+Does not: draw (see `bench.figure`), or grow the scene (see `bench.scale`).
+"""
+
+from __future__ import annotations
+
+import platform
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
+from functools import partial
+from os import cpu_count
+from typing import Any
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Analysis, analyze
+from apc.analysis.needs import needs
+from apc.analysis.paper import analyze_paper
+from apc.benchmark.reference import PRECISIONS, Truth, exact_course, spectral_truth
+from apc.benchmark.timing import spread_of, take_turns, timed
+from apc.compiler.compiled import Column, CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.compiler.words import with_unit
+from apc.distribution import versions
+from apc.eigen.balls import precision
+from apc.frame.discretize import UNIT
+from apc.frame.jacobians import jacobians
+from apc.frame.parameters import resolve
+from apc.simulation.blocks import blocks
+from apc.simulation.methods import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method
+from apc.simulation.scales import state_scales
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+from apc.threads import single_threaded
+
+Floats = NDArray[np.float64]
+
+# Rounds in which every method takes its turn; a method gets fewer once its runs took so many seconds, and
+# none after its first run if that alone did.
+ROUNDS, ENOUGH = 15, 3.0
+
+# Errors below this are one: which of two is smaller is luck. An eigenvalue of n states is computed to some n
+# roundings, a state after so many ticks to about as many as the root of their number; scenes have tens of
+# states and hundreds of ticks.
+SAME = 64 * UNIT
+
+# How long the scene is played: what balls can follow in a few seconds, and longer than any start-up.
+DURATION = Fraction(1, 4)
+MOST_PLAYED = 30  # peers: each of them is followed in balls
+
+# States of the one sparse matrix of method krylov, which has no limit of its own: on a complete graph 2,424
+# took 19 s, 3,000 took 74 s. What is too large for another method is refused by that method itself.
+MOST_SPARSE = 2500
+
+FAILED, WRONG = "FAILED, which is a bug", "WRONG"  # how what must not be is said
+
+# Of `analyze(method=…)`, and the two that are called otherwise.
+CERTIFIED, PAPER = "certified", "paper"
+ANALYSES = ("modes", "dense", "determinant", "krylov", CERTIFIED, PAPER)
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One method: median `seconds`, `spread` (half the distance between the quartiles), over `rounds` runs.
+
+    `error` is the true one, None without a reference; `bound` what the method itself says, None if it says
+    nothing. `front` says that no other method is both faster and more right; `chosen` that it is the default.
+    """
+
+    name: str
+    seconds: float
+    spread: float
+    rounds: int
+    error: float | None
+    bound: float | None
+    chosen: bool
+    front: bool = False
+
+    @property
+    def fails(self) -> bool:
+        """Whether the true error is above what the method says it is at most."""
+        return self.error is not None and self.bound is not None and not self.error <= self.bound
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """All methods of one task, the fastest first.
+
+    `quantity` says what `error` is of, `relative` to what, `timed` what a time is of. `reference` is the
+    truth in words, or why there is none; `refused` are the methods that can't serve the scene, with the
+    reason; `left_out` is what of the scene none of them looks at.
+    """
+
+    task: str
+    quantity: str
+    relative: str
+    timed: str
+    measured: tuple[Measured, ...]
+    reference: str
+    refused: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def chosen(self) -> Measured | None:
+        """The default method."""
+        return next((one for one in self.measured if one.chosen), None)
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What must not be: a wrong verdict or bound, or a method that crashes."""
+        wrong = [note for note in self.notes if note.startswith(WRONG)]
+        return (*wrong, *(f"{name} {why}" for name, why in self.refused if why.startswith(FAILED)))
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Both tasks on a scene; `machine` says where."""
+
+    topology: str
+    peers: int
+    machine: Mapping[str, str]
+    comparisons: tuple[Comparison, ...]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What must not be, on any scene: none where all is well."""
+        return tuple(fault for one in self.comparisons for fault in one.faults)
+
+    def __str__(self) -> str:
+        """Return tables of at most 80 columns."""
+        from apc.benchmark.report import bench_report  # it needs this module
+
+        return bench_report(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data, ready for JSON."""
+        return asdict(self)
+
+
+def bench(system: CompiledSystem, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
+    """Measure every method of analysis and of simulation on a scene.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to use.
+    rounds
+        Runs of each method, fewer of slow ones.
+    duration
+        How long the scene is played, in seconds.
+
+    Raises
+    ------
+    ApcError
+        The scene can't be analysed at all.
+    """
+    with single_threaded():
+        analysis = bench_analysis(system, rounds=rounds)
+        try:
+            simulation = bench_simulation(system, duration, rounds=rounds)
+        except ApcError as error:  # what is too large to be played can be analysed all the same
+            simulation = _simulation(duration, (), "nothing is played", (("every method", reason_of(error)),))
+    return Bench(system.name, system.peers, machine(), (analysis, simulation))
+
+
+def reason_of(error: ApcError) -> str:
+    """Return why something was refused; the line to write instead is of another command."""
+    return replace(error.mistakes[0], hint="").sentence.removesuffix(".")
+
+
+def machine() -> dict[str, str]:
+    """Return what was measured on."""
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": str(cpu_count()),
+        "python": platform.python_version(),
+        **dict(versions("numpy", "scipy", "casadi", "python-flint")),
+    }
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:  # noqa: PTH123 -- one line of a file of the kernel's
+            return next(
+                (line.partition(":")[2].strip() for line in file if line.startswith("model name")), ""
+            )
+    except OSError:
+        return platform.processor()
+
+
+def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Comparison:
+    """Measure every method of analysis, from the compiled scene to its verdict.
+
+    The error is that of the spectral radius, rigid modes left out.
+    """
+    calls: dict[str, Callable[[], Analysis]] = {
+        name: partial(analyze, system, method=name) for name in ANALYSES if name not in (CERTIFIED, PAPER)
+    }
+    calls[CERTIFIED] = partial(analyze, system, certify=True)
+    calls[PAPER] = partial(analyze_paper, system)
+    default = analyze(system)
+    states = _states(system)
+    left_out = []
+    if states > MOST_SPARSE and default.method != "krylov":
+        del calls["krylov"]
+        left_out.append(
+            ("krylov", f"its matrix of {states:,} states is above the {MOST_SPARSE:,} tried here")
+        )
+    truth = spectral_truth(system)
+    results, refused, slow = _first(calls)
+    if CERTIFIED in results and (reason := _not_proved(results[CERTIFIED])):
+        left_out.append((CERTIFIED, reason))
+        del results[CERTIFIED]
+    times = slow | take_turns(
+        {name: calls[name] for name in results if name not in slow}, rounds, enough=ENOUGH
+    )
+    measured = [
+        _measured(
+            name,
+            times[name],
+            error=_radius_error(found, truth) if isinstance(truth, Truth) else None,
+            bound=found.spectral_radius_error,
+            chosen=name == default.method,
+        )
+        for name, found in results.items()
+    ]
+    said = truth if isinstance(truth, str) else f"spectral radius {truth.digits} of the numbers as doubles"
+    notes = [
+        f"{WRONG}: {name} says {found.verdict}, {default.method} {default.verdict}"
+        for name, found in results.items()
+        if found.stable is not None and default.stable is not None and found.verdict != default.verdict
+    ]
+    if default.stable is None:
+        notes.append(f"{WRONG}: analyze leaves the verdict open: {default.verdict}")
+    notes += [f"{WRONG}: the bound of {one.name} does not hold" for one in measured if one.fails]
+    return Comparison(
+        task="analyze",
+        quantity="spectral radius",
+        relative="absolute",
+        timed="an analysis, from the compiled scene to its verdict",
+        measured=pareto_front(measured),
+        reference=said,
+        refused=(*left_out, *refused),
+        notes=tuple(notes),
+        left_out=default.left_out,
+    )
+
+
+def _states(system: CompiledSystem) -> int:
+    """Return how many states all peers have together."""
+    sites = needs(system).sites
+    return sum(group.count * sites[group.kind].states for group in system.groups)
+
+
+def _not_proved(found: Analysis) -> str:
+    """Return why an analysis that was to prove its verdict did not, "" if it did."""
+    if found.proof.startswith("proved"):
+        return ""
+    return "; ".join(note for note in found.notes if "not proved" in note) or f"not proved: {found.proof}"
+
+
+def _radius_error(found: Analysis, truth: Truth) -> float:
+    with precision(PRECISIONS[0]):
+        return float(abs(truth.radius - flint.arb(found.spectral_radius)).mid())
+
+
+def bench_simulation(
+    system: CompiledSystem, duration: Fraction = DURATION, *, rounds: int = ROUNDS
+) -> Comparison:
+    """Measure every method of simulation, from the first instant to the last.
+
+    The error is the largest of any continuous state at any tick, relative to the largest value that a state
+    of its unit takes.
+    """
+    notes = []
+    if _rests(system, duration):
+        system, how = _moved(system)
+        notes.append(f"nothing moves in this scene: {how}")
+    if system.peers > MOST_PLAYED:
+        truth: tuple[tuple[str, ...], Any] | str = f"{system.peers:,} peers are too many to follow in balls"
+    else:
+        truth = exact_course(system, duration)
+    calls = {str(method): partial(_ready, system, duration, method) for method in _methods(system)}
+    ready, refused, _ = _first(calls)
+    times = take_turns({name: partial(_play, one) for name, one in ready.items()}, rounds, enough=ENOUGH)
+    chosen = prepare(system, Settings(duration)).how
+    measured = [
+        _measured(
+            name,
+            times[name],
+            error=None if isinstance(truth, str) else _course_error(one, truth),
+            bound=None,
+            chosen=name == chosen or (name == str(DEFAULT) and chosen != EXACT),
+        )
+        for name, one in ready.items()
+    ]
+    said = truth if isinstance(truth, str) else f"{len(truth[1])} instants in ball arithmetic"
+    return _simulation(duration, pareto_front(measured), said, refused, tuple(notes))
+
+
+def _simulation(
+    duration: Fraction,
+    measured: tuple[Measured, ...],
+    reference: str,
+    refused: tuple[tuple[str, str], ...],
+    notes: tuple[str, ...] = (),
+) -> Comparison:
+    return Comparison(
+        task="simulate",
+        quantity=f"states over {float(duration):g} s",
+        relative="relative to the largest value of a state's unit",
+        timed="a run, without what prepares it",
+        measured=measured,
+        reference=reference,
+        refused=refused,
+        notes=notes,
+    )
+
+
+def _methods(system: CompiledSystem) -> list[Method]:
+    """Return the methods to compare, their steps cut from the period of the fastest clock."""
+    seconds = resolve(system).timings
+    tick = min((seconds[clock.period] for clock in system.clocks), default=Fraction(1, 1000))
+    return [
+        Method(EXACT),
+        *(Method(RK4, step=tick / parts) for parts in (1, 4, 16)),
+        *(Method(SEMI_IMPLICIT, step=tick / parts) for parts in (1, 10)),
+        *(Method(CVODES, tolerance=tolerance) for tolerance in (1e-6, 1e-8, 1e-10)),
+    ]
+
+
+def _rests(system: CompiledSystem, duration: Fraction) -> bool:
+    """Say whether no state ever changes: whatever pushes, and be it between two ticks, leaves its trace."""
+    names = tuple(dict.fromkeys(state.name for kind in system.kinds for state in kind.states))
+    if not names:
+        return False
+    first: Floats | None = None
+    for block in blocks(prepare(system, Settings(duration), signals=names)):
+        first = block.values[0] if first is None else first
+        if block.stopped or np.any(block.values != first):
+            return False
+    return True
+
+
+def _moved(system: CompiledSystem) -> tuple[CompiledSystem, str]:
+    """Let the first peer start by its first state's own scale elsewhere, and say so."""
+    first, *others = system.groups
+    kind, numbers = system.kinds[first.kind], resolve(system)
+    state = kind.states[0]
+    rows = numbers.parameters[0]
+    by = float(state_scales(system, kind, jacobians(kind), list(rows))[0])
+    values = np.array(rows[numbers.rows[0], kind.parameters.index(state.start)], dtype=np.float64)
+    values[0] += by
+    columns = (*(one for one in first.columns if one.name != state.start), Column(state.start, values))
+    changed = replace(system, groups=(replace(first, columns=columns), *others))
+    return changed, f"{state.name} of its first peer starts {with_unit(f'{by:g}', state.unit)} elsewhere"
+
+
+def _ready(system: CompiledSystem, duration: Fraction, method: Method) -> Simulation:
+    return prepare(system, Settings(duration, method))
+
+
+def _play(simulation: Simulation) -> None:
+    for _ in blocks(simulation):
+        pass
+
+
+def _course_error(simulation: Simulation, truth: tuple[tuple[str, ...], Floats]) -> float:
+    """Return the largest error of any state, relative to the largest value of its unit."""
+    names, rows = truth
+    values = np.concatenate([block.values for block in blocks(simulation)])
+    place = {signal.name: number for number, signal in enumerate(simulation.signals)}
+    units = np.array([simulation.signals[place[name]].unit for name in names])
+    if len(values) < len(rows):
+        return np.inf  # it left the range of floats
+    apart = np.abs(values[:, [place[name] for name in names]] - rows)
+    worst = 0.0
+    for unit in dict.fromkeys(units.tolist()):
+        largest = float(np.abs(rows[:, units == unit]).max())
+        error = float(apart[:, units == unit].max())
+        worst = max(worst, error / largest if largest else error)
+    return worst
+
+
+def _first(
+    calls: Mapping[str, Callable[[], Any]],
+) -> tuple[dict[str, Any], tuple[tuple[str, str], ...], dict[str, list[float]]]:
+    """Call everything once; return what came out, what was refused and why, and the times of slow ones."""
+    results, refused, slow = {}, [], {}
+    for name, call in calls.items():
+        try:
+            taken, results[name] = timed(call)
+        except ApcError as error:
+            refused.append((name, reason_of(error)))
+        except Exception as error:  # a bug of one method is a result, and no reason to lose the others'
+            refused.append((name, f"{FAILED}: {error!r}"))
+        else:
+            if taken > ENOUGH:
+                slow[name] = [taken]
+    return results, tuple(refused), slow
+
+
+def _measured(
+    name: str, times: Sequence[float], *, error: float | None, bound: float | None, chosen: bool
+) -> Measured:
+    return Measured(name, statistics.median(times), spread_of(times), len(times), error, bound, chosen)
+
+
+def pareto_front(measured: Sequence[Measured]) -> tuple[Measured, ...]:
+    """Mark what no other is better than in both ways, and sort by time.
+
+    One beats another if it is faster by more than both spreads together and not less right, or more right and
+    not slower. Half the distance between the quartiles is 0.67 of a normal deviation σ, the median of 15 runs
+    is certain to 0.32 σ, so that a difference of both spreads is three deviations of what luck makes. More
+    right is what errs less by more than luck (`SAME`). Without errors there is no front.
+    """
+    return tuple(
+        replace(
+            one,
+            front=one.error is not None
+            and not any(_beats(other, one) for other in measured if other.error is not None),
+        )
+        for one in sorted(measured, key=lambda one: one.seconds)
+    )
+
+
+def _beats(one: Measured, other: Measured) -> bool:
+    faster = one.seconds + one.spread + other.spread < other.seconds
+    mine, its = (max(m.error or 0.0, SAME) for m in (one, other))
+    return (faster and mine <= its) or (mine < its and one.seconds <= other.seconds)

@@ -1,0 +1,209 @@
+"""The hard cases: scenes whose truth is known to fifty digits, each analysed and compared with it.
+
+Takes: a folder of topologies and its `truths.json`.
+Gives: `HardCase`, `HardReport`, `run_hard_cases`.
+Guarantees: an error is computed exactly from the stored digits; a bound that does not hold or says nothing, a
+verdict that is wrong or left open and a wrong number of rigid modes fail.
+Does not: compute any truth (see the script beside the scenes).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from apc.analysis.analysis import Analysis, analyze
+from apc.benchmark.timing import median_time
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import RefusedError, read_file
+from apc.compiler.pipeline import compile_topology
+from apc.compiler.source.source import MAX_BYTES
+from apc.threads import single_threaded
+
+TRUTHS = "truths.json"
+FOLDER = "--hard FOLDER, of scenes and their truths, as tests/hard of a copy of the repository"
+REPEATS = 3  # of each analysis; its time is the median
+ENOUGH = 2.0  # seconds after which one is not repeated
+
+
+@dataclass(frozen=True, slots=True)
+class HardCase:
+    """One scene: the answer beside the truth.
+
+    `error` is |ρ − truth|, `bound` what the analysis says it is at most, both divided by max(ρ, 1) where ρ
+    is the truth. `seconds` is the median time of the analysis. `undecided` says that it left the verdict
+    open. `failed` says what is wrong, "" if nothing is: no bound and no verdict are failures too, since the
+    truth is known.
+    """
+
+    name: str
+    about: str
+    peers: int
+    method: str
+    verdict: str
+    radius: str
+    error: float
+    bound: float
+    seconds: float
+    undecided: bool
+    failed: str
+
+    @property
+    def looseness(self) -> float:
+        """Bound ÷ error; infinite where there is no error."""
+        return self.bound / self.error if self.error else math.inf
+
+    @property
+    def unbounded(self) -> bool:
+        """Whether the bound says nothing."""
+        return not math.isfinite(self.bound)
+
+
+@dataclass(frozen=True, slots=True)
+class HardReport:
+    """All cases of a folder, and its scenes without a truth."""
+
+    folder: str
+    cases: tuple[HardCase, ...]
+    without: tuple[str, ...]
+
+    @property
+    def failures(self) -> tuple[HardCase, ...]:
+        """The cases that failed."""
+        return tuple(case for case in self.cases if case.failed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as plain data, ready for JSON."""
+        return {
+            "folder": self.folder,
+            "cases": [
+                asdict(case) | {"bound_over_error": case.looseness if case.error else None}
+                for case in self.cases
+            ],
+            "without_truth": list(self.without),
+            "failed": [case.name for case in self.failures],
+            "undecided": [case.name for case in self.cases if case.undecided],
+            "unbounded": [case.name for case in self.cases if case.unbounded],
+        }
+
+
+def run_hard_cases(
+    folder: Path,
+    *,
+    repeats: int = REPEATS,
+    solve: Callable[[CompiledSystem], Analysis] = analyze,
+) -> HardReport:
+    """Analyse every scene of a folder and compare.
+
+    Parameters
+    ----------
+    folder
+        Holds topologies and `truths.json`: by the name of a file without its suffix, `spectral_radius` (text,
+        many digits), `rigid_modes`, `verdict`.
+    repeats
+        Analyses of each scene, of which the median time counts.
+    solve
+        The analysis.
+
+    Raises
+    ------
+    ApcError
+        E920 no such folder, no truths in it or truths that can't be read; and those of compiling and
+        analysing.
+    """
+    truths = _truths(folder)
+    cases, without = [], []
+    for path in sorted(folder.glob("*.yaml")):
+        if path.stem not in truths:
+            without.append(path.name)
+            continue
+        system = compile_topology(path)
+        with single_threaded():
+            seconds, found = median_time(partial(solve, system), repeats, enough=ENOUGH)
+        cases.append(compare(system, found, truths[path.stem], seconds, path.stem))
+    if not cases:
+        what = "holds no topology whose truth is known"
+        raise ApcError(Mistake("E920", Place(str(folder)), what, hint=FOLDER))
+    return HardReport(str(folder), tuple(cases), tuple(without))
+
+
+def compare(
+    system: CompiledSystem, found: Analysis, truth: Mapping[str, Any], seconds: float, name: str
+) -> HardCase:
+    """Compare an analysis with the truth.
+
+    Parameters
+    ----------
+    system, found
+        The scene and its analysis.
+    truth
+        An entry of `truths.json`.
+    seconds
+        What it took.
+    name
+        The name of the case.
+    """
+    radius = Fraction(truth["spectral_radius"])
+    bound = found.spectral_radius_error
+    apart = None
+    if math.isfinite(found.spectral_radius):
+        apart = abs(Fraction(found.spectral_radius) - radius)
+    size = float(max(radius, Fraction(1)))
+    wrong = []
+    if apart is None:
+        wrong.append("there is no spectral radius")
+    elif not math.isfinite(bound):
+        wrong.append("the bound says nothing")
+    elif apart > Fraction(bound):
+        wrong.append("the bound does not hold")
+    if found.stable is None:
+        wrong.append(f"the verdict is left open: {truth['verdict']}")
+    elif found.verdict != truth["verdict"]:
+        wrong.append(f"the verdict is wrong: {truth['verdict']}")
+    if found.rigid_modes != truth["rigid_modes"]:
+        wrong.append(f"{truth['rigid_modes']} rigid modes, not {found.rigid_modes}")
+    return HardCase(
+        name=name,
+        about=system.about,
+        peers=system.peers,
+        method=found.method + (" + proof" if found.proof else ""),
+        verdict=found.verdict,
+        radius=str(truth["spectral_radius"]),
+        error=math.inf if apart is None else float(apart) / size,
+        bound=bound / size,
+        seconds=seconds,
+        undecided=found.stable is None,
+        failed="; ".join(wrong),
+    )
+
+
+def _truths(folder: Path) -> dict[str, Any]:
+    """Read the truths of a folder."""
+    path = folder / TRUTHS
+    place = Place(str(path))
+    try:
+        found = json.loads(read_file(path, MAX_BYTES))
+    except RefusedError as refused:
+        raise ApcError(Mistake("E920", place, refused.words, hint=FOLDER)) from None
+    except ValueError as error:
+        raise ApcError(Mistake("E920", place, f"is not JSON: {error}")) from error
+    listed: list[tuple[str, Any]] = list(found.items()) if isinstance(found, dict) else [("", None)]
+    for name, truth in listed:
+        try:
+            Fraction(truth["spectral_radius"])
+            whole = isinstance(truth["rigid_modes"], int) and isinstance(truth["verdict"], str)
+            if not whole:
+                raise TypeError
+        except (TypeError, KeyError, ValueError, ArithmeticError) as error:
+            expected = "spectral_radius (digits), rigid_modes and verdict of each scene"
+            raise ApcError(
+                Mistake("E920", place, name or "the truths", expected, "something else")
+            ) from error
+    return dict(found)

@@ -1,0 +1,173 @@
+"""What more peers cost: time, memory and error against their number.
+
+Takes: a topology file and the numbers of peers.
+Gives: `Scale`, `ScaleRow`, `scale`.
+Guarantees: each number is measured in a process of its own, so that memory is its own.
+Does not: change the file; the group with the most peers of a written `count` grows in memory only.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from apc.analysis.analysis import analyze
+from apc.benchmark.bench import reason_of
+from apc.benchmark.reference import Truth, spectral_truth
+from apc.benchmark.timing import median_time, timed
+from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.pipeline import stages_of
+from apc.compiler.source.nodes import Mapping, Scalar
+from apc.compiler.source.source import parse_source, read_source
+from apc.compiler.words import counted
+from apc.threads import single_threaded
+
+REPEATS = 3  # of each analysis; its time is the median
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleRow:
+    """One number of peers: seconds to compile and analyse, bytes at most, the error of the radius.
+
+    `count` is of the group that grows, `peers` of the whole scene.
+    """
+
+    count: int
+    peers: int
+    compile_s: float
+    analyze_s: float
+    memory: int
+    error: float | None
+    bound: float
+    method: str
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """A row a number; `refused` are the numbers that can't be analysed, with the reason.
+
+    `floor` says how much memory the program takes by itself.
+    """
+
+    topology: str
+    group: str
+    rows: tuple[ScaleRow, ...]
+    refused: tuple[tuple[int, str], ...]
+    floor: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data, ready for JSON."""
+        return asdict(self)
+
+
+def scale(path: Path, counts: Sequence[int]) -> Scale:
+    """Compile and analyse a topology with other numbers of peers.
+
+    Parameters
+    ----------
+    path
+        The topology.
+    counts
+        How many peers the group that grows has; each is measured once.
+
+    Raises
+    ------
+    ApcError
+        E921 no group has a written count, a number is none, or none of them can be analysed; and those of
+        compiling.
+    """
+    if not counts or min(counts) < 1 or max(counts) > LARGEST_COUNT:
+        expected = f"numbers from 1 to {LARGEST_COUNT:,}, like 3,30,300"
+        got = ",".join(map(str, counts))[:80]
+        raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, got))
+    name, _ = _largest(path)
+    rows, refused = [], []
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
+        floor = pool.submit(_memory).result()
+        for count in dict.fromkeys(counts):
+            found = pool.submit(_measure, path, count).result()
+            if isinstance(found, str):
+                refused.append((count, found))
+            else:
+                rows.append(found)
+    if not rows:
+        count, reason = refused[0]
+        what = f"leaves nothing to measure: {counted(count, 'peer')} of {name}: {reason}"
+        raise ApcError(Mistake("E921", Place("--scale"), what))
+    said = f"{floor / 2**20:.0f} MiB are the program itself"
+    return Scale(path.stem, name, tuple(rows), tuple(refused), said)
+
+
+def with_count(path: Path, count: int) -> CompiledSystem:
+    """Compile a topology whose largest group has another number of peers."""
+    source = read_source(path)
+    _, number = _largest(path)
+    lines = source.text.splitlines(keepends=True)
+    place = number.place
+    line = lines[place.line - 1]
+    assert line[place.column - 1 :].startswith(number.text)
+    lines[place.line - 1] = (
+        line[: place.column - 1] + str(count) + line[place.column - 1 + len(number.text) :]
+    )
+    changed = parse_source("".join(lines).encode(), file=source.file, path=source.path)
+    *_, (_, system) = stages_of(changed)
+    assert isinstance(system, CompiledSystem)
+    return system
+
+
+def _largest(path: Path) -> tuple[str, Scalar]:
+    """Return the group with the most peers of a written count, and where that stands."""
+    root = read_source(path).root
+    groups = root.get("peers") if isinstance(root, Mapping) else None
+    found: list[tuple[int, str, Scalar]] = []
+    for key, value in groups.entries if isinstance(groups, Mapping) else ():
+        number = value.get("count") if isinstance(value, Mapping) else None
+        if isinstance(number, Scalar) and isinstance(number.value, int):
+            found.append((number.value, key.text, number))
+    if not found:
+        what = "no group of this topology has a count that could grow"
+        raise ApcError(Mistake("E921", Place(str(path)), what, hint="peers: {user: {count: 3}}"))
+    _, name, number = max(found, key=lambda one: one[0])
+    return name, number
+
+
+def _measure(path: Path, count: int) -> ScaleRow | str:
+    """Compile and analyse, in this process."""
+    try:
+        with single_threaded():
+            compiled, system = timed(partial(with_count, path, count))
+            analyzed, found = median_time(partial(analyze, system), REPEATS)
+            memory = _memory()
+            truth = spectral_truth(system)
+    except ApcError as error:
+        return reason_of(error)
+    off = None
+    if isinstance(truth, Truth):
+        off = float(abs(Fraction(truth.digits) - Fraction(found.spectral_radius)))
+    return ScaleRow(
+        count=count,
+        peers=system.peers,
+        compile_s=compiled,
+        analyze_s=analyzed,
+        memory=memory,
+        error=off,
+        bound=found.spectral_radius_error,
+        method=found.method,
+        verdict=found.verdict,
+    )
+
+
+def _memory() -> int:
+    """Return the most bytes this process has held."""
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024

@@ -1,0 +1,79 @@
+"""The command `apc analyze`.
+
+Takes: words of a command line. Gives: text on stdout.
+Guarantees: with --json, stdout holds one JSON document and nothing else.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import click
+
+from apc.cli.options import json_option, print_result, set_option
+from apc.threads import start_single_threaded
+
+METHODS = ("auto", "modes", "dense", "determinant", "krylov", "paper")
+
+
+@click.command("analyze")
+@click.argument("file", required=False)
+@set_option
+@click.option(
+    "--method",
+    type=click.Choice(METHODS),
+    default="auto",
+    show_default=True,
+    metavar="METHOD",
+    help="auto: what serves the scene. modes: a few small systems. dense: all peers in one, to check. "
+    "determinant: zeros of a small determinant, for peers that all differ and for long delays. krylov: a "
+    "sparse matrix, for peers that differ on a sparse graph. paper: the lifted matrices of Rakhsha and "
+    "Constantinescu, eqs. (18) to (20).",
+)
+@click.option(
+    "--certify", is_flag=True, help="Prove the verdict in ball arithmetic, for the numbers as doubles."
+)
+@click.option(
+    "--box",
+    "box",
+    multiple=True,
+    metavar="PATH=±P%",
+    help="Prove stability for every value within, e.g. --box contact.stiffness=±1%, or "
+    '--box "contact.stiffness=900 N/m:1100 N/m". May be repeated.',
+)
+@click.option(
+    "--conventions",
+    "every_convention",
+    is_flag=True,
+    help="Repeat the analysis under every order of events that coincide.",
+)
+@json_option
+def analyze_command(
+    file: str | None,
+    settings: tuple[str, ...],
+    method: str,
+    certify: bool,
+    box: tuple[str, ...],
+    every_convention: bool,
+    as_json: bool,
+) -> None:
+    """Say whether a scene is stable, by how much, and in which modes.
+
+    FILE is a topology or a compiled model. The spectral radius is per frame,
+    the time after which all clocks stand as before; below 1 every motion
+    dies out. A motion of all peers together, which nothing hinders, is left
+    out of it and named. Beside the verdict stand what moves the radius most,
+    how far each coupler and delay may grow, and for contacts that push and
+    never pull, which of them make it unstable.
+    """
+    start_single_threaded()
+    from apc.answers.answer import answer
+    from apc.inputs import open_scene
+
+    system = open_scene(file, settings)
+    ranges = []
+    if box:
+        from apc.analysis.box import parse_range
+
+        ranges = [parse_range(system, text) for text in box]
+    found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)
+    print_result(found, as_json=as_json)

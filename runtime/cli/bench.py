@@ -1,0 +1,151 @@
+"""The command `apc bench`.
+
+Takes: words of a command line. Gives: text on stdout; exit code 1 when a hard case fails.
+Guarantees: with --json, stdout holds one JSON document and nothing else.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+
+from apc.cli.options import json_option, print_document, set_option, tell
+from apc.compiler.digits import plain_float
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import check_target
+
+HARD = Path("tests/hard")  # of a copy of the repository
+
+
+@click.command("bench")
+@click.argument("file", required=False)
+@set_option
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Draw error against time: .png, .svg or .pdf.",
+)
+@click.option(
+    "--scale",
+    "counts",
+    metavar="3,30,300",
+    help="Measure with these numbers of peers of one group instead: that of the largest written count. "
+    "Not with --set or --plot.",
+)
+@click.option(
+    "--hard",
+    "folder",
+    type=click.Path(path_type=Path),
+    is_flag=False,
+    flag_value=HARD,
+    metavar="[FOLDER]",
+    help=f"Analyse a folder of scenes whose truth is known instead ({HARD} if not given). "
+    "Not with FILE, --set, --plot or --scale.",
+)
+@json_option
+def bench_command(
+    file: str | None,
+    settings: tuple[str, ...],
+    plot: Path | None,
+    counts: str | None,
+    folder: Path | None,
+    as_json: bool,
+) -> None:
+    """Measure speed against error, on this scene and this machine.
+
+    Every method of analysis and of simulation that can serve the scene is
+    timed, and its error found against a reference of fifty digits. A star
+    marks those that none is better than in both. FILE is a topology or a
+    compiled model. Fifty digits are had of scenes whose different peers move
+    in at most 64 states together (equal peers count once), and of the play of
+    at most 30 peers; beyond, times and bounds stand without a true error.
+
+    \b
+        apc bench --plot bench.png
+        apc bench --scale 3,30,300,3000
+        apc bench --hard tests/hard
+    """
+    if folder is not None:
+        if file or settings or plot or counts:
+            raise click.UsageError("--hard has scenes of its own: no FILE, --set, --plot or --scale with it")
+        _hard(folder, as_json)
+        return
+    from apc.inputs import find_input, open_scene
+
+    if counts is not None:
+        if settings or plot:
+            raise click.UsageError("--scale compiles anew: no --set or --plot with it")
+        _scale(Path(file) if file else find_input(compiled_too=False), counts, as_json)
+        return
+    from apc.benchmark.bench import bench
+    from apc.benchmark.report import bench_report
+
+    if plot is not None:
+        from apc.simulation.figures import check_format
+
+        check_target(plot)
+        check_format(plot)
+    system = open_scene(file, settings, {"--plot": plot})
+    found = bench(system)
+    _print(found.to_dict(), bench_report(found), as_json)
+    if plot is not None:
+        from apc.benchmark.figure import save_bench
+
+        save_bench(found, plot)
+        if not as_json:
+            tell(f"  {plot} is written")
+    if found.faults:
+        what = f"not everything came out right: {'; '.join(found.faults)}"
+        raise ApcError(Mistake("E922", Place(found.topology), what))
+
+
+def _hard(folder: Path, as_json: bool) -> None:
+    """Report the hard cases; a failure is exit code 1."""
+    from apc.benchmark.hard import run_hard_cases
+    from apc.benchmark.report import hard_report
+
+    found = run_hard_cases(folder)
+    _print(found.to_dict(), hard_report(found), as_json)
+    if found.failures:
+        names = ", ".join(case.name for case in found.failures)
+        raise ApcError(Mistake("E922", Place(str(folder)), f"not every hard case came out right: {names}"))
+
+
+def _scale(path: Path, counts: str, as_json: bool) -> None:
+    """Report what more peers cost."""
+    from apc.benchmark.report import scale_report
+    from apc.benchmark.scale import scale
+
+    if path.suffix == ".apc":
+        what = "is a compiled model, whose peers are counted"
+        raise ApcError(Mistake("E921", Place(str(path)), what, hint=f"apc bench {path.with_suffix('.yaml')}"))
+    try:
+        numbers = [plain_float(text) for text in counts.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(number.is_integer() for number in numbers):
+        expected = "numbers of peers like 3,30,300"
+        raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, counts[:80]))
+    found = scale(path, [int(number) for number in numbers])
+    _print(found.to_dict(), scale_report(found), as_json)
+
+
+def _print(document: dict[str, Any], text: str, as_json: bool) -> None:
+    if as_json:
+        print_document(_finite(document))
+    else:
+        tell(text)
+
+
+def _finite(value: Any) -> Any:
+    """Replace what JSON has no word for by null."""
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

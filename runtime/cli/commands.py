@@ -1,0 +1,260 @@
+"""The commands: what they take, what they call, what they print.
+
+Takes: words of a command line. Gives: text on stdout, messages on stderr.
+Guarantees: with --json, stdout holds one JSON document and nothing else.
+Does not: compute, or decide exit codes (see `__main__`).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import click
+
+from apc.cli.analyze import analyze_command
+from apc.cli.bench import bench_command
+from apc.cli.critical import critical_command
+from apc.cli.options import tell
+from apc.cli.region import region_command
+from apc.cli.simulate import simulate_command
+from apc.cli.sweep import sweep_command
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import write_file
+from apc.compiler.words import counted
+from apc.suffixes import check_suffix
+from apc.threads import start_single_threaded
+
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
+
+STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}\Z")
+SCHEMA_FILE = "topology.schema.json"
+FORMATS = {".txt": "text", ".json": "json", ".dot": "dot", ".gv": "dot", ".svg": "svg"}
+CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
+
+
+def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        from apc.distribution import program_version
+
+        tell(f"apc {program_version()}")
+        context.exit()
+
+
+@click.group(context_settings=CONTEXT)
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_version,
+    help="Show the version.",
+)
+def apc() -> None:
+    """Is a shared virtual object stable in the hands of all its users?
+
+    Describe users, masses, couplers and network links in a YAML file, a
+    topology. Compile it to equations and read the verdict:
+
+    \b
+        apc new            write a topology.yaml to start from
+        apc compile        check it and turn it into topology.apc
+        apc analyze        stable or not, by how much, in which modes
+        apc critical       the largest stable value of a parameter
+        apc simulate       what happens over time, as rows and a picture
+        apc region         where it is stable over two parameters: curves, areas
+        apc sweep          any of it at many values of some parameters
+        apc show           what the scene is made of, as text or a picture
+
+    Without FILE a command takes the only topology of the folder.
+    """
+
+
+apc.add_command(analyze_command)
+apc.add_command(bench_command)
+apc.add_command(critical_command)
+apc.add_command(simulate_command)
+apc.add_command(region_command)
+apc.add_command(sweep_command)
+
+
+@apc.command()
+@click.argument("name", default="topology")
+def new(name: str) -> None:
+    """Write NAME.yaml, a commented topology to start from.
+
+    NAME is "topology" if not given. A file that exists is never overwritten.
+    """
+    if not NAME.match(name):
+        what = "a scene's name"
+        expected = "letters, digits, - and _, 63 at most, with a letter or digit first"
+        raise ApcError(Mistake("E612", Place(name[:80] or "''"), what, expected, "this", "apc new my-scene"))
+    from importlib.resources import files
+
+    text = files("apc.models").joinpath("scenes/template.yaml").read_text(encoding="utf-8")
+    # Its first line names the schema beside the library; a schema beside the new topology serves as well.
+    _, _, text = text.partition("\n")
+    if Path(SCHEMA_FILE).is_file():
+        text = f"# yaml-language-server: $schema={SCHEMA_FILE}\n{text}"
+    path = Path(f"{name}.yaml")
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text.replace("topology: my-scene", f"topology: {name}"))
+    except FileExistsError:
+        raise ApcError(
+            Mistake(
+                "E613", Place(str(path)), "exists already and is left as it is", hint="apc new another-name"
+            )
+        ) from None
+    except OSError as error:
+        raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {error.strerror}")) from None
+    tell(f"{path} is written. Next: apc compile {path}")
+
+
+@apc.command()
+@click.argument("file", required=False)
+def check(file: str | None) -> None:
+    """Report every mistake in a topology; build nothing.
+
+    Exit code 0 if there is none, 1 otherwise.
+    """
+    from apc.compiler.pipeline import compile_topology
+    from apc.inputs import find_input
+
+    path = Path(file) if file else find_input(compiled_too=False)
+    system = compile_topology(path)
+    tell(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
+
+
+@apc.command("compile")
+@click.argument("file", required=False)
+@click.option(
+    "--until",
+    type=click.Choice(STAGES),
+    default="compiled",
+    metavar="STAGE",
+    help=f"Stop after a stage, print what it made and write nothing. One of {', '.join(STAGES[:-1])}.",
+)
+@click.option("--force", is_flag=True, help="Compile even if nothing has changed since it was compiled.")
+@click.option("--timings", is_flag=True, help="Print how long each stage took; implies --force.")
+def compile_command(file: str | None, until: str, force: bool, timings: bool) -> None:
+    """Turn a topology into equations: NAME.yaml to NAME.apc beside it.
+
+    Prints what the scene needed: states, delays and packets kept for a peer,
+    and how large the systems are that decide its stability. Compiles nothing
+    if the topology, every file it names and apc itself are as they were.
+    """
+    start_single_threaded()
+    from apc.inputs import check_model_name, compiled_already, find_input
+
+    path = Path(file) if file else find_input(compiled_too=False)
+    if until != "compiled":
+        from apc.compiler.pipeline import run_stages
+        from apc.compiler.view.listing import describe
+
+        tell(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
+        return
+    if path.suffix == ".apc":
+        raise ApcError(Mistake("E614", Place(str(path)), "is compiled already", hint=f"apc analyze {path}"))
+    if not (force or timings) and compiled_already(path):
+        tell(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
+        return
+    check_model_name(path)
+    _compile(path, timings=timings)
+
+
+def _compile(path: Path, *, timings: bool) -> None:
+    """Compile, check, save and report; with `timings`, how long each of it took."""
+    from apc.analysis.needs import needs
+    from apc.analysis.selfcheck import check_frame
+    from apc.answers.report import compile_report, timings_report
+    from apc.compiler.pipeline import each_stage
+    from apc.compiler.store import save
+
+    taken: list[tuple[str, float]] = []
+    last = time.perf_counter()
+
+    def lap(name: str) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        taken.append((name, now - last))
+        last = now
+
+    values = []
+    for stage, value in each_stage(path):
+        lap(stage)
+        values.append(value)
+    system = cast("CompiledSystem", values[-1])
+    difference = check_frame(system)
+    lap("self-check")
+    save(system, target := path.with_suffix(".apc"), sealed=True)
+    lap("save")
+    tell(compile_report(system, needs(system), target, difference))
+    if timings:
+        tell(timings_report(taken))
+
+
+@apc.command()
+@click.argument("file", required=False)
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["text", "json", "dot", "svg"]),
+    help="text: graph, equations, schedule. json: the same as one document. dot: the graph for Graphviz. "
+    "svg: the graph as a picture. Taken from --out if not given, else text.",
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal.")
+def show(file: str | None, format_: str | None, out: Path | None) -> None:
+    """Show what a scene is made of: its graph, equations and schedule.
+
+    The graph has the parts of one peer and how they are joined, and the
+    peers and the links between them. The schedule says what ticks when, how
+    long what it computes is held, and which packets are on their way.
+    """
+    from apc.api import show as shown
+    from apc.inputs import check_topology_outputs, find_input
+
+    wanted = format_ or "text"
+    if out is not None and (out.suffix or not format_):
+        check_suffix(out, [suffix for suffix in FORMATS if format_ in (None, FORMATS[suffix])], "--out")
+        wanted = FORMATS[out.suffix.lower()]
+    path = Path(file) if file else find_input(compiled_too=False)
+    check_topology_outputs(path, {"--out": out})
+    _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
+
+
+@apc.command()
+@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal.")
+def schema(out: Path | None) -> None:
+    """Print the JSON Schema of topologies, for editors.
+
+    An editor that knows YAML schemas completes and checks a topology whose
+    first line is, with the schema beside it as topology.schema.json,
+
+    \b
+        # yaml-language-server: $schema=topology.schema.json
+
+    `apc new` writes that line where the schema is.
+    """
+    from apc.api import schema as generated
+
+    if out is not None:
+        check_suffix(out, (".json",), "--out")
+    _print_or_write(json.dumps(generated(), ensure_ascii=False, indent=1), out)
+
+
+def _print_or_write(text: str, out: Path | None) -> None:
+    if out is None:
+        tell(text)
+        return
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(f"{text}\n".encode())
+
+    write_file(out, write)
+    tell(f"{out} is written")

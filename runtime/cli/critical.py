@@ -1,0 +1,71 @@
+"""The command `apc critical`.
+
+Takes: words of a command line. Gives: text on stdout.
+Guarantees: with --json, stdout holds one JSON document and nothing else; how far the search is goes to a
+terminal only.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from apc.cli.options import json_option, print_result, set_option
+from apc.cli.progress import status_line
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.threads import start_single_threaded
+
+# What the name of a scene ends in.
+SCENES = (".yaml", ".yml", ".apc")
+
+
+@click.command("critical")
+@click.argument("path")
+@click.argument("file", required=False)
+@set_option
+@click.option("--upper", metavar='"VALUE UNIT"', help="Look no further up than this.")
+@click.option("--lower", metavar='"VALUE UNIT"', help="Look no further down than this.")
+@json_option
+def critical_command(
+    path: str,
+    file: str | None,
+    settings: tuple[str, ...],
+    upper: str | None,
+    lower: str | None,
+    as_json: bool,
+) -> None:
+    """Find the largest stable value of a parameter, with its error.
+
+    PATH names a stiffness, damping, mass or delay, of one group or of all:
+    coordination.stiffness, left.device.mass, lan.delay. Every value at which
+    the scene becomes stable or unstable is found, down to a cell size that
+    is printed, and on which side of it the scene is stable. FILE is a
+    topology or a compiled model.
+    """
+    start_single_threaded()
+    from apc.inputs import open_scene
+    from apc.vary.critical import critical
+
+    _check_order(path, file)
+    system = open_scene(file, settings)
+    with status_line() as told:
+        found = critical(system, path, lower=lower, upper=upper, told=told)
+    print_result(found, as_json=as_json)
+
+
+def _check_order(path: str, file: str | None) -> None:
+    """Refuse a scene where the parameter belongs: the two were exchanged, or only one was given."""
+    if Path(path).suffix.lower() not in SCENES:
+        return
+    got, name = f"{path}, then {file}", file
+    if file is None or Path(file).suffix.lower() in SCENES:  # then a name of the scene's own is shown
+        from apc.inputs import open_scene
+        from apc.vary.margins import coupler_parameters
+
+        got = got if file else f"{path} alone"
+        name = next((one.label for one in coupler_parameters(open_scene(path, ()))), None)
+    hint = f"apc critical {name} {path}" if name else ""
+    wanted = "a parameter or delay, then the scene"
+    raise ApcError(Mistake("E841", Place("apc critical"), "the command", wanted, got, hint))

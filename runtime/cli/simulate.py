@@ -1,0 +1,258 @@
+"""The command `simulate`: what it takes, what it prints, how it is interrupted.
+
+Takes: words of a command line. Gives: the click command `simulate_command`.
+Guarantees: with --json, stdout holds one JSON document and nothing else; progress goes to a terminal only;
+Ctrl-C ends the run and keeps what is done.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from apc.cli.options import WholeNumber, json_option, print_document, print_result, set_option, tell
+from apc.cli.progress import progress_bar
+from apc.compiler.errors import ApcError
+from apc.compiler.files import partial_name
+from apc.suffixes import check_suffix
+
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
+    from apc.simulation.settings import Settings
+    from apc.simulation.simulation import Simulation
+    from apc.simulation.summary import Summary
+    from apc.simulation.trajectory import Sink
+
+
+@click.command("simulate")
+@click.argument("file", required=False)
+@click.option(
+    "--duration",
+    metavar='"TIME"',
+    help='How long, such as "2 s"; that of the scene\'s experiment if not given.',
+)
+@set_option
+@click.option(
+    "--signals",
+    multiple=True,
+    metavar="PATTERN",
+    help="Record only what fits, such as cube.x, 'left[2].*' or '*.v'. May be repeated.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the rows to this file: .csv, .parquet, .mat or .npz.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Draw them, a panel a quantity: .png, .svg or .pdf.",
+)
+@click.option(
+    "--still",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf.",
+)
+@json_option
+@click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
+@click.option(
+    "--seed",
+    type=WholeNumber(0, 2**63 - 1),
+    metavar="NUMBER",
+    help="Of packets that get lost or come late; the experiment's if not given.",
+)
+@click.option(
+    "--runs",
+    type=WholeNumber(1, 10_000_000),
+    metavar="NUMBER",
+    help="Play it so often, with other packets each time, and say what that amounts to.",
+)
+@click.option(
+    "--jobs",
+    type=WholeNumber(1, 1024),
+    default=1,
+    show_default=True,
+    metavar="NUMBER",
+    help="Processes that share the runs.",
+)
+@click.option(
+    "--method",
+    metavar="METHOD",
+    help="exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL; exact where linear and CVODES elsewhere if "
+    "not given.",
+)
+@click.option("--error", is_flag=True, help="Play it a second time, more closely, and say how far off it is.")
+def simulate_command(
+    file: str | None,
+    duration: str | None,
+    settings: tuple[str, ...],
+    signals: tuple[str, ...],
+    out: Path | None,
+    plot: Path | None,
+    still: Path | None,
+    as_json: bool,
+    no_jit: bool,
+    seed: int | None,
+    runs: int | None,
+    jobs: int,
+    method: str | None,
+    error: bool,
+) -> None:
+    """Play a scene in time.
+
+    FILE is a topology or a compiled model. Devices move by their exact
+    transition from event to event, forces are computed at their ticks,
+    packets arrive when they are due; there is no step size. What is not
+    linear between the ticks is integrated by CVODES. A row is written for
+    every tick of the fastest clock, with the values before the tick.
+
+    \b
+        apc simulate --duration "3 s" --plot run.png
+        apc simulate --signals cube.x --out run.csv
+        apc simulate --runs 1000 --seed 1 --jobs 4
+        apc simulate --method semi-implicit:1ms --error
+    """
+    from apc.inputs import open_scene
+    from apc.simulation.length import check_length
+    from apc.simulation.methods import DEFAULT, parse_method
+    from apc.simulation.settings import Settings
+    from apc.simulation.trajectory import duration_of, parse_duration
+
+    if runs is not None and (signals or out or plot or error):
+        raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
+    chosen = parse_method(method) if method is not None else DEFAULT
+    asked = parse_duration(duration) if duration is not None else None
+    _check_files(out, plot, still)
+    system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still})
+    seconds = duration_of(system, asked)
+    check_length(system, seconds, runs=runs or 1)
+    if still is not None:
+        from apc.simulation.still import save_still
+
+        save_still(system, still)
+    how = Settings(seconds, chosen, seed, jit=not no_jit)
+    if runs is not None:
+        _play_many(system, how, runs, jobs, as_json=as_json)
+    else:
+        _play_one(system, how, _Kept(signals, out, plot, still, error), as_json=as_json)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """What is kept of a run: rows of which signals, a picture of them, and its error; `still` is drawn."""
+
+    signals: tuple[str, ...]
+    out: Path | None
+    plot: Path | None
+    still: Path | None
+    error: bool
+
+
+def _check_files(out: Path | None, plot: Path | None, still: Path | None) -> None:
+    """Refuse a file that can't be written, or a picture that can't be drawn, before anything is computed."""
+    if out is not None:
+        from apc.simulation.recording import SUFFIXES
+
+        check_suffix(out, SUFFIXES, "--out")
+    for path, option in ((plot, "--plot"), (still, "--still")):
+        if path is not None:
+            from apc.simulation.figures import check_format
+
+            check_format(path, option)
+
+
+def _play_many(system: CompiledSystem, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
+    """Play a scene many times and print what that amounts to."""
+    from apc.simulation.ensemble import play_many
+
+    with progress_bar("simulate", "runs") as show:
+        many = play_many(
+            system,
+            how,
+            runs=runs,
+            jobs=jobs,
+            progress=lambda done: show(done, runs),
+        )
+    print_result(many, as_json=as_json)
+    if many.interrupted:
+        raise click.Abort
+
+
+def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bool) -> None:
+    """Play a scene once, keep what is wanted of it, and print what it amounts to."""
+    from apc.simulation.accuracy import compare_with
+    from apc.simulation.simulation import prepare
+    from apc.simulation.trajectory import (
+        Keeper,
+        provenance_of,
+        result_document,
+        result_text,
+        trajectory_of,
+    )
+
+    simulation = prepare(system, how, signals=kept.signals)
+    keeper = Keeper(simulation) if kept.plot is not None else None
+    comparison = compare_with(simulation, signals=kept.signals) if kept.error else None
+    sinks = [sink for sink in (keeper, comparison) if sink is not None]
+    summary, interrupted, out = _play_into(simulation, kept.out, sinks)
+    estimate = comparison.estimate() if comparison is not None else None
+    plot = kept.plot
+    if plot is not None and keeper is not None:
+        from apc.simulation.figures import save
+
+        plot = partial_name(plot) if interrupted else plot
+        save(trajectory_of(simulation, keeper, summary, interrupted), plot)
+    provenance = provenance_of(simulation)
+    if as_json:
+        print_document(result_document(system.name, summary, provenance, interrupted, estimate))
+    else:
+        tell(result_text(system.name, summary, provenance, estimate))
+        for written in (out, plot, kept.still):
+            if written is not None:
+                tell(f"  {written} is written")
+    if interrupted:
+        until = f"{summary.end:g} s of {float(how.duration):g} s"
+        tell(f"stopped at {until}; what was done is kept", err=True)
+        raise click.Abort
+
+
+def _play_into(
+    simulation: Simulation, out: Path | None, sinks: Sequence[Sink]
+) -> tuple[Summary, bool, Path | None]:
+    """Play a simulation into sinks and a file, whose name is returned with what `play` returns.
+
+    What was done is in the file even if the run can't go on.
+    """
+    from apc.simulation.length import size_note
+    from apc.simulation.recording import open_recording
+    from apc.simulation.trajectory import play
+
+    recording = open_recording(out, simulation) if out is not None else None
+    if out is not None and (note := size_note(simulation, decimal=out.suffix.lower() == ".csv")):
+        tell(f"{out} {note}", err=True)
+    total = float(simulation.settings.duration)
+    try:
+        with progress_bar("simulate", "s") as show:
+            every = sinks if recording is None else [recording, *sinks]
+            summary, interrupted = play(simulation, every, progress=lambda done: show(done, total))
+        if recording is not None:
+            recording.close(partial=interrupted)
+    except ApcError:  # the run can't go on: what was done is kept
+        if recording is not None:
+            recording.close(partial=True)
+            if recording.path != out:
+                tell(f"{recording.path} holds what was done; {out} is as it was", err=True)
+        raise
+    except BaseException:
+        if recording is not None:
+            recording.discard()
+        raise
+    return summary, interrupted, recording.path if recording is not None else None

@@ -1,0 +1,140 @@
+"""The command `sweep`: what it takes, what it prints, how it is interrupted.
+
+Takes: words of a command line. Gives: the click command `sweep_command`.
+Guarantees: with --json, stdout holds one JSON document and nothing else; progress goes to a terminal only;
+an interruption ends with what is kept, and says so.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from apc.cli.options import WholeNumber, json_option, print_result, set_option, tell
+from apc.cli.progress import Bar, progress_bar
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.given import given
+
+
+@click.command("sweep")
+@click.argument("file", required=False)
+@click.option(
+    "--over",
+    multiple=True,
+    required=True,
+    metavar="PATH=VALUES",
+    help="Vary a parameter: PATH='LOW:HIGH', 'LOW:HIGH:COUNT', 'LOW:HIGH:COUNT:log' or 'V1,V2,V3', with "
+    "units. May be repeated: every combination is computed, the last parameter turning fastest.",
+)
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the rows to this file, .parquet or .csv.",
+)
+@click.option(
+    "--of",
+    default="analyze",
+    show_default=True,
+    metavar="WHAT",
+    help="What to compute at each point; see below.",
+)
+@set_option
+@click.option("--jobs", type=WholeNumber(min=1), help="Processes to compute with; all cores by default.")
+@click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Compute on a running Dask cluster instead: its scheduler's address, tcp://HOST:8786.",
+)
+@click.option(
+    "--patience",
+    metavar='"TIME"',
+    help='End when nothing has come from processes or cluster for so long, such as "10 min"; wait for ever '
+    "if not given.",
+)
+@json_option
+def sweep_command(
+    file: str | None,
+    over: tuple[str, ...],
+    out: Path,
+    of: str,
+    settings: tuple[str, ...],
+    jobs: int | None,
+    cluster: str | None,
+    patience: str | None,
+    as_json: bool,
+) -> None:
+    """Compute a result at every combination of parameter values.
+
+    FILE is a topology or a compiled model. What is finished is kept beside
+    the target as it comes; a sweep that was stopped, however it was, is taken
+    up by the same command.
+
+    \b
+        apc sweep --over contact.stiffness="100 N/m:3000 N/m:30" \\
+                  --over links.lan.delay="0,8 ms" --out results.csv
+
+    WHAT is "analyze" (verdict, spectral radius per frame with its error,
+    rigid modes, frequency and damping of the leading mode) or
+    "critical:PATH" (the value of another parameter at which the verdict
+    changes, with its error).
+    """
+    from apc.inputs import open_scene
+    from apc.sweeps.sweep import Patience, sweep
+
+    waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))
+    values = _values(over)
+    system = open_scene(file, settings, {"--out": out})
+    with _progress(out) as progress:
+        result = sweep(
+            system, values, of=of, out=out, jobs=jobs, cluster=cluster, progress=progress, patience=waiting
+        )
+    print_result(result, as_json=as_json)
+
+
+def _seconds(patience: str | None) -> float | None:
+    if patience is None:
+        return None
+    found = float(given("--patience", patience, what="patience", unit="s"))
+    if found <= 0:
+        form = '--patience "10 min"'
+        raise ApcError(Mistake("E889", Place("sweep"), "--patience", "more than 0 s", patience[:80], form))
+    return found
+
+
+def _values(over: tuple[str, ...]) -> dict[str, str]:
+    """Return the values of each parameter by its name as written."""
+    form = "--over contact.stiffness='100 N/m:3000 N/m:30'"
+    found: dict[str, str] = {}
+    for text in over:
+        name, equals, values = (part.strip() for part in text.partition("="))
+        if not (equals and name and values):
+            raise ApcError(Mistake("E880", Place("sweep"), "--over", "PATH=VALUES", text[:80], form))
+        if name in found:
+            raise ApcError(Mistake("E883", Place("sweep"), f"{name[:80]} is swept twice"))
+        found[name] = values
+    return found
+
+
+@contextmanager
+def _progress(out: Path) -> Iterator[Bar]:
+    """Give a function that shows progress on a terminal; say what is kept if the body doesn't end well."""
+    state = {"done": 0.0, "of": 0.0}
+    try:
+        with progress_bar("sweep", "points", after=0.0) as show:
+
+            def progress(done: float, points: float) -> None:
+                state.update(done=done, of=points)
+                show(done, points)
+
+            yield progress
+    except BaseException:
+        if state["done"] > 0:
+            kept = f"{state['done']:,.0f} of {state['of']:,.0f} points are kept in {out}.parts"
+            tell(f"{kept}; the same command takes up from there", err=True)
+        raise

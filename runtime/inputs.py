@@ -1,0 +1,236 @@
+"""Which file a command means, and whether a compiled model still matches what it was made from.
+
+Takes: paths. Gives: the topology or compiled model to work on; `check_outputs`.
+Guarantees: a compiled model is used only while its topology, every text the topology names and the program
+are those it was made from, by their content; a model that has no topology beside it speaks for itself; what a
+topology says is never taken from a model that somebody else wrote; nothing is written where a command reads.
+Does not: compile.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from apc.compiler.cache import DAMAGE, LARGEST, Archive, Record, changed, read_archive, record_of
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import RefusedError, check_file, check_target, is_bounded, read_file, same_file
+
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
+
+YAML_SUFFIXES = (".yaml", ".yml")
+LIBRARY_SUFFIX = ".yaml"  # of the files in a folder of components
+_TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
+
+
+def find_input(*, compiled_too: bool) -> Path:
+    """Return the only topology of the working folder, or failing that, its only compiled model.
+
+    Parameters
+    ----------
+    compiled_too
+        Whether a compiled model serves.
+
+    Raises
+    ------
+    ApcError
+        There is none, or there are several.
+    """
+    here = Path()
+    topologies = sorted(path for path in here.glob("*.yaml") if _is_topology(path))
+    models = sorted(here.glob("*.apc")) if compiled_too else []
+    orphans = [path for path in models if path.with_suffix(".yaml") not in topologies]
+    candidates = [*topologies, *orphans]
+    if len(candidates) == 1:
+        return candidates[0]
+    place = Place("this folder")
+    if not candidates:
+        what = "holds no topology" + (" and no compiled model" if compiled_too else "")
+        raise ApcError(
+            Mistake("E610", place, what, hint="apc new  (it writes a topology.yaml to start from)")
+        )
+    listed = ", ".join(str(path) for path in candidates[:10]) + (", …" if len(candidates) > 10 else "")
+    raise ApcError(
+        Mistake("E611", place, f"holds {len(candidates)} scenes: {listed}", hint=f"apc … {candidates[0]}")
+    )
+
+
+def _is_topology(path: Path) -> bool:
+    from apc.compiler.source.source import (
+        MAX_BYTES,  # with a YAML parser, which a compiled model does without
+    )
+
+    try:
+        return _TOPOLOGY.search(read_file(path, MAX_BYTES)) is not None
+    except RefusedError as refused:
+        return refused.why == "large"  # which is told of when it is read
+
+
+def load_fresh(path: Path) -> CompiledSystem:
+    """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
+    from apc.compiler.store import load_with_record
+
+    system, record = load_with_record(path)
+    now = _changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
+    if now:
+        what = f"is stale: {now} has changed since it was compiled"
+        hint = f"apc compile {path.with_name(record.topology)}"
+        raise ApcError(Mistake("E605", Place(str(path)), what, hint=hint))
+    return system
+
+
+def load_or_compile(path: Path) -> CompiledSystem:
+    """Return the compiled model of a file.
+
+    A compiled model is read. A topology is compiled in memory and checks itself, unless the model beside it
+    is what compiling it now would give.
+
+    Raises
+    ------
+    ApcError
+        The file is at fault.
+    """
+    from apc.compiler.store import unpacked
+
+    if path.suffix == ".apc":
+        return load_fresh(path)
+    if (archive := compiled_already(path)) is not None:
+        try:
+            return unpacked(archive, path.with_suffix(".apc"))
+        except (ApcError, *DAMAGE):
+            pass  # it is only a saving of time; the topology itself decides
+    from apc.analysis.selfcheck import check_frame
+    from apc.compiler.pipeline import compile_topology
+
+    system = compile_topology(path)
+    check_frame(system)
+    return system
+
+
+def open_scene(
+    file: str | None, settings: Sequence[str], outputs: Mapping[str, Path | None] | None = None
+) -> CompiledSystem:
+    """Return the compiled model that a command means.
+
+    Parameters
+    ----------
+    file
+        A topology or compiled model; the only one of the working folder if not given.
+    settings
+        Parameters to change, each `NAME=QUANTITY`.
+    outputs
+        What the command will write, by the option that says so: see `check_outputs`.
+
+    Raises
+    ------
+    ApcError
+        As `find_input`, `load_or_compile`, `check_outputs`, `overrides.parse_override` and `overrides.apply`.
+    """
+    path = Path(file) if file else find_input(compiled_too=True)
+    system = load_or_compile(path)
+    check_outputs(path, (name for name, _ in system.origin.texts), outputs or {})
+    if not settings:
+        return system
+    from apc.frame.overrides import apply, parse_override
+
+    return apply(system, [parse_override(system, text) for text in settings])
+
+
+def check_model_name(topology: Path) -> None:
+    """Refuse a topology beside another whose compiled model would have the same name: ApcError E617."""
+    for suffix in YAML_SUFFIXES:
+        other = topology.parent / f"{topology.stem}{suffix}"
+        if other.name != topology.name and not same_file(other, topology) and _is_topology(other):
+            what = f"and {other.name} would both be compiled to {topology.stem}.apc"
+            raise ApcError(Mistake("E617", Place(str(topology)), what, hint=_renaming(topology)))
+
+
+def _renaming(topology: Path) -> str:
+    return f"mv {topology} {topology.with_name(f'{topology.stem}-2{topology.suffix}')}"
+
+
+def check_topology_outputs(path: Path, outputs: Mapping[str, Path | None]) -> None:
+    """As `check_outputs`, for a command that reads a topology and not its model."""
+    given = [output for output in outputs.values() if output is not None]
+    for output in given:
+        check_target(output)
+    if any(output.exists() for output in given):
+        from apc.compiler.pipeline import run_stages
+        from apc.compiler.scene.scene import Scene, library_folders
+        from apc.compiler.source.source import read_source
+
+        scene = run_stages(path, until="scene")
+        assert isinstance(scene, Scene)
+        folders = (str(folder.resolve()) for folder in library_folders(read_source(path)))
+        check_outputs(path, (*(name for name, _ in scene.texts), *folders), outputs)
+
+
+def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path | None]) -> None:
+    """Refuse to write to a file that the command reads, or to one file twice.
+
+    Parameters
+    ----------
+    path
+        The topology or compiled model.
+    texts
+        What it names, from its folder: files, and folders of components.
+    outputs
+        What will be written, by the option that says so; None is nothing.
+
+    Raises
+    ------
+    ApcError
+        E601 one of them can't be written; E616 one is read, or given twice.
+    """
+    named = [path, path.with_suffix(".yaml"), *(path.parent / text for text in texts)]
+    given = [(option, output) for option, output in outputs.items() if output is not None]
+    for place, (option, output) in enumerate(given):
+        check_target(output)
+        hint = f"{option} {output.with_name(f'{output.stem}-result{output.suffix}')}"
+        for other, before in given[:place]:
+            if output.absolute() == before.absolute() or same_file(output, before):
+                what = f"is given to {other} and to {option}: the second would replace the first"
+                raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
+        if not output.is_file():
+            continue
+        if any(same_file(output, one) or _is_below(output, one) for one in named):
+            what = f"is read by this command: {option} would replace it"
+            raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
+
+
+def _is_below(file: Path, folder: Path) -> bool:
+    """Return whether a file is one that a folder of components is read for."""
+    return (
+        file.suffix == LIBRARY_SUFFIX and folder.is_dir() and file.resolve().is_relative_to(folder.resolve())
+    )
+
+
+def compiled_already(topology: Path) -> Archive | None:
+    """Return the compiled model beside a topology if it is what compiling it now would give.
+
+    That it is, only this user's own seal says: anybody can write what a file says of itself.
+    """
+    try:
+        check_file(topology, LARGEST)
+        check_file(model := topology.with_suffix(".apc"), LARGEST)
+        archive = read_archive(model)
+        if not archive.sealed:
+            return None
+        record = record_of(archive)
+        fresh = record.topology == topology.name and not _changed(record, topology.parent)
+    except (RefusedError, OSError, *DAMAGE):
+        return None
+    return archive if fresh else None
+
+
+def _changed(record: Record, folder: Path) -> str:
+    """Return the name of the first text that is different now, or is no file or folder that would be read."""
+    for name, _ in record.texts:
+        path = folder / name
+        if os.path.lexists(path) and not is_bounded(path, LARGEST, LIBRARY_SUFFIX):
+            return name.removeprefix("./")
+    return changed(record, folder)

@@ -1,0 +1,81 @@
+"""The axes of a stable region: two parameters of a scene, and their ranges.
+
+Takes: a `CompiledSystem` and texts such as `contact.stiffness=10 N/m:3000 N/m`.
+Gives: `parse_axes`; `PLACE`.
+Guarantees: a parameter that can't be an axis is refused, and said why.
+Does not: analyse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+from apc.analysis.ranges import Range
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.names import unit_of
+from apc.sweeps.grid import parse_axis
+
+PLACE = Place("region")
+
+_FORM = "contact.stiffness=10 N/m:3000 N/m"
+
+
+def parse_axes(
+    system: CompiledSystem, x: str | None, y: str | None, *, scale: Fraction = Fraction(1)
+) -> tuple[Range, Range]:
+    """Read the two axes of a region: `PATH=LOW:HIGH` each, or the scene's own where one is left out.
+
+    Parameters
+    ----------
+    system
+        The scene.
+    x, y
+        `contact.stiffness=10 N/m:3000 N/m`, or None for that of `studies: region:`.
+    scale
+        What the range of y is divided by.
+
+    Raises
+    ------
+    ApcError
+        E901 not of that form, or missing; E902 the same parameter twice; E903 a parameter that can't be an
+        axis; E622, E881, E204, E624 as `grid.parse_axis`.
+    """
+    found = []
+    for letter, text, place in (("x", x, 0), ("y", y, 1)):
+        if text is None and len(system.region) == 2:
+            own = system.region[place]
+            unit = unit_of(system, own.parameter)
+            text = f"{own.parameter}={float(own.low)!r} {unit}:{float(own.high)!r} {unit}"
+        if text is None:
+            what = f"the scene has no studies: region:, so that --{letter} must be given"
+            raise ApcError(Mistake("E901", PLACE, what, hint=f'--{letter} "{_FORM}"'))
+        name, equals, span = (part.strip() for part in text.partition("="))
+        if not (equals and name and span.count(":") == 1):
+            hint = f'--{letter} "{_FORM}"'
+            raise ApcError(
+                Mistake("E901", PLACE, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", hint)
+            )
+        try:
+            axis = parse_axis(system, name, f"{span}:2")
+        except ApcError as error:
+            mistakes = [replace(one, place=Place(f"--{letter}")) for one in error.mistakes]
+            raise ApcError(mistakes) from None
+        _refuse_period(system, axis.name, axis.label)
+        found.append(Range(axis.name, axis.group, axis.unit, axis.values[0], axis.values[-1]))
+    first, second = found
+    if first.name == second.name and (first.group == second.group or None in (first.group, second.group)):
+        what = f"{first.label} is on both axes; a region has two parameters"
+        if first.group != second.group:
+            what = f"{first.label} and {second.label} are not apart: without a group it is that of all groups"
+        raise ApcError(Mistake("E902", PLACE, what))
+    return first, replace(second, low=second.low / scale, high=second.high / scale)
+
+
+def _refuse_period(system: CompiledSystem, name: str, label: str) -> None:
+    """Raise E903 for what makes another frame at every value: one would see arithmetic, not physics."""
+    for clock in system.clocks:
+        if name in (clock.period, clock.phase):
+            what = f"{label} can't be an axis: at each value all clocks stand as before after another time"
+            raise ApcError(Mistake("E903", PLACE, what, hint='--vary "haptic.period=1 ms, 2 ms"'))

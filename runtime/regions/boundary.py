@@ -1,0 +1,377 @@
+"""Boundary curves of a stable region in the unit square, to a stated accuracy.
+
+Takes: a `Family` of closed systems and the `Survey` of its cells.
+Gives: `Arc`, `trace`.
+Guarantees: every point lies on the boundary to rounding; between its points a curve is the cubic Hermite
+interpolant through points and tangents, and that has been measured against the true boundary in the middle
+of every interval. Where one mode takes over from another the curve has a corner, solved for.
+Does not: find pieces the survey has not seen.
+
+On the boundary log|λ| = 0 for the deciding eigenvalue; its gradient gives Newton's step
+
+    P ← P − log|λ| ∇log|λ| / |∇log|λ||²
+
+and the tangent (−∂_y, ∂_x) log|λ|, which has the stable side on its left. A corner is where two eigenvalues
+have log|λ_a| = log|λ_b| = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.frame.discretize import UNIT
+from apc.regions.boundary_points import MOST_STEPS, SHORT, clear, cross, just_inside, moved, polish
+from apc.regions.cells import Survey
+from apc.regions.curves import between, fill, off_an_arc, stencils, through_four
+from apc.regions.eigenpairs import Family, Pairs, follow, join, log_magnitudes, value_errors
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+Integers = NDArray[np.int64]
+
+# Halvings of the intervals between the first points of a curve. Each makes the interpolant 16 times better.
+MOST_HALVINGS = 12
+
+# The middle of an interval, put in, makes the cubic through two points 16 times better than it was measured
+# there, the polynomial through four some hundred times once it converges; little of that is counted on.
+GAIN_TWO = 8.0
+GAIN_FOUR = 10.0
+
+# Points nearer to each other than this are one.
+COINCIDENT = 1e-11
+
+# A middle farther from where it is expected, in lengths of the interval, is not on the same piece.
+ASTRAY = 0.25
+
+# Two ends of an interval are on one branch if the eigenvalue's slopes explain its difference to this share.
+EXPLAINED = 0.25
+
+# The share of the tolerance that interpolation may take.
+FILLED = 0.75
+
+# Errors are relative to a coordinate, or to this share of its range where the coordinate is smaller.
+LEAST_COORDINATE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Arc:
+    """A piece of the boundary along which one mode decides, stable side on the left.
+
+    `points` and unit `tangents` (k, 2) are of the unit square; `curves.between` goes from each to the next.
+    `errors` (k − 1,) are its distances from the boundary. `knots` (m, 2) are the points that were solved for,
+    `values` (m,) the eigenvalues there, `system` is the closed system they belong to, and `rounding` bounds
+    how far rounding moves them. `chain` says which chain of the survey the arc is on. An arc that is not
+    `smooth` has steps, and straight lines between its points.
+    """
+
+    points: Floats
+    tangents: Floats
+    errors: Floats
+    knots: Floats
+    values: Complexes
+    system: int
+    rounding: float
+    chain: int
+    smooth: bool = True
+
+    @property
+    def closed(self) -> bool:
+        """Whether the arc comes back to its own first point."""
+        return bool(len(self.points) > 2 and np.array_equal(self.points[0], self.points[-1]))
+
+
+class _Knots:
+    """Points on the boundary, each with the eigenvalue that decides there; `key` orders those of a chain.
+
+    `error` is that of the interval from a knot to the next; `last` says that an arc ends with the knot.
+    """
+
+    def __init__(self, points: Floats, pairs: Pairs, chain: Integers, key: Floats) -> None:
+        self.points, self.pairs, self.chain, self.key = points, pairs, chain, key
+        self.error = np.zeros(len(key))
+        self.last = np.zeros(len(key), dtype=bool)
+
+    def add(self, points: Floats, pairs: Pairs, after: Integers, key: Floats) -> Integers:
+        """Add knots on the chains of the knots `after`; return their numbers."""
+        before = len(self.key)
+        self.points = np.concatenate([self.points, points])
+        self.pairs = join([self.pairs, pairs])
+        self.chain = np.concatenate([self.chain, self.chain[after]])
+        self.key = np.concatenate([self.key, key])
+        self.error = np.concatenate([self.error, np.zeros(len(key))])
+        self.last = np.concatenate([self.last, np.zeros(len(key), dtype=bool)])
+        return np.arange(before, len(self.key))
+
+    def tangents(self, knots: Integers) -> Floats:
+        """Return the unit tangents (k, 2) at some knots."""
+        return _tangents(self.pairs.gradient[knots])
+
+
+def trace(family: Family, found: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
+    """Follow the boundary through all crossings of a survey.
+
+    Parameters
+    ----------
+    family
+        The closed systems over the unit square.
+    found
+        Where the boundary crosses the cells' edges, and in what order.
+    tolerance
+        Largest distance between curves and boundary, relative to one of the two coordinates: that in which
+        the distance makes the smaller difference.
+    offset
+        What to add to unit coordinates to have them count from zero (2,): lower end over width of the range.
+    """
+    if not found.crossings:
+        return ()
+    points, pairs = cross(
+        family,
+        np.array([one.stable for one in found.crossings]),
+        np.array([one.unstable for one in found.crossings]),
+        np.array([one.growth for one in found.crossings]),
+    )
+    members: list[int] = []
+    chain: list[int] = []
+    key: list[int] = []
+    for number, (listed, closed) in enumerate(zip(found.chains, found.closed, strict=True)):
+        whole = [*listed, listed[0]] if closed else list(listed)
+        members += whole
+        chain += [number] * len(whole)
+        key += range(len(whole))
+    taken = np.array(members)
+    knots = _Knots(points[taken], pairs.at(taken), np.array(chain), np.array(key, np.float64))
+    first = np.flatnonzero(knots.chain[1:] == knots.chain[:-1])
+    intervals = np.stack([first, first + 1], axis=1)
+    for halving in range(MOST_HALVINGS):
+        intervals = _apart(knots, intervals)
+        if not len(intervals):
+            break
+        intervals = _halve(family, knots, intervals, tolerance, offset, guarded=halving == 0)
+    for a, b in intervals.tolist():  # given up: the chord is all that is known
+        knots.error[a] = max(knots.error[a], float(np.linalg.norm(knots.points[b] - knots.points[a])))
+    return _arcs(family, knots, found.closed, tolerance, offset)
+
+
+def _apart(knots: _Knots, intervals: Integers) -> Integers:
+    """Return the intervals longer than nothing; where two modes meet in one of no length, an arc ends."""
+    a, b = intervals.T
+    apart = np.linalg.norm(knots.points[b] - knots.points[a], axis=1) > COINCIDENT
+    meeting = intervals[~apart]
+    knots.last[meeting[~_on_one_branch(knots, meeting), 0]] = True
+    left: Integers = intervals[apart]
+    return left
+
+
+def _tangents(gradient: Floats) -> Floats:
+    """Return unit tangents (k, 2) with the side towards which log|λ| falls on their left."""
+    turned = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1)
+    length = np.linalg.norm(turned, axis=1, keepdims=True)
+    unit: Floats = turned / np.maximum(length, np.finfo(np.float64).tiny)
+    return unit
+
+
+def _halve(
+    family: Family, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats, *, guarded: bool
+) -> Integers:
+    """Put a knot into every interval, or a corner; return the intervals that are not good enough yet.
+
+    `guarded` asks whether another eigenvalue has left the unit circle at the new knots.
+    """
+    same = _on_one_branch(knots, intervals)
+    lost = intervals[~same]
+    left = []
+    if len(lost):
+        cornered, lost = _corners(family, knots, lost)
+        left.append(cornered)
+    a, b = intervals[same].T
+    if len(a):
+        chord = knots.points[b] - knots.points[a]
+        length = np.linalg.norm(chord, axis=1)
+        expected, unseen, gain = _expected(knots, a, b)
+        place, pairs = polish(family, expected, _halfway(knots, a, b, chord))
+        off = np.linalg.norm(place - expected, axis=1)
+        good = off <= ASTRAY * length
+        if guarded:
+            good &= clear(family, place, pairs)
+        lost = np.concatenate([lost, np.stack([a[~good], b[~good]], axis=1)])
+        a, b, place, pairs = a[good], b[good], place[good], pairs.at(good)
+        off = off[good] / gain[good] + unseen[good]
+        middle = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
+        knots.error[a] = knots.error[middle] = off
+        fine = off <= FILLED / 2 * tolerance * relative_to(place, pairs.gradient, offset)
+        left += [np.stack([a, middle], axis=1)[~fine], np.stack([middle, b], axis=1)[~fine]]
+    if len(lost):
+        left.append(_search(family, knots, lost))
+    return np.concatenate(left) if left else intervals[:0]
+
+
+def _expected(knots: _Knots, a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
+    """Return where the middles of intervals are expected (k, 2), what their misses do not show (k,), and how
+    much better the middle makes the interpolant (k,).
+
+    By four knots of the same arc where there are as many, else by two.
+    """
+    points, tangents = knots.points, knots.tangents(np.arange(len(knots.key)))
+    plain = between(points[a], points[b], tangents[a], tangents[b], 0.5)
+    unseen = off_an_arc(tangents[a], tangents[b], np.linalg.norm(points[b] - points[a], axis=1))
+    order = np.lexsort((knots.key, knots.chain))
+    pairs = np.stack([order[:-1], order[1:]], axis=1)
+    ends = knots.last[order[:-1]] | (knots.chain[order[:-1]] != knots.chain[order[1:]])
+    ends |= np.linalg.norm(points[order[1:]] - points[order[:-1]], axis=1) <= COINCIDENT
+    ends |= ~_on_one_branch(knots, pairs)
+    first = stencils(np.concatenate([[0], np.cumsum(ends)]))
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    first = first[place[a]]
+    four = order[np.minimum(np.maximum(first, 0)[:, None] + np.arange(4), len(order) - 1)]
+    better, _ = through_four(points[four], tangents[four], points[a], points[b], np.array([0.5]))
+    use = (first >= 0) & np.isfinite(better[:, 0]).all(axis=1)
+    return (
+        np.where(use[:, None], better[:, 0], plain),
+        np.where(use, 0.0, unseen / GAIN_TWO),
+        np.where(use, GAIN_FOUR, GAIN_TWO),
+    )
+
+
+def relative_to(points: Floats, gradient: Floats, offset: Floats) -> Floats:
+    """Return what a distance from the boundary is relative to, at points (k, 2).
+
+    A distance d is a difference d/|n_x| of one coordinate or d/|n_y| of the other, n the unit normal.
+    """
+    normal = np.abs(gradient) / np.linalg.norm(gradient, axis=1, keepdims=True)
+    size: Floats = (normal * np.maximum(np.abs(points + offset), LEAST_COORDINATE)).max(axis=1)
+    return size
+
+
+def _on_one_branch(knots: _Knots, intervals: Integers) -> NDArray[np.bool_]:
+    """Say of each interval whether the eigenvalues at its ends are one that moved."""
+    a, b = intervals.T
+    chord = knots.points[b] - knots.points[a]
+    moves = [(knots.pairs.slope[end] * chord).sum(axis=1) for end in (a, b)]
+    moved = knots.pairs.value[b] - knots.pairs.value[a]
+    # A complex pair may meet on the real axis: the slopes say nothing there, but the eigenvalue is near it.
+    size = np.abs(moved) + np.abs(moves[0]) + np.abs(moves[1])
+    same: NDArray[np.bool_] = knots.pairs.system[a] == knots.pairs.system[b]
+    same &= np.abs(moved - (moves[0] + moves[1]) / 2) <= EXPLAINED * size + SHORT
+    return same
+
+
+def _halfway(knots: _Knots, a: Integers, b: Integers, chord: Floats) -> Pairs:
+    """Return a guess of the pairs in the middle of intervals: the cubic through values and slopes."""
+    start, end = knots.pairs.at(a), knots.pairs.at(b)
+    slopes = ((start.slope - end.slope) * chord).sum(axis=1)
+    return replace(start, value=(start.value + end.value) / 2 + slopes / 8)
+
+
+def _corners(family: Family, knots: _Knots, intervals: Integers) -> tuple[Integers, Integers]:
+    """Solve for the corner in each interval; return the intervals beside corners, and those without one."""
+    a, b = intervals.T
+    count = len(a)
+    chord = knots.points[b] - knots.points[a]
+    length = np.linalg.norm(chord, axis=1)
+    place = (knots.points[a] + knots.points[b]) / 2
+    pairs = join([knots.pairs.at(a), knots.pairs.at(b)])
+    before = np.concatenate([knots.points[a], knots.points[b]])
+    for _ in range(MOST_STEPS):
+        both = np.concatenate([place, place])
+        pairs = follow(family, both, moved(pairs, both - before))
+        before = both
+        rows = np.stack([pairs.gradient[:count], pairs.gradient[count:]], axis=1)
+        growth = np.stack([pairs.growth[:count], pairs.growth[count:]], axis=1)
+        regular = np.abs(np.linalg.det(rows)) > UNIT * np.square(rows).sum(axis=(1, 2))
+        rows = np.where(regular[:, None, None], rows, np.eye(2))
+        step = -np.linalg.solve(rows, growth[:, :, None])[:, :, 0]
+        # The first step may overshoot; the corner is no farther than the chord is long.
+        size = np.linalg.norm(step, axis=1)
+        step *= np.minimum(1, length / np.maximum(size, np.finfo(np.float64).tiny))[:, None]
+        place = place + step
+        if np.all(size <= SHORT):
+            break
+    off = np.linalg.norm(place - (knots.points[a] + knots.points[b]) / 2, axis=1)
+    good = regular & (size <= SHORT) & (off <= length)
+    good &= clear(family, place, pairs.at(np.arange(count)))
+    a, b, place = a[good], b[good], place[good]
+    own = pairs.at(np.concatenate([good, good]))
+    third = (knots.key[b] - knots.key[a]) / 3
+    ends = knots.add(place, own.at(np.arange(len(a))), a, knots.key[a] + third)
+    starts = knots.add(place, own.at(np.arange(len(a), 2 * len(a))), a, knots.key[b] - third)
+    knots.last[ends] = True
+    beside = np.concatenate([np.stack([a, ends], axis=1), np.stack([starts, b], axis=1)])
+    return beside, intervals[~good]
+
+
+def _search(family: Family, knots: _Knots, intervals: Integers) -> Integers:
+    """Put a knot into intervals nothing is known about, where a line across their middle meets the boundary.
+
+    Returns the halves; an interval without such a crossing keeps the chord as its error.
+    """
+    a, b = intervals.T
+    chord = knots.points[b] - knots.points[a]
+    middle = (knots.points[a] + knots.points[b]) / 2
+    across = np.stack([chord[:, 1], -chord[:, 0]], axis=1) / 2  # to the right, where it is unstable
+    stable, unstable = just_inside(middle - across), just_inside(middle + across)
+    ends = log_magnitudes(family, np.concatenate([stable, unstable]), 1)[:, 0].reshape(2, -1).T
+    found = (ends[:, 0] < 0) & (ends[:, 1] >= 0)
+    knots.error[a[~found]] = np.linalg.norm(chord[~found], axis=1)
+    a, b = a[found], b[found]
+    if not len(a):
+        return intervals[:0]
+    place, pairs = cross(family, stable[found], unstable[found], ends[found])
+    new = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
+    return np.concatenate([np.stack([a, new], axis=1), np.stack([new, b], axis=1)])
+
+
+def _arcs(
+    family: Family, knots: _Knots, closed: tuple[bool, ...], tolerance: float, offset: Floats
+) -> tuple[Arc, ...]:
+    """Return each chain's knots in order, cut at its corners."""
+    arcs = []
+    for chain, comes_back in enumerate(closed):
+        members = np.flatnonzero(knots.chain == chain)
+        order = members[np.argsort(knots.key[members], kind="stable")]
+        pieces = np.split(order, np.flatnonzero(knots.last[order]) + 1)
+        if comes_back and len(pieces) > 1:  # the first crossing is no corner
+            pieces = [np.concatenate([pieces[-1], pieces[0][1:]]), *pieces[1:-1]]
+        for piece in pieces:
+            kept = _without_copies(knots.points[piece])
+            if len(kept) > 1:
+                arcs.append(_arc(family, knots, piece[kept], chain, tolerance, offset))
+    return tuple(arcs)
+
+
+def _without_copies(points: Floats) -> Integers:
+    """Return which points of a curve to keep so that no two that follow each other are one; both ends are."""
+    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > COINCIDENT
+    kept = np.flatnonzero(np.concatenate([[True], apart]))
+    if len(kept) > 1:
+        kept[-1] = len(points) - 1
+    return kept
+
+
+def _arc(family: Family, knots: _Knots, piece: Integers, chain: int, tolerance: float, offset: Floats) -> Arc:
+    """Return some knots as an arc."""
+    pairs = knots.pairs.at(piece)
+    system = int(pairs.system[0])
+    steepness = np.linalg.norm(pairs.gradient, axis=1)
+    # Some of what is allowed is left for rounding, and for the interval's other points.
+    allowed = FILLED * tolerance * relative_to(knots.points[piece], pairs.gradient, offset)
+    points, tangents, errors = fill(
+        knots.points[piece],
+        _tangents(pairs.gradient),
+        knots.error[piece[:-1]],
+        np.minimum(allowed[:-1], allowed[1:]),
+    )
+    rounding = value_errors(family, pairs) / np.maximum(steepness, np.finfo(np.float64).tiny)
+    return Arc(
+        points=points,
+        tangents=tangents,
+        errors=errors,
+        knots=knots.points[piece],
+        values=pairs.value,
+        system=system,
+        rounding=float(rounding.max()),
+        chain=chain,
+    )

@@ -1,0 +1,167 @@
+"""Newton's method onto the boundary, for many points at once.
+
+Takes: a `Family` of closed systems, and guesses of points and eigenvalues.
+Gives: `cross`, `polish`, `moved`, `clear`, `just_inside`; `SHORT`.
+Guarantees: a point is on the curve log|λ| = 0 of its eigenvalue to rounding, or NaN; one of `cross` is where
+the spectral radius is 1.
+Does not: connect points (see `boundary`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.regions.cells import INSIDE_RIM
+from apc.regions.eigenpairs import Family, Pairs, follow, leading, log_magnitudes
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# A step this short, in unit coordinates, leaves an error of its square.
+SHORT = 1e-8
+
+# Newton's method either arrives within so many steps or is not near anything.
+MOST_STEPS = 8
+
+# A bracket is closed in on at most so many times, each time by half or more.
+MOST_BRACKETS = 50
+
+# log|λ| of another eigenvalue at a point of the boundary above this means that the point isn't on it.
+OUTSIDE = 1e-9
+
+
+def cross(family: Family, stable: Floats, unstable: Floats, growth: Floats) -> tuple[Floats, Pairs]:
+    """Return where the boundary lies on stretches from stable to unstable points, and who decides there.
+
+    Parameters
+    ----------
+    family
+        The closed systems.
+    stable, unstable
+        The ends of the stretches (k, 2).
+    growth
+        The log of the spectral radius at both ends (k, 2).
+
+    Notes
+    -----
+    The eigenvalue that is largest at the unstable end is followed to where it enters the unit circle. If
+    another one is still outside there, that point is the new unstable end; if Newton's method went nowhere,
+    the middle becomes an end.
+    """
+    count = len(stable)
+    low, high = np.zeros(count), np.ones(count)
+    along = unstable - stable
+    points = unstable.copy()
+    pairs = leading(family, just_inside(unstable))
+    guess = _quadratic_root(growth, (pairs.gradient * along).sum(axis=1))
+    rest = np.arange(count)
+    for _ in range(MOST_BRACKETS):
+        start = stable[rest] + guess[rest, None] * along[rest]
+        place, found = polish(family, start, moved(pairs.at(rest), start - points[rest]), along[rest])
+        length = np.square(along[rest]).sum(axis=1)
+        reached = ((place - stable[rest]) * along[rest]).sum(axis=1) / length
+        arrived = np.isfinite(reached) & (reached >= low[rest]) & (reached <= high[rest])
+        middle = (low[rest] + high[rest]) / 2
+        looked_at = np.where(arrived, reached, middle)
+        spots = stable[rest] + looked_at[:, None] * along[rest]
+        top = log_magnitudes(family, just_inside(spots), 1)[:, 0]
+        good = arrived & (top <= rounded_growth(spots, found.gradient))
+        done = rest[good]
+        points[done] = place[good]
+        _put(pairs, done, found.at(good))
+        out = ~good & (top > 0)
+        low[rest[~good & ~out]] = looked_at[~good & ~out]
+        high[rest[out]] = looked_at[out]
+        again = rest[out]
+        if len(again):
+            points[again] = spots[out]
+            _put(pairs, again, leading(family, points[again]))
+        rest = rest[~good]
+        if not len(rest):
+            break
+        guess[rest] = (low[rest] + high[rest]) / 2
+    return points, pairs
+
+
+def _quadratic_root(growth: Floats, slope: Floats) -> Floats:
+    """Return where in (0, 1) a quadratic vanishes, of given values (k, 2) at 0 and 1 and slope (k,) at 1.
+
+    Where the slope doesn't fit, by another mode at the other end, the secant's root.
+    """
+    low, high = growth.T
+    bend = slope - (high - low)  # g = high + slope (t − 1) + bend (t − 1)²
+    root = np.sqrt(np.maximum(slope**2 - 4 * bend * high, 0.0))
+    # The root next to t = 1, in the form that cancels nothing.
+    found = 1 - 2 * high / np.where(slope + root > 0, slope + root, np.inf)
+    fits = (found > 0) & (found < 1) & (slope > 0)
+    guess: Floats = np.where(fits, found, low / (low - high))
+    return guess
+
+
+def _put(pairs: Pairs, places: Integers, new: Pairs) -> None:
+    """Write pairs into others, in place."""
+    for name in Pairs.__slots__:
+        getattr(pairs, name)[places] = getattr(new, name)
+
+
+def just_inside(points: Floats) -> Floats:
+    """Return points a hair inside the unit square, as the survey samples them."""
+    return np.clip(points, INSIDE_RIM, 1 - INSIDE_RIM)
+
+
+def rounded_growth(points: Floats, gradient: Floats) -> Floats:
+    """Return up to where log|λ| counts as zero at points of the boundary, looked at a hair inside the rim."""
+    shift = np.abs(just_inside(points) - points)
+    limit: Floats = OUTSIDE + 2 * (shift * np.abs(gradient)).sum(axis=1)
+    return limit
+
+
+def clear(family: Family, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
+    """Say of each point of the boundary whether no other eigenvalue has left the unit circle there."""
+    alone: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+    if alone.any():
+        top = log_magnitudes(family, just_inside(points[alone]), 1)[:, 0]
+        alone[alone] = top <= rounded_growth(points[alone], pairs.gradient[alone])
+    return alone
+
+
+def moved(pairs: Pairs, by: Floats) -> Pairs:
+    """Return a guess of the pairs at points moved by (k, 2), to first order."""
+    return replace(pairs, value=pairs.value + (pairs.slope * by).sum(axis=1))
+
+
+def polish(family: Family, points: Floats, guess: Pairs, along: Floats | None = None) -> tuple[Floats, Pairs]:
+    """Move points onto the curve log|λ| = 0 of the eigenvalues guessed; NaN where that leads nowhere.
+
+    Parameters
+    ----------
+    family
+        The closed systems.
+    points
+        Where to begin (k, 2).
+    guess
+        The eigenvalues to follow.
+    along
+        Directions to stay on (k, 2); left out, each point moves down its gradient.
+    """
+    points, pairs = points.copy(), guess.at(np.arange(len(points)))
+    rest = np.arange(len(points))
+    for _ in range(MOST_STEPS):
+        own = follow(family, points[rest], pairs.at(rest))
+        _put(pairs, rest, own)
+        way = own.gradient if along is None else along[rest]
+        rise = (own.gradient * way).sum(axis=1)
+        step = -(own.growth / np.where(rise == 0, np.nan, rise))[:, None] * way
+        points[rest] += step
+        left = ~(np.linalg.norm(step, axis=1) <= SHORT)
+        lost = ~(np.linalg.norm(step, axis=1) <= 1)
+        points[rest[lost]] = np.nan
+        pairs.value[rest] += (own.slope * np.where(lost[:, None], 0, step)).sum(axis=1)
+        rest = rest[left & ~lost]
+        if not len(rest):
+            return points, pairs
+    points[rest] = np.nan
+    return points, pairs

@@ -1,0 +1,203 @@
+"""A published condition laid over two parameters of a scene: who plays which symbol, and the curve.
+
+Takes: a `CompiledSystem` and words such as
+`colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period`.
+Gives: `Overlay`, `parse_overlay`, `symbol_values`, `overlay_points`.
+Guarantees: which parameter plays which symbol is said by the user, every one of them, and never guessed;
+units fit; what depends on a parameter of the plane by an expression follows it.
+Does not: find a boundary that a line of the plane crosses twice; draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem, Group
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.frame.names import find, unit_of
+from apc.frame.overrides import Override, apply
+from apc.regions.passivity import CONDITIONS, MEANINGS, UNITS, PublishedCondition
+
+Floats = NDArray[np.float64]
+
+_PLACE = Place("overlay")
+_FORM = "colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period"
+
+# Lines of the plane along each axis on which the boundary is found: a curve of so many points looks smooth.
+LINES = 65
+
+
+@dataclass(frozen=True, slots=True)
+class Role:
+    """What plays a symbol: a parameter of the scene (of one group, or of all), or a number in SI."""
+
+    symbol: str
+    parameter: str | None
+    group: str | None
+    value: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """A published condition, and what plays each of its symbols, in the order of the symbols."""
+
+    condition: PublishedCondition
+    roles: tuple[Role, ...]
+
+    @property
+    def label(self) -> str:
+        """What a legend says: authors and formula."""
+        return f"{self.condition.title}: {self.condition.formula}"
+
+
+def parse_overlay(system: CompiledSystem, text: str) -> Overlay:
+    """Read `CONDITION:SYMBOL=PARAMETER,SYMBOL=QUANTITY,…`; every symbol of the condition must be given.
+
+    Raises
+    ------
+    ApcError
+        E886 not of that form, no such condition or symbol, a symbol missing or given twice; E622 no such
+        parameter; E204 a unit that does not fit.
+    """
+    name, colon, rest = (part.strip() for part in text.partition(":"))
+    if not colon or not rest:
+        raise ApcError(Mistake("E886", _PLACE, "an overlay", "CONDITION:SYMBOL=NAME,…", text[:80], _FORM))
+    condition = CONDITIONS.get(name)
+    if condition is None:
+        what = f"{name[:80]} is no published condition known here ({', '.join(CONDITIONS)})"
+        raise ApcError(Mistake("E886", _PLACE, what, hint=nearest(name, CONDITIONS) or _FORM))
+    found: dict[str, Role] = {}
+    for part in rest.split(","):
+        symbol, equals, player = (piece.strip() for piece in part.partition("="))
+        if not (equals and symbol and player):
+            raise ApcError(Mistake("E886", _PLACE, "a symbol", "SYMBOL=NAME", part[:80], _FORM))
+        if symbol not in condition.symbols:
+            what = f"{condition.formula} has no {symbol[:80]}; it has {', '.join(condition.symbols)}"
+            raise ApcError(Mistake("E886", _PLACE, what, hint=nearest(symbol, condition.symbols)))
+        if symbol in found:
+            raise ApcError(Mistake("E886", _PLACE, f"{symbol} is given twice"))
+        found[symbol] = _role(system, symbol, player)
+    missing = [symbol for symbol in condition.symbols if symbol not in found]
+    if missing:
+        wanted = ", ".join(f"{symbol}, the {MEANINGS[symbol]}" for symbol in missing)
+        hint = f"{text.strip()},{missing[0]}=… (a parameter or a quantity in {UNITS[missing[0]]})"
+        raise ApcError(Mistake("E886", _PLACE, f"{condition.formula} needs {wanted}", hint=hint))
+    return Overlay(condition, tuple(found[symbol] for symbol in condition.symbols))
+
+
+def _role(system: CompiledSystem, symbol: str, player: str) -> Role:
+    """Read what plays a symbol: a quantity begins with a digit, sign or point, a parameter never does."""
+    from apc.compiler.language.units import parse_unit, quantity
+
+    if player[0] in "+-.0123456789":
+        value = quantity(player, _PLACE, what=symbol, unit=UNITS[symbol]).value
+        return Role(symbol, None, None, float(value))
+    name, group = find(system, player, _PLACE)
+    unit = unit_of(system, name)
+    if parse_unit(unit, _PLACE).dimension != parse_unit(UNITS[symbol], _PLACE).dimension:
+        what = f"{symbol}, the {MEANINGS[symbol]},"
+        raise ApcError(Mistake("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))
+    if group is None:
+        own = [one for one in system.groups if name in _own_names(one)]
+        if own:
+            what = f"{name} differs between peers, and {symbol} is one number"
+            raise ApcError(Mistake("E886", _PLACE, what, hint=f"{symbol}={own[0].name}.{name}"))
+    return Role(symbol, name, group, None)
+
+
+def _own_names(group: Group) -> set[str]:
+    """Return the parameters of which a group has values of its own."""
+    return {value.name for value in group.values} | {column.name for column in group.columns}
+
+
+def symbol_values(system: CompiledSystem, overlay: Overlay) -> tuple[float, ...]:
+    """Return the value of each symbol with the scene's numbers, in the order of the condition's symbols."""
+    common = {one.name: one.value for one in system.parameters}
+    common |= {one.name: float(one.value) for one in system.timings}
+    values = []
+    for role in overlay.roles:
+        if role.parameter is None:
+            assert role.value is not None
+            values.append(role.value)
+            continue
+        group = next((one for one in system.groups if one.name == role.group), None)
+        own = {one.name: one.value for one in group.values} if group else {}
+        values.append(float(own.get(role.parameter, common[role.parameter])))
+    return tuple(values)
+
+
+def overlay_points(
+    system: CompiledSystem,
+    overlay: Overlay,
+    x: tuple[str, float, float],
+    y: tuple[str, float, float],
+) -> Floats:
+    """Return the boundary of an overlay's condition in the plane of two parameters, as one polyline.
+
+    Parameters
+    ----------
+    system
+        The scene; its numbers hold for what is on neither axis, and what depends on an axis follows it.
+    overlay
+        The condition and its roles.
+    x, y
+        Name of the parameter on the axis, and the ends of its range in SI.
+
+    Returns
+    -------
+    Floats
+        Points (n, 2) in SI, from end to end of the curve; (0, 2) where the condition holds in the whole
+        window or nowhere in it.
+
+    Raises
+    ------
+    ApcError
+        E622 an axis names no parameter, E624 or E625 an end of an axis is a value that can't be.
+
+    Notes
+    -----
+    The margin of each condition grows, or falls, all along each axis. So a line of the plane meets the
+    boundary once at most, and the boundary is monotone: the points found along lines of either direction,
+    put in order of x, follow it.
+    """
+    from scipy.optimize import brentq
+
+    axes = [find(system, name, _PLACE) for name, _, _ in (x, y)]
+
+    def margin(at_x: float, at_y: float) -> float:
+        places = zip(axes, (at_x, at_y), strict=True)
+        overrides = [Override(name, group, Fraction(value)) for (name, group), value in places]
+        return float(overlay.condition.margin(*symbol_values(apply(system, overrides), overlay)))
+
+    def crossing(along: Callable[[float], float], low: float, high: float) -> float | None:
+        first, last = along(low), along(high)
+        if first == 0 or last == 0:
+            return low if first == 0 else high
+        if (first > 0) == (last > 0):
+            return None
+        return float(brentq(along, low, high, xtol=abs(high - low) * 1e-15, rtol=1e-14))
+
+    points = []
+    for at in np.linspace(y[1], y[2], LINES).tolist():
+        found = crossing(lambda value, at=at: margin(value, at), x[1], x[2])  # type: ignore[misc]
+        points += [(found, at)] if found is not None else []
+    for at in np.linspace(x[1], x[2], LINES).tolist():
+        found = crossing(lambda value, at=at: margin(at, value), y[1], y[2])  # type: ignore[misc]
+        points += [(at, found)] if found is not None else []
+    return _in_order(points)
+
+
+def _in_order(points: Sequence[tuple[float, float]]) -> Floats:
+    """Return the points of a monotone curve from its one end to the other, each once."""
+    if not points:
+        return np.empty((0, 2))
+    unique = sorted(set(points))
+    (first_x, first_y), (last_x, last_y) = unique[0], unique[-1]
+    falling = last_y < first_y if last_x != first_x else False
+    ordered = sorted(unique, key=lambda point: (point[0], -point[1] if falling else point[1]))
+    return np.array(ordered, dtype=np.float64)

@@ -1,0 +1,240 @@
+"""Stable regions side by side: several scenes in one panel, several settings in several panels.
+
+Takes: compiled scenes, what each panel sets, and two axes.
+Gives: `Panel`, `Panels`, `panel_letter`; `compare_regions`, `parse_panel`, `parse_vary`, `gain_factor`.
+Guarantees: what is multiplied for a comparison at equal gain follows from the scene's equations, and is told.
+Does not: draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from string import ascii_lowercase
+from typing import Any
+
+import numpy as np
+
+from apc.analysis.ranges import Range
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.exchange import build_exchange
+from apc.frame.jacobians import jacobians
+from apc.frame.linearize import linearize_rows, site_of_row
+from apc.frame.overrides import Override, apply, parse_override
+from apc.frame.parameters import resolve
+from apc.regions.axes import PLACE, parse_axes
+from apc.regions.overlay import Overlay, overlay_points, parse_overlay
+from apc.regions.region import CELLS, Floats, Region, region
+from apc.vary.search import Told
+
+# By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
+MOVE = Fraction(19, 13)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One picture: the regions of some scenes with the same settings.
+
+    `gains` are what each region's y is multiplied by in the comparison: 1, or its number of others.
+    `overlays` are published conditions as (label, points (k, 2) in SI).
+    """
+
+    title: str
+    regions: tuple[Region, ...]
+    gains: tuple[int, ...]
+    overlays: tuple[tuple[str, Floats], ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the panel as plain data, ready for JSON."""
+        return {
+            "panel": self.title,
+            "regions": [
+                {**one.to_dict(), "y_multiplied_by": gain}
+                for one, gain in zip(self.regions, self.gains, strict=True)
+            ],
+            "overlays": [{"label": label, "points": points.tolist()} for label, points in self.overlays],
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panels:
+    """Regions to be seen together; `normalized` says that y is an effective gain, see `gain_factor`."""
+
+    panels: tuple[Panel, ...]
+    normalized: bool
+
+    @property
+    def alone(self) -> Region | None:
+        """The only region, if it is just one, with nothing laid over it."""
+        if len(self.panels) > 1 or self.panels[0].overlays or self.normalized:
+            return None
+        regions = self.panels[0].regions
+        return regions[0] if len(regions) == 1 else None
+
+    def __str__(self) -> str:
+        """Return what was found, in words."""
+        from apc.regions.report import panels_report  # it needs this module
+
+        return panels_report(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the region itself if it is alone, else the panels, as plain data, ready for JSON."""
+        if self.alone is not None:
+            return self.alone.to_dict()
+        return {"normalized": self.normalized, "panels": [panel.to_dict() for panel in self.panels]}
+
+    def plot(self) -> Any:
+        """Draw all panels; return the matplotlib Figure."""
+        from apc.regions.figure import draw_panels
+
+        return draw_panels(self)
+
+
+def panel_letter(place: int) -> str:
+    """Return the letter of a panel, "a" for the first; after "z" they begin anew."""
+    return ascii_lowercase[place % len(ascii_lowercase)]
+
+
+def parse_panel(text: str) -> tuple[str, ...]:
+    """Read `lan.delay=0 ms, contact.delay=0 ms`: what a panel sets. Raises ApcError E907 if it isn't that."""
+    parts = tuple(part.strip() for part in text.split(","))
+    if not all(part and "=" in part for part in parts):
+        form = '--panel "lan.delay=0 ms, contact.delay=0 ms"'
+        raise ApcError(Mistake("E907", Place("--panel"), "a panel", "NAME=VALUE, …", text[:80], form))
+    return parts
+
+
+def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
+    """Read `lan.delay=0,8 ms`: a panel a value; a number without a unit takes that of the last.
+
+    Raises
+    ------
+    ApcError
+        E907 it isn't of that form.
+    """
+    name, equals, values = (part.strip() for part in text.partition("="))
+    listed = [value.strip() for value in values.split(",")]
+    if not (equals and name and all(listed)):
+        form = "--vary lan.delay=0,8 ms"
+        raise ApcError(Mistake("E907", Place("--vary"), "--vary", "NAME=VALUE,VALUE,…", text[:80], form))
+    unit = listed[-1].lstrip("+-.0123456789eE").strip()
+    bare = "+-.0123456789eE"
+    return tuple(
+        (f"{name}={value} {unit}" if not value.strip(bare) else f"{name}={value}",) for value in listed
+    )
+
+
+# A scene with a panel's settings, its axes, and what its y is multiplied by.
+_Work = tuple[CompiledSystem, tuple[Range, Range], int]
+
+
+def compare_regions(
+    systems: Sequence[CompiledSystem],
+    *,
+    x: str | None = None,
+    y: str | None = None,
+    panels: Sequence[Sequence[str]] = ((),),
+    overlays: Sequence[str] = (),
+    normalize: bool = False,
+    cells: int = CELLS,
+    told: Told | None = None,
+) -> Panels:
+    """Find the regions of some scenes with some settings.
+
+    Parameters
+    ----------
+    systems
+        The scenes; the first one's `studies: region:` gives the axes that are left out.
+    x, y
+        The axes, see `axes.parse_axes`.
+    panels
+        What each panel sets: `NAME=VALUE` texts.
+    overlays
+        Published conditions, see `overlay.parse_overlay`; of the first scene.
+    normalize
+        Whether y is the effective gain: a scene that sums over its others is given y divided by their number,
+        so that its coupling is as strong as that of a scene that takes their mean.
+    cells, told
+        See `region.region`.
+
+    Raises
+    ------
+    ApcError
+        As `parse_axes`, `parse_override`, `parse_overlay`, `gain_factor` and `region`.
+    """
+    # Whatever is wrong is told before anything is computed.
+    jobs: list[tuple[str, list[_Work], list[Overlay]]] = []
+    for settings in panels:
+        work: list[_Work] = []
+        for place, original in enumerate(systems):
+            system = apply(original, [parse_override(original, text) for text in settings])
+            if place and len(systems[0].region) == 2:
+                system = replace(system, region=systems[0].region)
+            axes = parse_axes(system, x, y)
+            _refuse_set(axes, system, settings)
+            gain = gain_factor(system, axes[1]) if normalize else 1
+            work.append((system, parse_axes(system, x, y, scale=Fraction(gain)), gain))
+        jobs.append((", ".join(settings), work, [parse_overlay(work[0][0], text) for text in overlays]))
+    found = []
+    for title, work, laid in jobs:
+        regions = tuple(region(system, axes, cells=cells, told=told) for system, axes, _ in work)
+        ranges = [(axis.label, float(axis.low), float(axis.high)) for axis in work[0][1]]
+        lines = tuple(
+            (one.label, overlay_points(work[0][0], one, ranges[0], ranges[1]) * [1.0, work[0][2]])
+            for one in laid
+        )
+        found.append(Panel(title, regions, tuple(gain for _, _, gain in work), lines))
+    return Panels(tuple(found), normalize)
+
+
+def _refuse_set(axes: Sequence[Range], system: CompiledSystem, settings: Sequence[str]) -> None:
+    """Raise E902 when a panel sets what an axis varies."""
+    for text in settings:
+        override = parse_override(system, text)
+        for axis in axes:
+            if axis.name == override.name and override.group in (None, axis.group):
+                what = f"{axis.label} is on an axis and set for the panel as well"
+                raise ApcError(Mistake("E902", PLACE, what))
+
+
+def gain_factor(system: CompiledSystem, axis: Range) -> int:
+    """Return how often a parameter counts: its number of others where it weighs a sum, 1 where a mean.
+
+    With the mean of N − 1 others a peer is pulled as by one of them, with their sum as by all of them: the
+    mean is a sum whose gain is divided by N − 1.
+
+    Raises
+    ------
+    ApcError
+        E906 a parameter that weighs both, an operator that is neither, or peers that hear unequally many.
+    """
+    first = resolve(system)
+    value = axis.low + (axis.high - axis.low) * (MOVE - 1)
+    second = resolve(system, [Override(axis.name, axis.group, value)])
+    exchange = build_exchange(system, first.timings)
+    found: set[int] = set()
+    for place, group in enumerate(system.groups):
+        built = jacobians(system.kinds[group.kind])
+        if not built.parameters_suffice:
+            what = "the scene weighs its others one by one, so that there is no effective gain to compare at"
+            raise ApcError(Mistake("E906", PLACE, what))
+        before, after = (
+            site_of_row(built, linearize_rows(built, numbers.parameters[place][:1])[0])
+            for numbers in (first, second)
+        )
+        for partition, tick_a, tick_b in zip(built.kind.clocks, before.ticks, after.ticks, strict=True):
+            for column in np.flatnonzero((tick_a.r != tick_b.r).any(axis=0)).tolist():
+                receive = partition.receives[column]
+                if receive.operator == "mean":
+                    found.add(1)
+                elif exchange.is_complete(receive.link):
+                    found.add(system.peers - 1)
+                else:
+                    heard = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=system.peers)
+                    found |= set(heard.tolist())
+    if len(found) > 1:
+        what = f"{axis.label} weighs what is heard of {' and '.join(map(str, sorted(found)))} others"
+        raise ApcError(Mistake("E906", PLACE, f"{what}, so that there is no one effective gain"))
+    return max(found, default=1)

@@ -1,0 +1,471 @@
+"""The stable region of two parameters: exact boundary curves, areas, and who is inside.
+
+Takes: a `CompiledSystem`, two parameters and their ranges.
+Gives: `Curve`, `Region`, `region`, `side_of_curves`.
+Guarantees: every curve comes with a bound on its distance from the boundary, the mode that makes it and that
+mode's frequency; an empty region and one without boundary are answers. What was looked at how finely is part
+of the answer: a component smaller than a cell, with nothing around it that hints at it, can be missed.
+Does not: draw, or write files (see `region.figure`, `region.files`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
+from apc.analysis.ranges import Range
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.words import counted
+from apc.eigen.spectrum import finite
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
+from apc.network.nominal import left_out, refuse_channel_number
+from apc.regions.area import stable_area
+from apc.regions.axes import PLACE
+from apc.regions.boundary import Arc, relative_to, trace
+from apc.regions.cells import survey
+from apc.regions.curves import between
+from apc.regions.eigenpairs import Family, log_magnitudes
+from apc.regions.staircase import trace_steps
+from apc.regions.strips import BRANCHES, Striped, trace_strips
+from apc.regions.surrogate import Rectangle, point_errors, resolve_family
+from apc.threads import single_threaded
+from apc.trouble import finite_equations
+from apc.vary.batch import BatchEvaluator, matrix_errors
+from apc.vary.evaluator import PointEvaluator, evaluator, reaches_time
+from apc.vary.marginal import marginal_motion, with_rigid
+from apc.vary.search import Told
+
+if TYPE_CHECKING:
+    import pandas
+
+Floats = NDArray[np.float64]
+
+# Coarse cells along each side of the rectangle.
+CELLS = 12
+
+# Distance of a curve from the boundary, relative to a coordinate (see `boundary.trace`).
+TOLERANCE = 1e-9
+
+# How near to 0 or π, in radians, an eigenvalue's angle may come before its turns are counted again.
+FOLD = 0.1
+
+# Points looked at together when they are compared with all curves.
+CHUNK = 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """A piece of the boundary made by one mode; the stable side is on the left of the points' order.
+
+    `points` (k, 2) are in SI; `tangents` (k, 2) are directions in units of the ranges. From point to point
+    goes the cubic of `curves.between`, or a straight line if not `smooth` (where events coincide, and in the
+    steps over two times). `error` bounds the curve's distance from the true boundary, relative to the
+    coordinate in which it makes the smaller difference, `distance` the same in units of the ranges. `knots`
+    (m, 2) are the points solved for, in SI, and `eigenvalues` (m,) those that decide there.
+    """
+
+    points: Floats
+    tangents: Floats
+    error: float
+    distance: float
+    closed: bool
+    smooth: bool
+    knots: Floats
+    eigenvalues: NDArray[np.complex128]
+    source: BatchEvaluator | PointEvaluator
+
+    @property
+    def mode(self) -> str:
+        """The name of the closed system that makes the boundary here."""
+        middle = len(self.knots) // 2
+        return _identify(self.source, self.knots[middle], complex(self.eigenvalues[middle]))[0]
+
+    @property
+    def frequency_hz(self) -> tuple[float, float]:
+        """The least and the largest frequency, along the curve, of the motion that neither grows nor dies.
+
+        Both are NaN where it can't be told.
+        """
+        angles = np.abs(np.angle(self.eigenvalues))
+        middle = len(self.knots) // 2
+        places = {middle} if self.smooth else set(range(len(self.knots)))
+        if np.any(angles < FOLD) or np.any(angles > np.pi - FOLD):  # it may fold on the way
+            places |= {0, len(self.knots) - 1}
+        found: list[float] = []
+        for place in sorted(places):
+            _, turn, frame = _identify(self.source, self.knots[place], complex(self.eigenvalues[place]))
+            if np.isnan(turn):
+                return np.nan, np.nan
+            # turn = 2πm ± angle, and so is it along the curve.
+            candidates = [
+                2 * np.pi * round((turn - sign * float(angles[place])) / (2 * np.pi)) + sign * angles
+                for sign in (1, -1)
+            ]
+            own = min(candidates, key=lambda listed: abs(float(listed[place]) - turn))
+            listed = own if len(places) == 1 else own[[place]]
+            found += (np.abs(listed) / (2 * np.pi * frame)).tolist()
+        return min(found), max(found)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the curve as plain data, ready for JSON."""
+        return {
+            "points": self.points.tolist(),
+            "tangents": self.tangents.tolist(),
+            "error": self.error,
+            "mode": self.mode,
+            "frequency_hz": [finite(one) for one in self.frequency_hz],
+            "closed": self.closed,
+            "smooth": self.smooth,
+            "stable_side": "left",
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """The stable region of a rectangle of two parameters.
+
+    `stable_area` is in the product of the axes' units. `cell` are the sides of the cells the rectangle was
+    looked at in, in SI; where values hinted at more, cells down to `finest` of them. `corner` says whether
+    the corner of both lower ends is stable, `stepped` that the boundary is right to a cell only, as times
+    vary, `linearized` that the scene is not linear;
+    `left_out` says what of the scene the answer does not look at.
+    """
+
+    topology: str
+    x: Range
+    y: Range
+    curves: tuple[Curve, ...]
+    stable_area: float
+    stable_area_error: float
+    cell: tuple[float, float]
+    finest: float
+    corner: bool
+    stepped: bool
+    linearized: bool
+    left_out: tuple[str, ...]
+    system: CompiledSystem
+
+    def __str__(self) -> str:
+        """Return what was found, in words."""
+        from apc.regions.report import region_report  # it needs this module
+
+        return region_report(self)
+
+    @property
+    def rectangle(self) -> Rectangle:
+        """The ranges."""
+        low = np.array([float(self.x.low), float(self.y.low)])
+        return Rectangle(low, np.array([float(self.x.high), float(self.y.high)]) - low)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the region as plain data, ready for JSON."""
+        return {
+            "topology": self.topology,
+            "x": self.x.to_dict(),
+            "y": self.y.to_dict(),
+            "boundary": [curve.to_dict() for curve in self.curves],
+            "stable_area": self.stable_area,
+            "stable_area_error": self.stable_area_error,
+            "area_unit": _product(self.x.unit, self.y.unit),
+            "cell": list(self.cell),
+            "finest_cell": self.finest,
+            "left_out": list(self.left_out),
+            "origin": dict(self.system.origin.texts),
+        }
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return the points of all curves as a table (needs pandas)."""
+        import pandas
+
+        from apc.regions.files import headings, region_rows
+
+        return pandas.DataFrame(list(region_rows(self)), columns=headings(self))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the region into a matplotlib Axes, or a figure of its own; return the Axes."""
+        from apc.regions.figure import draw_region
+
+        return draw_region(self, ax)
+
+    def contains(self, x: Any, y: Any) -> Any:
+        """Say whether points are stable: by the curves or, nearer to them than their error, by eigenvalues.
+
+        Parameters
+        ----------
+        x, y
+            Values of the two parameters in SI, numbers or arrays that broadcast.
+
+        Returns
+        -------
+        bool, or an array of them.
+
+        Raises
+        ------
+        ApcError
+            E904 a point outside the rectangle.
+        """
+        wide, high = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        values = np.stack([wide.ravel(), high.ravel()], axis=1)
+        points = (values - self.rectangle.low) / self.rectangle.width
+        if not np.all((points >= 0) & (points <= 1)):
+            ranges = " and ".join(
+                f"{axis.label} in {float(axis.low):g} to {float(axis.high):g} {axis.unit}"
+                for axis in (self.x, self.y)
+            )
+            raise ApcError(Mistake("E904", PLACE, "a point", ranges, "one outside"))
+        inside, near = side_of_curves(self, points)
+        if near.any():
+            inside[near] = _decide(self, values[near])
+        return bool(inside[0]) if wide.ndim == 0 else inside.reshape(wide.shape)
+
+
+def region(
+    system: CompiledSystem,
+    axes: tuple[Range, Range],
+    *,
+    cells: int = CELLS,
+    tolerance: float = TOLERANCE,
+    prepared: Prepared | None = None,
+    told: Told | None = None,
+) -> Region:
+    """Find the boundary of the stable region of two parameters.
+
+    Parameters
+    ----------
+    system
+        The compiled scene; all other parameters keep its numbers.
+    axes
+        The two parameters, from `parse_axes`.
+    cells
+        Into how many cells each side of the rectangle is divided to begin with.
+    tolerance
+        Largest distance between curves and boundary, relative to a coordinate.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
+    told
+        Is told, in words, how far the work is.
+
+    Raises
+    ------
+    ApcError
+        E896 a number of an unreliable link; E905 the scene can't be analysed everywhere in the rectangle; and
+        those of `analysis.lifted_groups`.
+
+    Notes
+    -----
+    Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Where both axes are
+    times, or the scene is linearized at its start, each point is analysed by itself, and the boundary is a
+    line from cell edge to cell edge, its error the size of a cell.
+    """
+    free = tuple(Free(axis.name, axis.group) for axis in axes)
+    for one in free:
+        refuse_channel_number(system, one, PLACE)
+    low = np.array([float(axis.low) for axis in axes])
+    rectangle = Rectangle(low, np.array([float(axis.high) for axis in axes]) - low)
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        prepared = prepared or prepare(system)
+        used = [prepared.jacobians[group.kind] for group in system.groups]
+        affine = all(site.affine for site in used)
+        times = [place for place, one in enumerate(free) if reaches_time(system, one)]
+        source: BatchEvaluator | PointEvaluator
+        if times:
+            source = PointEvaluator(system, free, prepared)
+        else:
+            source = evaluator(system, free, prepared=prepared)
+        found: Striped | None = None
+        start = prepare_at_start(system, prepared) if len(times) == 1 else None
+        if start is not None:
+            found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
+        stepped = bool(times) and found is None
+        if found is None:
+            found = _surveyed(source, rectangle, bool(times), cells, tolerance, told)
+        curves = tuple(_curve(source, rectangle, arc) for arc in found.arcs)
+    whole = float(rectangle.width.prod())
+    return Region(
+        topology=system.name,
+        x=axes[0],
+        y=axes[1],
+        curves=curves,
+        stable_area=found.area * whole,
+        stable_area_error=found.off * whole,
+        cell=(found.cell[0] * float(rectangle.width[0]), found.cell[1] * float(rectangle.width[1])),
+        finest=found.finest,
+        corner=found.corner,
+        stepped=stepped,
+        linearized=not affine,
+        left_out=left_out(system, linear=affine),
+        system=system,
+    )
+
+
+def _surveyed(
+    source: BatchEvaluator | PointEvaluator,
+    rectangle: Rectangle,
+    timed: bool,
+    cells: int,
+    tolerance: float,
+    told: Told | None,
+) -> Striped:
+    """Survey the whole rectangle and follow the boundary through it; in steps where a time varies."""
+    family = _family(source, rectangle, timed)
+    looked = 0
+
+    def samples(points: Floats) -> Floats:
+        nonlocal looked
+        looked += len(points)
+        if told:
+            told(f"looking at {counted(looked, 'point')}")
+        return _samples(family, source, rectangle, points)
+
+    found = survey(samples, cells=cells)
+    if timed:
+        arcs = trace_steps(
+            lambda points: samples(points)[:, 0], lambda point: _leading_value(family, point), found
+        )
+    else:
+        arcs = trace(family, found, tolerance=tolerance, offset=rectangle.low / rectangle.width)
+    area, off = stable_area(arcs, found)
+    return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
+
+
+def _family(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, timed: bool) -> Family:
+    """Return the closed systems over the unit square."""
+    if isinstance(source, BatchEvaluator):
+        return resolve_family(source, rectangle, lambda values: matrix_errors(source, values))
+    if timed:
+        return _Timed(source, rectangle)
+    return resolve_family(source, rectangle, lambda values: point_errors(source, values))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Timed:
+    """A `Family` without slopes: each point has its own schedule."""
+
+    evaluator: PointEvaluator
+    rectangle: Rectangle
+    sizes: tuple[int, ...] = ()
+    errors: tuple[Floats, ...] = ()
+
+    def matrices(self, points: Floats) -> tuple[Floats, ...]:
+        return self.evaluator.matrices(self.rectangle.values(points))
+
+    def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
+        raise AssertionError("a schedule that changes has no slope")
+
+
+def _samples(
+    family: Family, source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, points: Floats
+) -> Floats:
+    """Return the logarithms of the largest magnitudes, or raise what is wrong with a point."""
+    matrices = family.matrices(points)
+    for one in matrices:
+        wrong = np.flatnonzero(~np.isfinite(one).all(axis=(1, 2)))
+        if len(wrong):
+            value = rectangle.values(points[wrong[:1]])[0].tolist()
+            overrides = [
+                Override(free.name, free.group, Fraction(number))
+                for free, number in zip(source.free, value, strict=True)
+            ]
+            apply(source.system, overrides)  # says so itself if the value can't be
+            source.closed_at(value)
+            what = "the scene's frame leaves the range of floating point numbers in part of the rectangle"
+            raise ApcError(Mistake("E905", PLACE, what, hint="a smaller range"))
+    return log_magnitudes(family, points, BRANCHES)
+
+
+def _leading_value(family: Family, point: Floats) -> complex:
+    """Return the eigenvalue of largest magnitude at a point (2,)."""
+    values = np.concatenate([np.linalg.eigvals(one[0]) for one in family.matrices(point[None])])
+    return complex(values[np.argmax(np.abs(values))])
+
+
+def _curve(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, arc: Arc) -> Curve:
+    """Return an arc in SI."""
+    return Curve(
+        points=rectangle.values(arc.points),
+        tangents=arc.tangents,
+        error=_relative_error(arc, rectangle.low / rectangle.width),
+        distance=float(arc.errors.max(initial=0.0)) + arc.rounding,
+        closed=arc.closed,
+        smooth=arc.smooth,
+        knots=rectangle.values(arc.knots),
+        eigenvalues=arc.values,
+        source=source,
+    )
+
+
+def _relative_error(arc: Arc, offset: Floats) -> float:
+    """Return the largest distance from the boundary, relative to the coordinate it changes less."""
+    normal = np.stack([arc.tangents[:, 1], -arc.tangents[:, 0]], axis=1)
+    size = relative_to(arc.points, normal, offset)
+    errors = np.maximum(np.append(arc.errors, 0.0), np.insert(arc.errors, 0, 0.0)) + arc.rounding
+    return float((errors / size).max())
+
+
+def _identify(
+    source: BatchEvaluator | PointEvaluator, value: Floats, eigenvalue: complex
+) -> tuple[str, float, float]:
+    """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
+    found = marginal_motion(with_rigid(source.closed_at(value.tolist())), eigenvalue)
+    return found.name, found.turn, found.frame_s
+
+
+def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Say of points (k, 2) of the unit square whether they are stable, and which are too near a curve to say.
+
+    From the point straight down, then along the lower edge to its left corner: each crossing of a curve
+    changes sides. Curves are replaced by their chords, which is right farther from them than their sagitta.
+    """
+    rectangle = found.rectangle
+    stable = np.full(len(points), found.corner)
+    near = np.zeros(len(points), dtype=bool)
+    for curve in found.curves:
+        knots = (curve.points - rectangle.low) / rectangle.width
+        a, b = knots[:-1], knots[1:]
+        sagitta = np.zeros(len(a))
+        if curve.smooth:
+            middle = between(a, b, curve.tangents[:-1], curve.tangents[1:], 0.5)
+            sagitta = 1.5 * np.linalg.norm(middle - (a + b) / 2, axis=1)
+        reach = sagitta + curve.distance
+        ends = [knots[0], knots[-1]] if not curve.closed else []
+        for start in range(0, len(points), CHUNK):
+            some = slice(start, start + CHUNK)
+            x, y = points[some, 0, None], points[some, 1, None]
+            chord = b - a
+            over = (a[:, 0] <= x) != (b[:, 0] <= x)
+            height = a[:, 1] + (x - a[:, 0]) * chord[:, 1] / np.where(chord[:, 0] == 0, 1.0, chord[:, 0])
+            crossings = (over & (height < y)).sum(axis=1)
+            crossings += sum(((end[1] == 0.0) & (end[0] < x[:, 0])).astype(int) for end in ends)
+            stable[some] ^= crossings % 2 == 1
+            size = np.maximum(np.square(chord).sum(axis=1), np.finfo(np.float64).tiny)
+            along = np.clip(((x - a[:, 0]) * chord[:, 0] + (y - a[:, 1]) * chord[:, 1]) / size, 0, 1)
+            apart = np.hypot(x - a[:, 0] - along * chord[:, 0], y - a[:, 1] - along * chord[:, 1])
+            near[some] |= (apart <= reach).any(axis=1)
+    return stable, near
+
+
+def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
+    """Say of parameter values (k, 2) whether they are stable, each by an analysis of its own."""
+    prepared = prepare(found.system)
+    decided = []
+    for value in values.tolist():
+        overrides = [
+            Override(axis.name, axis.group, Fraction(number))
+            for axis, number in zip((found.x, found.y), value, strict=True)
+        ]
+        answer = analyze(apply(found.system, overrides), prepared=prepared)
+        decided.append(bool(answer.stable))
+    return np.array(decided, dtype=bool)
+
+
+def _product(x: str, y: str) -> str:
+    """Return the unit of an area."""
+    units = [unit for unit in (x, y) if unit != "1"]
+    return "*".join(f"({unit})" if "/" in unit or "*" in unit else unit for unit in units) or "1"

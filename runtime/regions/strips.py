@@ -1,0 +1,398 @@
+"""The boundary of a stable region over a delay and another parameter, strip by strip of the delay.
+
+Takes: a `CompiledSystem`, a delay's range and another parameter's.
+Gives: `Striped`, `trace_strips`.
+Guarantees: within a strip the order of events stays: curves there are as right as those of two parameters
+that reach no time; between strips, where events coincide, the boundary goes straight along the delay's value.
+Does not: take two times, or scenes linearized at their start (None: see `staircase`).
+
+Where no event moves within a strip, as over a link, whose packets are read at ticks only, nothing changes
+with the delay: the boundary is a straight line at a critical value of the other parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared
+from apc.analysis.ranges import Range
+from apc.compiler.compiled import CompiledSystem
+from apc.frame.names import Free, parameter_of
+from apc.regions.area import stable_area
+from apc.regions.axes import PLACE
+from apc.regions.boundary import Arc, relative_to, trace
+from apc.regions.cells import HALVINGS, survey
+from apc.regions.curves import between, refined
+from apc.regions.eigenpairs import log_magnitudes
+from apc.regions.surrogate import DirectFamily, Rectangle, point_errors, resolve_family
+from apc.vary.crossings import scan
+from apc.vary.delays import Piece, delay_pieces
+from apc.vary.evaluator import PointEvaluator, evaluator
+from apc.vary.marginal import marginal_motion, with_rigid
+from apc.vary.search import SPAN, Line, proved_crossing
+
+Floats = NDArray[np.float64]
+
+# Magnitudes looked at in each point: three complex pairs.
+BRANCHES = 6
+
+# Ends of curves on either side of a strip's edge that are nearer than this many tolerances are one point:
+# each is off by a tolerance at most, and the coordinate it is relative to differs by little.
+SAME = 8.0
+
+# The share of the tolerance that drawing a strip's curves in units of the whole range may take.
+RESTATED = 0.25
+
+# Pieces an interval is cut into for it at most; each doubling makes it 16 times better.
+MOST_PIECES = 64
+
+# How far inside a strip, relative to its width, a point is looked at that stands for its edge.
+INSIDE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Striped:
+    """A boundary in the unit square: the delay runs along `axis` (0: x, 1: y).
+
+    `area` is the stable share of the square, `off` bounds its error, `corner` says whether (0, 0) is stable,
+    `cell` are the sides of the largest cells, `finest` is the share of them that the smallest had.
+    """
+
+    arcs: tuple[Arc, ...]
+    area: float
+    off: float
+    corner: bool
+    cell: tuple[float, float]
+    finest: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Strip:
+    """A strip from `start` to `end` of the delay's unit range, the delay first in its arcs' points.
+
+    `stable` says of the lower ends of its two edges whether they are stable.
+    """
+
+    start: float
+    end: float
+    arcs: tuple[Arc, ...]
+    stable: tuple[bool, bool]
+    area: float
+    off: float
+
+
+def trace_strips(
+    system: CompiledSystem,
+    axes: tuple[Range, Range],
+    axis: int,
+    prepared: Prepared,
+    *,
+    cells: int,
+    tolerance: float,
+    told: Callable[[str], None] | None = None,
+) -> Striped | None:
+    """Follow the boundary strip by strip; None where some strip can't be had in closed form.
+
+    Parameters
+    ----------
+    system, axes
+        The scene, and its two parameters with their ranges.
+    axis
+        Which of them is the delay, 0 or 1; the other reaches no time.
+    prepared
+        From `analysis.prepare`; all sites linear.
+    cells, tolerance
+        As for `region.region`, of every strip.
+    told
+        Is told how far the work is.
+
+    Raises
+    ------
+    ApcError
+        E844 a time that no delay is linear in.
+    """
+    delay, other = axes[axis], axes[1 - axis]
+    free = (Free(delay.name, delay.group), Free(other.name, other.group))
+    strips: list[_Strip] = []
+    for piece in delay_pieces(system, free[0], delay.low, prepared, place=PLACE, high=delay.high):
+        if told:
+            until = float(min(piece.high, delay.high))
+            told(f"following the boundary up to {delay.label} = {until:.6g} s of {float(delay.high):.6g} s")
+        width = delay.high - delay.low
+        ends = [float((one - delay.low) / width) for one in (piece.low, min(piece.high, delay.high))]
+        if piece.constant:
+            found = _standing(piece, free[1], other, ends, prepared)
+        else:
+            source = PointEvaluator(system, free, prepared)
+            found = _moving(source, axes[axis], other, piece, ends, cells, tolerance)
+        if found is None:
+            return None
+        strips.append(found)
+    whole = PointEvaluator(system, free, prepared)
+    arcs = [list(one.arcs) for one in strips]
+    rectangle = _rectangle(delay, other)
+    edges = []
+    for place in range(1, len(strips)):
+        edges += _join(strips, arcs, place, SAME * tolerance, whole, rectangle)
+
+    def mode_of(arc: Arc) -> str:
+        value = rectangle.values(arc.knots)[0].tolist()
+        return marginal_motion(with_rigid(whole.closed_at(value)), complex(arc.values[0])).name
+
+    listed = _joined([arc for own in arcs for arc in own] + edges, mode_of)
+    widest = max(one.end - one.start for one in strips)
+    cell = (widest / cells, 1 / cells)
+    return Striped(
+        arcs=tuple(replace(_swapped(arc) if axis else arc, chain=n) for n, arc in enumerate(listed)),
+        area=sum((one.end - one.start) * one.area for one in strips),
+        off=sum((one.end - one.start) * one.off for one in strips),
+        corner=strips[0].stable[0],
+        cell=cell[::-1] if axis else cell,
+        finest=2.0**-HALVINGS,
+    )
+
+
+def _rectangle(delay: Range, other: Range) -> Rectangle:
+    low = np.array([float(delay.low), float(other.low)])
+    return Rectangle(low, np.array([float(delay.high), float(other.high)]) - low)
+
+
+def _standing(
+    piece: Piece, free: Free, other: Range, ends: Sequence[float], prepared: Prepared
+) -> _Strip | None:
+    """Return a strip in which nothing depends on the delay: straight lines at the other's critical values."""
+    low, high = float(other.low), float(other.high)
+    line = Line(
+        evaluator(piece.inside, [free], prepared=prepared),
+        np.array([parameter_of(piece.inside, free).value]),
+        0,
+    )
+    scale = line.scale()
+    found = scan(line.course, line.samples(low, high, scale)[0], least=scale / SPAN)
+    if not len(found.points):
+        return None
+    arcs, heights = [], [0.0]
+    for root in found.roots:
+        crossing = proved_crossing(root, line, found)
+        if crossing is None:
+            return None
+        height = min(max((crossing.value - low) / (high - low), 0.0), 1.0)
+        heights.append(height)
+        middle = np.array([[(ends[0] + ends[1]) / 2, height]])
+        # The stable side is on the left: to the west it is below, to the east above.
+        places = ends[::-1] if root.rising else ends
+        arcs.append(
+            _straight(
+                np.array([[places[0], height], [places[1], height]]),
+                middle,
+                root.eigenvalue,
+                crossing.error / (high - low) + np.spacing(1.0),
+            )
+        )
+    first = bool(found.radius[0] < 1)
+    steps = np.diff([*heights, 1.0])
+    area = float(steps[0 if first else 1 :: 2].sum())
+    off = sum(float(arc.errors[0]) for arc in arcs)
+    return _Strip(ends[0], ends[1], tuple(arcs), (first, first), area, off)
+
+
+def _straight(points: Floats, knot: Floats, value: complex, error: float) -> Arc:
+    """Return a straight piece of the boundary (2, 2); at its knot (1, 2) `value` is the eigenvalue."""
+    chord = points[1] - points[0]
+    tangent = chord / np.linalg.norm(chord)
+    return Arc(
+        points=points,
+        tangents=np.array([tangent, tangent]),
+        errors=np.array([error]),
+        knots=knot,
+        values=np.array([value], np.complex128),
+        system=0,
+        rounding=0.0,
+        chain=0,
+        smooth=False,
+    )
+
+
+def _moving(
+    source: PointEvaluator,
+    delay: Range,
+    other: Range,
+    piece: Piece,
+    ends: Sequence[float],
+    cells: int,
+    tolerance: float,
+) -> _Strip | None:
+    """Return a strip in which events move with the delay: its curves, in units of the whole range."""
+    low = np.array([float(piece.low), float(other.low)])
+    high = np.array([float(min(piece.high, delay.high)), float(other.high)])
+    rectangle = Rectangle(low, high - low)
+    family = resolve_family(source, rectangle, lambda values: point_errors(source, values))
+    if isinstance(family, DirectFamily):
+        return None
+    found = survey(lambda points: log_magnitudes(family, points, BRANCHES), cells=cells)
+    arcs = trace(family, found, tolerance=tolerance * (1 - RESTATED), offset=low / rectangle.width)
+    area, off = stable_area(arcs, found)
+    offset = _rectangle(delay, other)
+    restated = [_restated(arc, ends, tolerance, offset.low / offset.width) for arc in arcs]
+    if any(arc is None for arc in restated):
+        return None
+    kept = tuple(arc for arc in restated if arc is not None)
+    return _Strip(ends[0], ends[1], kept, (found.corners[0], found.corners[1]), area, off)
+
+
+def _restated(arc: Arc, ends: Sequence[float], tolerance: float, offset: Floats) -> Arc | None:
+    """Return an arc of a strip's unit square as one of the whole's, whose cubics go another way between."""
+    scale = np.array([ends[1] - ends[0], 1.0])
+
+    def moved(points: Floats) -> Floats:
+        found: Floats = points * scale + np.array([ends[0], 0.0])
+        found[points[:, 0] == 0.0, 0], found[points[:, 0] == 1.0, 0] = ends[0], ends[1]
+        return found
+
+    pieces = 1
+    while pieces <= MOST_PIECES:
+        points, tangents = refined(arc.points, arc.tangents, pieces)
+        own = moved(points)
+        turned = tangents * scale
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        apart = np.zeros(len(own) - 1)
+        for share in (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875):
+            here = between(own[:-1], own[1:], turned[:-1], turned[1:], share)
+            # Refined once more, the strip's own curve has its points there.
+            along, way = refined(arc.points, arc.tangents, 8 * pieces)
+            there = moved(along)[round(8 * share) :: 8][: len(apart)]
+            normal = (way * scale)[round(8 * share) :: 8][: len(apart), ::-1] * [-1.0, 1.0]
+            normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+            apart = np.maximum(apart, np.abs(((here - there) * normal).sum(axis=1)))
+        normals = np.stack([turned[:-1, 1], -turned[:-1, 0]], axis=1)
+        if (apart <= RESTATED * tolerance * relative_to(own[:-1], normals, offset)).all():
+            errors = np.repeat(arc.errors, pieces) + apart
+            return replace(arc, points=own, tangents=turned, errors=errors, knots=moved(arc.knots))
+        pieces *= 2
+    return None
+
+
+def _join(
+    strips: Sequence[_Strip],
+    arcs: list[list[Arc]],
+    place: int,
+    same: float,
+    source: PointEvaluator,
+    rectangle: Rectangle,
+) -> list[Arc]:
+    """Join the curves of two strips at the edge between them; return the straight pieces along it.
+
+    Ends that are one point become one; where one side of the edge is stable and the other is not, the
+    boundary follows the edge.
+    """
+    edge = strips[place].start
+    marks: list[tuple[float, int, int, int]] = []  # height, side, arc, which end of it
+    for side in (0, 1):
+        for number, arc in enumerate(arcs[place - 1 + side]):
+            marks += [
+                (float(arc.points[end, 1]), side, number, end)
+                for end in ((0, -1) if not arc.closed else ())
+                if arc.points[end, 0] == edge
+            ]
+    marks.sort()
+    state = [strips[place - 1].stable[1], strips[place].stable[0]]
+    found, below = [], 0.0
+    for height, side, number, end in [*marks, (1.0, -1, 0, 0)]:
+        if state[0] != state[1]:
+            if side >= 0 and below > 0.0 and height - below <= same:
+                own = arcs[place - 1 + side][number]
+                arcs[place - 1 + side][number] = _ended(own, end, np.array([edge, below]))
+                height = below
+            elif height > below:
+                found.append(_edge_piece(edge, below, height, state[0], strips, place, source, rectangle))
+        if side >= 0:
+            state[side] = not state[side]
+        below = height
+    return found
+
+
+def _ended(arc: Arc, end: int, point: Floats) -> Arc:
+    """Return an arc with one end moved by less than a tolerance or so."""
+    points, errors = arc.points.copy(), arc.errors.copy()
+    errors[end] += float(np.linalg.norm(points[end] - point))
+    points[end] = point
+    return replace(arc, points=points, errors=errors)
+
+
+def _edge_piece(
+    edge: float,
+    low: float,
+    high: float,
+    stable_before: bool,
+    strips: Sequence[_Strip],
+    place: int,
+    source: PointEvaluator,
+    rectangle: Rectangle,
+) -> Arc:
+    """Return a piece of the boundary along an edge between strips, and the motion that grows beside it."""
+    grows = strips[place] if stable_before else strips[place - 1]
+    inside = (1 if stable_before else -1) * INSIDE * (grows.end - grows.start)
+    knot = np.array([[edge + inside, (low + high) / 2]])
+    values = np.concatenate([np.linalg.eigvals(one[0]) for one in source.matrices(rectangle.values(knot))])
+    points = np.array([[edge, low], [edge, high]])
+    leading = complex(values[np.argmax(np.abs(values))])
+    # Upwards, the left-hand side is the strip before.
+    return _straight(points if stable_before else points[::-1].copy(), knot, leading, float(np.spacing(1.0)))
+
+
+def _joined(arcs: Sequence[Arc], mode_of: Callable[[Arc], str]) -> list[Arc]:
+    """Return the arcs, straight ones of one mode that follow one another as one."""
+    found = [arc for arc in arcs if arc.smooth]
+    alike: dict[str, list[Arc]] = {}
+    for arc in arcs:
+        if not arc.smooth:
+            alike.setdefault(mode_of(arc), []).append(arc)
+    for listed in alike.values():
+        found += _chained(listed)
+    return found
+
+
+def _chained(listed: list[Arc]) -> list[Arc]:
+    """Return straight arcs, those that follow one another as one."""
+    found = []
+    while listed:
+        one = listed.pop()
+        for tail, head in ((-1, 0), (0, -1)):  # first what follows it, then what it follows
+            while not one.closed:
+                end = one.points[tail]
+                place = next(
+                    (n for n, arc in enumerate(listed) if np.array_equal(arc.points[head], end)), None
+                )
+                if place is None:
+                    break
+                other = listed.pop(place)
+                one = _after(one, other) if tail else _after(other, one)
+        found.append(one)
+    return found
+
+
+def _after(one: Arc, other: Arc) -> Arc:
+    return replace(
+        one,
+        points=np.concatenate([one.points, other.points[1:]]),
+        tangents=np.concatenate([one.tangents[:-1], other.tangents]),
+        errors=np.concatenate([one.errors, other.errors]),
+        knots=np.concatenate([one.knots, other.knots]),
+        values=np.concatenate([one.values, other.values]),
+    )
+
+
+def _swapped(arc: Arc) -> Arc:
+    """Return an arc with its coordinates in the other order, and so backwards: the stable side stays left."""
+    return replace(
+        arc,
+        points=arc.points[::-1, ::-1].copy(),
+        tangents=-arc.tangents[::-1, ::-1],
+        errors=arc.errors[::-1].copy(),
+        knots=arc.knots[::-1, ::-1].copy(),
+        values=arc.values[::-1].copy(),
+    )

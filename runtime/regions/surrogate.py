@@ -1,0 +1,246 @@
+"""Frame matrices over a rectangle of two parameters, as Chebyshev series.
+
+Takes: an `Evaluator` of two free parameters and their ranges.
+Gives: `ChebyshevFamily`, `DirectFamily`, `resolve_family`; `point_errors`.
+Guarantees: a series stands for the matrices only when it has converged to rounding in both directions, as
+seen from its last coefficients; how far it may be off is told.
+Does not: resolve what jumps or bends in the rectangle (see `DirectFamily`, which computes every point anew).
+
+The matrices of a frame are polynomials of stiffnesses and dampings, of as high a degree as there are ticks in
+a frame, and analytic functions of masses: M(x, y) = Σ_ij C_ij T_i(x) T_j(y), summed for all points by one
+product of matrices, derivatives as well. Interpolation at Chebyshev points converges geometrically and
+loses a digit at most (Trefethen, Approximation Theory and Approximation Practice, 2013, chapters 8 and 15).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.eigen.pseudospectrum import balance
+from apc.eigen.rigid import find_rigid_modes, relative_coordinates
+from apc.frame.discretize import UNIT
+from apc.regions.eigenpairs import Family
+from apc.vary.batch import Evaluator
+from apc.vary.evaluator import PointEvaluator
+
+Floats = NDArray[np.float64]
+
+# Bounds on the errors of each system's matrices (k, n, n) at values (k, 2).
+Errors = Callable[[Floats], tuple[Floats, ...]]
+
+# Nodes along each axis to begin with: a frame of eight ticks is of degree eight. Where that is not enough
+# they are doubled, until there are too many points.
+NODES = 12
+MOST_POINTS = 2500
+
+# The last coefficients along each axis must have come down to this share of the largest: some roundings of
+# the values they come from.
+CONVERGED = 64 * UNIT
+
+# Coefficients below this share of the largest are left out.
+DROPPED = 4 * UNIT
+
+# So many last coefficients along each axis are looked at: even and odd ones may vanish in turn.
+LAST = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Rectangle:
+    """Two ranges in SI: `low` and `width` (2,)."""
+
+    low: Floats
+    width: Floats
+
+    def values(self, points: Floats) -> Floats:
+        """Return parameter values (k, 2) at points of the unit square."""
+        return self.low + points * self.width
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DirectFamily:
+    """A `Family` that asks the evaluator for every point."""
+
+    evaluator: Evaluator
+    rectangle: Rectangle
+    sizes: tuple[int, ...]
+    errors: tuple[Floats, ...]
+
+    def matrices(self, points: Floats) -> tuple[Floats, ...]:
+        """Return each system's matrices (k, n, n) at points (k, 2)."""
+        return self.evaluator.matrices(self.rectangle.values(points))
+
+    def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
+        """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
+        count = len(points)
+        values = np.concatenate([self.rectangle.values(points)] * 2)
+        along = np.zeros_like(values)
+        along[:count, 0], along[count:, 1] = self.rectangle.width
+        matrix, slope = self.evaluator.slopes(values, along)[system]
+        return matrix[:count], slope.reshape(2, count, *slope.shape[1:])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChebyshevFamily:
+    """A `Family` that sums series: `terms` (m, 2) are the degrees (i, j) kept, `coefficients` (m, n²) theirs.
+
+    One of each a system.
+    """
+
+    terms: tuple[NDArray[np.int64], ...]
+    coefficients: tuple[Floats, ...]
+    sizes: tuple[int, ...]
+    errors: tuple[Floats, ...]
+
+    def matrices(self, points: Floats) -> tuple[Floats, ...]:
+        """Return each system's matrices (k, n, n) at points (k, 2)."""
+        degree = max(int(one.max(initial=0)) for one in self.terms)
+        x, y = _polynomials(points, degree)
+        return tuple(
+            ((x[:, terms[:, 0]] * y[:, terms[:, 1]]) @ coefficients).reshape(-1, n, n)
+            for terms, coefficients, n in zip(self.terms, self.coefficients, self.sizes, strict=True)
+        )
+
+    def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
+        """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
+        terms = self.terms[system]
+        degree = int(terms.max(initial=0))
+        values = _polynomials(points, degree)
+        slopes = _derivatives(points, values)
+        (x, y), (slope_x, slope_y) = (
+            (one[0][:, terms[:, 0]], one[1][:, terms[:, 1]]) for one in (values, slopes)
+        )
+        n = self.sizes[system]
+        summed = np.concatenate([x * y, slope_x * y, x * slope_y]) @ self.coefficients[system]
+        both = summed.reshape(3, len(points), n, n)
+        return both[0], both[1:]
+
+
+def _polynomials(points: Floats, degree: int) -> Floats:
+    """Return T_i(2u − 1) of both coordinates (2, k, degree + 1): T_(i+1) = 2x T_i − T_(i−1)."""
+    x = 2 * points.T - 1
+    found = np.empty((degree + 1, *x.shape))
+    found[0] = 1
+    if degree:
+        found[1] = x
+        for i in range(2, degree + 1):
+            found[i] = 2 * x * found[i - 1] - found[i - 2]
+    return found.transpose(1, 2, 0)
+
+
+def _derivatives(points: Floats, values: Floats) -> Floats:
+    """Return dT_i/du: T_(i+1)′ = 2 T_i + 2x T_i′ − T_(i−1)′ over x, twice that over u."""
+    x = 2 * points.T - 1
+    values = values.transpose(2, 0, 1)
+    found = np.zeros_like(values)
+    degree = len(found) - 1
+    if degree:
+        found[1] = 2
+        for i in range(2, degree + 1):
+            found[i] = 4 * values[i - 1] + 2 * x * found[i - 1] - found[i - 2]
+    return found.transpose(1, 2, 0)
+
+
+def resolve_family(evaluator: Evaluator, rectangle: Rectangle, errors: Errors) -> Family:
+    """Return the matrices over a rectangle as series where these converge, else as the evaluator has them.
+
+    Parameters
+    ----------
+    evaluator
+        Of two free parameters.
+    rectangle
+        Their ranges.
+    errors
+        Bounds (k, n, n) on the errors of each system's matrices at values (k, 2), entry by entry.
+    """
+    corners = rectangle.values(np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]]))
+    wrong = [one.max(axis=0) for one in errors(corners)]
+    counts = (NODES, NODES)
+    while counts[0] * counts[1] <= MOST_POINTS:
+        sampled, series = _sample(evaluator, rectangle, counts)
+        if series is None:
+            break
+        # Other units of the states, which no eigenvalue feels, so that no entry is rounded like a larger.
+        scales = [balance(np.abs(one).max(axis=0)) for one in sampled]
+        series = [
+            one * (scale[None, :] / scale[:, None]).ravel() for one, scale in zip(series, scales, strict=True)
+        ]
+        largest = [float(np.abs(one).max(initial=0.0)) for one in series]
+        x_done, y_done = (
+            all(
+                float(np.abs(np.moveaxis(one, axis, 0)[-LAST:]).max(initial=0.0)) <= CONVERGED * most
+                for one, most in zip(series, largest, strict=True)
+            )
+            for axis in (0, 1)
+        )
+        if x_done and y_done:
+            kept = [
+                np.argwhere(np.abs(one).max(axis=2) > DROPPED * most)
+                for one, most in zip(series, largest, strict=True)
+            ]
+            left_out = sum(counts) * CONVERGED + counts[0] * counts[1] * DROPPED
+            return ChebyshevFamily(
+                terms=tuple(kept),
+                coefficients=tuple(
+                    one[terms[:, 0], terms[:, 1]] for one, terms in zip(series, kept, strict=True)
+                ),
+                sizes=tuple(one.shape[1] for one in sampled),
+                errors=tuple(
+                    one * scale / scale[:, None] + left_out * most
+                    for one, scale, most in zip(wrong, scales, largest, strict=True)
+                ),
+            )
+        counts = (counts[0] * (1 if x_done else 2), counts[1] * (1 if y_done else 2))
+    sampled = evaluator.matrices(corners[:1])
+    return DirectFamily(evaluator, rectangle, tuple(one.shape[1] for one in sampled), tuple(wrong))
+
+
+def _sample(
+    evaluator: Evaluator, rectangle: Rectangle, counts: tuple[int, int]
+) -> tuple[tuple[Floats, ...], list[Floats] | None]:
+    """Return each system's matrices (k, n, n) at Chebyshev points, and their coefficients (n_x, n_y, n²).
+
+    None in their place where some matrix is not finite.
+    """
+    nodes = [(1 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) / 2 for count in counts]
+    points = np.stack([np.repeat(nodes[0], counts[1]), np.tile(nodes[1], counts[0])], axis=1)
+    sampled = evaluator.matrices(rectangle.values(points))
+    if not all(np.isfinite(one).all() for one in sampled):
+        return sampled, None
+    x, y = (_to_coefficients(one) for one in nodes)
+    series = []
+    for one in sampled:
+        values = one.reshape(counts[0], -1)
+        by_y = (x @ values).reshape(counts[0], counts[1], -1)
+        series.append(y @ by_y)
+    return sampled, series
+
+
+def _to_coefficients(nodes: Floats) -> Floats:
+    """Return what turns values at Chebyshev points into coefficients: row i is cos(i θ) at their angles."""
+    count = len(nodes)
+    transform: Floats = np.cos(np.outer(np.arange(count), np.arccos(2 * nodes - 1))) * (2 / count)
+    transform[0] /= 2
+    return transform
+
+
+def point_errors(source: PointEvaluator, values: Floats) -> tuple[Floats, ...]:
+    """Return bounds (1, n, n) on the errors of an evaluator's one matrix, amid some values (k, 2).
+
+    A block of relative coordinates x_rest − W x_held is off by what its rows and W times the others' are.
+    """
+    middle = values.mean(axis=0)
+    (matrix,) = source.matrices(middle[None])
+    found = np.zeros(matrix.shape)
+    start = 0
+    for system in source.closed_at(middle.tolist()):
+        free = find_rigid_modes(system, with_drifts=False)
+        held, rest, weights = relative_coordinates(free.basis)
+        error = system.error[np.ix_(rest, rest)] + np.abs(weights) @ system.error[np.ix_(held, rest)]
+        rows = slice(start, min(start + len(rest), matrix.shape[-1]))
+        found[0, rows, rows] = error[: rows.stop - start, : rows.stop - start]
+        start = rows.stop
+    return (found,)

@@ -1,0 +1,275 @@
+"""Many runs of one scene, each with packets of its own, and what they have in common.
+
+Takes: a `CompiledSystem`, its `Settings`, how many runs.
+Gives: `Run`, `Ensemble`, `play_many`; `ensemble_text`.
+Guarantees: run k is the same whoever plays it, in whatever order, however many there are; a share and a mean
+stand with how far chance may have moved them; on Ctrl-C the runs that are done are kept.
+Does not: keep rows: to see run k, play it alone.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import signal
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apc.compiler import store
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import counted
+from apc.simulation.blocks import blocks
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+from apc.simulation.summary import Watch
+from apc.threads import single_threaded
+
+QUANTILES = (0.05, 0.5, 0.95)
+SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
+PART = 20  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
+LABELS = {
+    "settled": "settled at [s]",
+    "largest_force": "largest force [N]",
+    "copies_apart": "copies apart [m]",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run: its number, its verdict as in `summary`, and some numbers in SI, None where there is none.
+
+    `copies_apart` is the largest distance between the peers' copies of a position at the end.
+    """
+
+    number: int
+    verdict: str
+    settled: float | None
+    largest_force: float | None
+    copies_apart: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Of `count` numbers: mean with its standard error, ends, and the quantiles of `QUANTILES`."""
+
+    count: int
+    mean: float
+    standard_error: float
+    low: float
+    high: float
+    quantiles: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Ensemble:
+    """Runs of a scene, in their order; `interrupted` says that there were to be more."""
+
+    topology: str
+    duration: Fraction
+    seed: int
+    runs: tuple[Run, ...]
+    interrupted: bool = False
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        return ensemble_text(self)
+
+    @property
+    def verdicts(self) -> tuple[tuple[str, int], ...]:
+        """How many runs have each verdict, the most frequent first."""
+        return tuple(Counter(run.verdict for run in self.runs).most_common())
+
+    def statistics(self, name: str) -> Statistics | None:
+        """Return what the runs' numbers of a name, such as "settled", amount to; None if no run has one."""
+        listed = [value for run in self.runs if (value := getattr(run, name)) is not None]
+        if not listed:
+            return None
+        values = np.array(listed)
+        n = len(values)
+        error = float(values.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
+        quantiles = tuple(float(one) for one in np.quantile(values, QUANTILES))
+        return Statistics(n, float(values.mean()), error, float(values.min()), float(values.max()), quantiles)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data, ready for JSON."""
+        n = len(self.runs)
+        found = {name: self.statistics(name) for name in LABELS}
+        return {
+            "topology": self.topology,
+            "duration_s": float(self.duration),
+            "seed": self.seed,
+            "runs": n,
+            "interrupted": self.interrupted,
+            "verdicts": {
+                verdict: {"runs": count, "share": count / n, "share_95": list(share_interval(count, n))}
+                for verdict, count in self.verdicts
+            },
+            **{
+                name: None
+                if one is None
+                else {
+                    "runs": one.count,
+                    "mean": one.mean,
+                    "standard_error": one.standard_error if one.count > 1 else None,
+                    "low": one.low,
+                    "high": one.high,
+                    "quantiles": dict(zip(map(str, QUANTILES), one.quantiles, strict=True)),
+                }
+                for name, one in found.items()
+            },
+        }
+
+
+def share_interval(count: int, total: int) -> tuple[float, float]:
+    """Return the 95 % confidence interval of a share, by Wilson's score (1927, J. Am. Stat. Assoc. 22)."""
+    share, z2 = count / total, SURE**2
+    centre = (share + z2 / (2 * total)) / (1 + z2 / total)
+    half = SURE * math.sqrt(share * (1 - share) / total + z2 / (4 * total**2)) / (1 + z2 / total)
+    return max(centre - half, 0.0), min(centre + half, 1.0)
+
+
+def play_many(
+    system: CompiledSystem,
+    settings: Settings,
+    *,
+    runs: int,
+    jobs: int = 1,
+    progress: Callable[[int], None] | None = None,
+) -> Ensemble:
+    """Play a scene many times, each time with other packets.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    settings
+        How each run is played; run k of a seed is always the same.
+    runs
+        How many, 1 or more.
+    jobs
+        How many processes share the work; 1: this one alone.
+    progress
+        Is told how many runs are done.
+
+    Raises
+    ------
+    ApcError
+        E894 nothing in the scene is left to chance; E895 a process ended without a word; and those of
+        `simulation.prepare`.
+    """
+    if not any(link.channel is not None for link in system.links):
+        what = f"nothing in {system.name} is left to chance: every run would be the same"
+        raise ApcError(Mistake("E894", Place(system.name), what, hint="links: {lan: {…, loss: 2 %}}"))
+    seed = system.experiment.seed if settings.seed is None else settings.seed
+    settings = replace(settings, seed=seed)
+    parts = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
+    done: list[Run] = []
+    interrupted = False
+    work = _here(system, settings, parts) if jobs == 1 else _shared(system, settings, parts, jobs)
+    try:
+        for found in work:
+            done += found
+            if progress is not None:
+                progress(len(done))
+    except KeyboardInterrupt:
+        if not done:
+            raise
+        interrupted = True
+    done.sort(key=lambda run: run.number)
+    return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted)
+
+
+def _here(system: CompiledSystem, settings: Settings, parts: Sequence[range]) -> Iterator[list[Run]]:
+    simulation = prepare(system, settings)
+    for part in parts:
+        yield [_played(simulation, number) for number in part]
+
+
+def _shared(
+    system: CompiledSystem, settings: Settings, parts: Sequence[range], jobs: int
+) -> Iterator[list[Run]]:
+    """Yield the runs as processes, each started afresh, get them done."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.apc"
+        store.save(system, path)
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(jobs, len(parts)), context, _ignore_interrupts)
+        try:
+            waiting = [pool.submit(_part, str(path), settings, part) for part in parts]
+            for future in as_completed(waiting):
+                yield future.result()
+        except BrokenProcessPool:
+            what = "a process that played runs ended without a word: stopped from outside, or out of memory"
+            raise ApcError(Mistake("E895", Place(system.name), what, hint="--jobs 1")) from None
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C to the process that shares out the work."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _part(path: str, settings: Settings, part: range) -> list[Run]:
+    with single_threaded():
+        simulation = _opened(path, settings)
+        return [_played(simulation, number) for number in part]
+
+
+@lru_cache(maxsize=1)
+def _opened(path: str, settings: Settings) -> Simulation:
+    return prepare(store.load(Path(path)), settings)
+
+
+def _played(simulation: Simulation, number: int) -> Run:
+    watch = Watch(simulation)
+    for block in blocks(simulation, run=number):
+        watch.take(block)
+    found = watch.summary()
+    force = found.largest_force
+    positions = {state.name for kind in simulation.system.kinds for state in kind.states if state.unit == "m"}
+    apart = [distance for name, distance in found.copies if name in positions]
+    return Run(
+        number,
+        found.verdict,
+        found.settled,
+        None if force is None else force[1],
+        max(apart) if apart else None,
+    )
+
+
+def ensemble_text(ensemble: Ensemble) -> str:
+    """Return what many runs amount to, in words of at most 80 columns."""
+    n = len(ensemble.runs)
+    lines = [
+        f"{ensemble.topology[:40]}: {counted(n, 'run')} of {float(ensemble.duration):g} s, "
+        f"seed {ensemble.seed}"
+    ]
+    for verdict, count in ensemble.verdicts:
+        low, high = share_interval(count, n)
+        told = f"{100 * count / n:.3g} % (95 % sure: {100 * low:.3g} % to {100 * high:.3g} %)"
+        lines.append(f"  {verdict:<10} {count:>8}   {told}")
+    lines.append(f"  {'':<18}{'mean':>10} ±{'error':>8}{'5 %':>10}{'median':>10}{'95 %':>10}{'most':>10}")
+    for name, label in LABELS.items():
+        one = ensemble.statistics(name)
+        if one is not None:
+            error = f"{one.standard_error:>8.1g}" if one.count > 1 else f"{'':>8}"
+            numbers = "".join(f"{value:>10.4g}" for value in (*one.quantiles, one.high))
+            lines.append(f"  {label:<18}{one.mean:>10.4g} ±{error}{numbers}")
+    settled = ensemble.statistics("settled")
+    if settled is not None and settled.count < n:
+        lines.append(f"  settled at: of the {settled.count} runs that settle")
+    if ensemble.interrupted:
+        lines.append("  interrupted: there were to be more runs")
+    return "\n".join(lines)

@@ -1,0 +1,221 @@
+"""What forces that change with time alone add to a site's motion, exact to rounding.
+
+Takes: the `Rates` of a kind, parameter vectors, when the intervals begin and how long they last.
+Gives: `Forcing`, `forcing_of`, `SiteForcing`, `impulses`.
+Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
+a table), so that what is integrated is smooth; an impulse is right to a few roundings of its terms and of
+the instants.
+Does not: integrate what depends on the motion.
+
+    c = ∫₀ᵀ e^{A (T − s)} g(t + s) ds
+
+over all intervals of one length at once, by two rules (see `quadrature`); where they differ by more than
+rounding, a panel is halved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.frame.guards import guards_of
+from apc.simulation.instants import at_instants
+from apc.simulation.propagate import Rates
+from apc.simulation.quadrature import AGREE, Kernel, Panels, integrate, magnitude, panels, whole
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+MOST_HALVINGS = 30  # below 1e-9 of an interval, what a jump is missed by is far below a rounding
+MOST_PANELS = 256  # integrated at once: what is held of them stays within some MB, however many there are
+LOOKS = 5  # instants of an interval at which a switch that is not linear in time is looked for
+
+# A switch is found to this share of the interval, or to a rounding of its instant.
+PLACED = 2.0**-60
+# Where it is looked for between two instants: evenly, which leaves 1/32 of what is between them, and nearer
+# and nearer to where a straight line through both would cross 0, which leaves nothing if it is one.
+EVENLY = np.arange(1, 32) / 32
+NEARER = 4.0 ** -np.arange(1, 31)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forcing:
+    """A kind's g(t): what pushes the states `pushed`, and where it is not smooth.
+
+    `force(p, t)` is their rows of g, `drift(p, t)` those of t dg/dt: a rounding of t changes g by so many.
+    Not smooth is g at sign changes of `switches(p, t)`; `affine` says that all of them are linear in time.
+    """
+
+    pushed: tuple[int, ...]
+    force: Any  # casadi.Function
+    drift: Any  # casadi.Function
+    switches: Any  # casadi.Function
+    affine: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteForcing:
+    """The forces on one site: its parameters (n_p,), and the kernel of each length of intervals."""
+
+    forcing: Forcing
+    parameters: Floats
+    kernels: tuple[Kernel, ...]
+
+
+def forcing_of(rates: Rates) -> Forcing:
+    """Find what a kind's forces push, and where they switch with time."""
+    type_: Any = casadi.SX if rates.rate.is_a("SXFunction") else casadi.MX
+    p, t = type_.sym("p", rates.rate.numel_in(0)), type_.sym("t")
+    g = rates.rate(p, t)
+    pushed, found, affine = tuple(range(g.numel())), [], True
+    if type_ is casadi.SX:  # a nonlinear loop has no switches but those halving finds
+        pushed = tuple(row for row in pushed if not g[row].is_zero())
+        found = guards_of(g, t)
+    g = g[list(pushed)]
+    if found:
+        slopes = casadi.jacobian(casadi.vertcat(*found), t)
+        affine = not (slopes.nnz() and casadi.depends_on(slopes, t))
+    column = casadi.vertcat(*found) if found else type_(0, 1)
+    return Forcing(
+        pushed=pushed,
+        force=casadi.Function("force", [p, t], [casadi.densify(g)]),
+        drift=casadi.Function("drift", [p, t], [casadi.densify(t * casadi.jacobian(g, t))]),
+        switches=casadi.Function("switches", [p, t], [casadi.densify(column)]),
+        affine=affine,
+    )
+
+
+def impulses(site: SiteForcing, starts: Floats, which: Integers) -> Floats:
+    """Return c of every interval (intervals, n_x).
+
+    Parameters
+    ----------
+    site
+        The forces.
+    starts
+        When each interval begins, in seconds (intervals,).
+    which
+        The place of each interval's length in the site's `kernels` (intervals,).
+    """
+    result = np.zeros((len(starts), len(site.kernels[0].a)))
+    for place, kernel in enumerate(site.kernels):
+        rows = np.flatnonzero(which == place)
+        result[rows] = _impulses_of_length(site, kernel, starts[rows])
+    return result
+
+
+def _impulses_of_length(site: SiteForcing, kernel: Kernel, starts: Floats) -> Floats:
+    total, off, size = _integrated(site, whole(kernel), starts)
+    rows, at = _switched(site, kernel, starts)
+    off[rows] = True
+    if not off.any():
+        return total
+    total[off] = 0.0
+    work = [(*_between(np.flatnonzero(off), rows, at, float(kernel.duration)), 0)]
+    while work:
+        rows, low, high, halvings = work.pop()
+        if len(rows) > MOST_PANELS:
+            work.append((rows[MOST_PANELS:], low[MOST_PANELS:], high[MOST_PANELS:], halvings))
+            rows, low, high = rows[:MOST_PANELS], low[:MOST_PANELS], high[:MOST_PANELS]
+        added, off, own = _integrated(site, panels(kernel, low, high), starts[rows], size[rows])
+        np.maximum.at(size, rows, own)  # a step at the very end is not seen from afar
+        off &= halvings < MOST_HALVINGS
+        np.add.at(total, rows[~off], added[~off])
+        if off.any():
+            rows, low, high = rows[off], low[off], high[off]
+            middle = (low + high) / 2
+            halves = np.tile(rows, 2), np.append(low, middle), np.append(middle, high)
+            work.append((*halves, halvings + 1))
+    return total
+
+
+def _integrated(
+    site: SiteForcing, found: Panels, starts: Floats, size: Floats | float = 0.0
+) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    """Integrate panels of intervals that begin at `starts` (k,), all of one or each of its own.
+
+    Returns
+    -------
+    The integrals (k, n_x); which of them both rules do not agree upon (k,); what their terms add up to
+    (k, n_x), at least `size`.
+    """
+    instants = starts[:, None] + found.after
+    g = at_instants(site.forcing.force, site.parameters, instants)
+    fine, apart = integrate(found, g)
+    size = np.maximum(magnitude(found, g), size)
+    off: NDArray[np.bool_] = ~np.all(apart <= AGREE * size, axis=1)
+    if off.any():  # it may be that of rounding the instants, which no halving mends
+        some = found if len(found.after) == 1 else found.chosen(off)
+        drift = at_instants(site.forcing.drift, site.parameters, instants[off])
+        moved = magnitude(some, np.where(np.isfinite(drift), drift, 0.0))
+        off[off] = ~np.all(apart[off] <= AGREE * (size[off] + moved), axis=1)
+    return fine, off, size
+
+
+def _between(again: Integers, rows: Integers, at: Floats, duration: float) -> tuple[Integers, Floats, Floats]:
+    """Return the panels of the intervals `again`: whose they are, and where they begin and end.
+
+    `at` (k,) are instants of the intervals `rows` (k,) at which something switches.
+    """
+    ends = np.concatenate([np.tile([0.0, duration], len(again)), at])
+    whose = np.concatenate([np.repeat(again, 2), rows])
+    order = np.lexsort((ends, whose))
+    ends, whose = ends[order], whose[order]
+    inside = (whose[1:] == whose[:-1]) & (ends[1:] > ends[:-1])
+    return whose[:-1][inside], ends[:-1][inside], ends[1:][inside]
+
+
+def _switched(site: SiteForcing, kernel: Kernel, starts: Floats) -> tuple[Integers, Floats]:
+    """Return the intervals within which something switches, and how long after their beginning."""
+    forcing, length = site.forcing, float(kernel.duration)
+    if not forcing.switches.numel_out(0):
+        return np.empty(0, np.int64), np.empty(0)
+    looks = np.linspace(0.0, length, 2 if forcing.affine else LOOKS)
+    values = at_instants(forcing.switches, site.parameters, starts[:, None] + looks)
+    switch, row, gap = np.nonzero(np.sign(values[:, :, 1:]) != np.sign(values[:, :, :-1]))
+    low, high = looks[gap], looks[gap + 1]
+    ends = values[switch, row, gap], values[switch, row, gap + 1]
+    at = _placed(site, starts[row], switch, low, high, ends, PLACED * length)
+    inside = (at > PLACED * length) & (at < length)
+    return row[inside], at[inside]
+
+
+def _placed(
+    site: SiteForcing,
+    starts: Floats,
+    switch: Integers,
+    low: Floats,
+    high: Floats,
+    ends: tuple[Floats, Floats],
+    enough: float,
+) -> Floats:
+    """Return where a switch changes sign between `low` and `high`, seconds after `starts`; all (k,).
+
+    `ends` are its values there.
+    """
+    first, last = (one.copy() for one in ends)
+    low, high = low.copy(), high.copy()
+    sign = np.sign(first)
+    while True:
+        width = high - low
+        busy = np.flatnonzero((width > enough) & (starts + low < starts + high - np.spacing(starts + high)))
+        if not len(busy):
+            return high
+        with np.errstate(all="ignore"):
+            guess = first[busy] / (first[busy] - last[busy])
+        guess = np.where((guess > 0) & (guess < 1), guess, np.where(first[busy] == 0, 0.0, 0.5))[:, None]
+        shares = np.concatenate([np.tile(EVENLY, (len(busy), 1)), guess - NEARER, guess + NEARER], axis=1)
+        shares = np.sort(np.clip(shares, 0.0, 1.0), axis=1)
+        places = np.clip(low[busy, None] + width[busy, None] * shares, low[busy, None], high[busy, None])
+        places = np.concatenate([low[busy, None], places, high[busy, None]], axis=1)
+        every = at_instants(site.forcing.switches, site.parameters, starts[busy, None] + places)
+        values = every[switch[busy], np.arange(len(busy))]
+        values[:, 0], values[:, -1] = first[busy], last[busy]
+        after = np.argmax(np.sign(values) != sign[busy, None], axis=1)
+        line = np.arange(len(busy))
+        low[busy], high[busy] = places[line, after - 1], places[line, after]
+        first[busy], last[busy] = values[line, after - 1], values[line, after]

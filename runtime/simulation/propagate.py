@@ -1,0 +1,228 @@
+"""What a site's continuous states do from event to event: the exact transition of a linear partition.
+
+Takes: a `Kind` and parameter vectors.
+Gives: `Rates`, `rates`, `Transitions`, `transitions`, `perturbed`; `nonlinear_rows`.
+Guarantees: no step size; every entry of a transition is right to the last digit but one.
+Does not: integrate what is not linear (see `flow`), or know what changes with time alone (see `forcing`).
+
+    dx/dt = A x + B u + g(t)        x(t + T) = E x(t) + F u + c,  u held
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Kind
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.discretize import discretize
+from apc.frame.exact import evaluate_exact
+from apc.frame.guards import guards_of
+from apc.frame.jacobians import structural_pattern
+from apc.frame.parameters import exact_numbers
+
+Floats = NDArray[np.float64]
+Pattern = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rates:
+    """The continuous equations of a kind, linear in x and u.
+
+    `matrices(p)` is [A B g] (n_x, n_x + n_u + 1), column-major, with the part of g that does not change;
+    `timed` says that g changes with time: then g is zero there, and `rate(p, t)` gives it. `e`, `f` and `g`
+    are where E, F and c can differ from zero, whatever the numbers. States that are moved otherwise have
+    no entries.
+    """
+
+    kind: Kind
+    matrices: Any  # casadi.Function
+    rate: Any  # casadi.Function
+    timed: bool
+    e: Pattern  # (n_x, n_x)
+    f: Pattern  # (n_x, n_u)
+    g: Pattern  # (n_x,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transitions:
+    """[E F c] (n_x, n_x + n_u + 1) of one site for every duration, and A (n_x, n_x), exact."""
+
+    matrices: tuple[Floats, ...]
+    a: NDArray[Any]
+
+
+def nonlinear_rows(kind: Kind) -> tuple[int, ...]:
+    """Return the states whose equations are not linear, and all that equations tie to them."""
+    moving, _, t, speed = _symbols(kind)
+    curved = _curved(speed, moving, t)
+    if not curved:
+        return ()
+    tied = structural_pattern(kind.derivative.jac_sparsity(0, 0))
+    together = _closure(tied | tied.T)
+    return tuple(np.flatnonzero(together[:, curved].any(axis=1)).tolist())
+
+
+def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
+    """Take the linear continuous equations of a kind apart.
+
+    Parameters
+    ----------
+    kind
+        The kind.
+    moved
+        States that are moved otherwise, with all that equations tie to them.
+
+    Raises
+    ------
+    ApcError
+        E870 the others' equations are not linear.
+    """
+    moving, p, t, speed = _symbols(kind)
+    n_x, rest = len(kind.states), sorted(set(range(len(kind.states))) - set(moved))
+    curved = sorted(set(_curved(speed, moving, t)) & set(rest))
+    if curved:
+        raise _nonlinear(kind, curved, speed, moving, p)
+    slopes = casadi.jacobian(speed, moving)
+    type_ = type(moving)
+    at_rest = kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
+    still = type_.zeros(n_x, 1)
+    for row in rest:
+        still[row] = at_rest[row]
+    kept = casadi.diag(casadi.DM([float(row in rest) for row in range(n_x)]))
+    slopes = casadi.sparsify(kept) @ slopes
+    if type_ is casadi.MX:  # the same wherever they are taken, but a loop's solution is of somewhere
+        at = casadi.Function("slopes", [moving, p, t], [slopes])
+        slopes = at(type_.zeros(moving.numel()), p, 0)
+    timed = bool(still.numel() and casadi.depends_on(still, t))
+    constant = type_.zeros(*still.shape) if timed else still
+    structure = structural_pattern(slopes)
+    reach = _closure(structure[:, :n_x])
+    pushed = (
+        np.ones(n_x, dtype=bool) if type_ is casadi.MX else structural_pattern(casadi.sparsify(still))[:, 0]
+    )
+    flat = casadi.vec(casadi.horzcat(casadi.densify(slopes), constant))
+    if type_ is casadi.MX:  # which names the symbols of the other rows, even where no value hangs on them
+        flat = casadi.substitute([flat], [moving, t], [type_.zeros(*moving.shape), type_(0)])[0]
+    own: Pattern = np.isin(np.arange(n_x), rest)
+    return Rates(
+        kind=kind,
+        matrices=casadi.Function("matrices", [p], [flat]),
+        rate=casadi.Function("rate", [p, t], [still]),
+        timed=timed,
+        e=reach & own[:, None],
+        f=((reach.astype(int) @ structure[:, n_x:].astype(int)) > 0) & own[:, None],
+        g=((reach.astype(int) @ pushed.astype(int)) > 0) & own,
+    )
+
+
+def perturbed(exact: Transitions, seed: int) -> Transitions:
+    """Return the same transitions with every number off by one rounding, up or down by chance.
+
+    Parameters
+    ----------
+    exact
+        The transitions.
+    seed
+        Of the chance.
+    """
+    chance = np.random.default_rng(seed)
+
+    def moved(matrix: Floats) -> Floats:
+        towards = np.where(chance.random(matrix.shape) < 0.5, -np.inf, np.inf)
+        return np.where(matrix == 0, 0.0, np.nextafter(matrix, towards))
+
+    return Transitions(tuple(moved(one) for one in exact.matrices), exact.a)
+
+
+def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fraction]) -> Transitions:
+    """Return what a site does in every duration.
+
+    Parameters
+    ----------
+    rates_of
+        The kind's equations.
+    parameters
+        The site's vector (n_p,).
+    durations
+        In seconds.
+
+    Raises
+    ------
+    ApcError
+        E806 something grows beyond the range of floats within a duration.
+    """
+    kind = rates_of.kind
+    n_x, n_u = len(kind.states), len(kind.holds)
+    if rates_of.matrices.is_a("SXFunction"):
+        exact = evaluate_exact(
+            rates_of.matrices, [exact_numbers(kind, np.asarray(parameters, dtype=np.float64))]
+        )[0]
+    else:
+        exact = [Fraction(float(one)) for one in np.asarray(rates_of.matrices(parameters)).ravel()]
+    whole = np.array(exact, dtype=object).reshape((n_x, n_x + n_u + 1), order="F")
+    steps = discretize(whole[:, :n_x], whole[:, n_x:], durations)
+    return Transitions(tuple(step.matrix for step in steps), whole[:, :n_x])
+
+
+def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:
+    """Return (x, u), p and t as symbols, and the rates of change."""
+    type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
+    x, u = type_.sym("x", len(kind.states)), type_.sym("u", len(kind.holds))
+    p, t = type_.sym("p", len(kind.parameters)), type_.sym("t")
+    speed = kind.derivative(x, u, p, t)
+    if type_ is casadi.SX:
+        return casadi.vertcat(x, u), p, t, speed
+    # A derivative is taken with respect to a symbol, which a column of two is not.
+    both = type_.sym("moving", x.numel() + u.numel())
+    speed = kind.derivative(both[: x.numel()], both[x.numel() :], p, t)
+    return both, p, t, speed
+
+
+def _curved(speed: Any, moving: Any, t: Any) -> list[int]:
+    """Return the rates that are not linear in what moves: their slopes change, or they jump."""
+    slopes = casadi.jacobian(speed, moving)
+    varies = casadi.vertcat(moving, t)
+    return [
+        row
+        for row in range(speed.numel())
+        if (slopes[row, :].nnz() and casadi.depends_on(slopes[row, :], varies))
+        or (isinstance(speed, casadi.SX) and guards_of(speed[row], moving))
+    ]
+
+
+def _closure(a: Pattern) -> Pattern:
+    """Return where exp(A T) can differ from zero: what reaches what, however indirectly."""
+    reach = a | np.eye(len(a), dtype=bool)
+    for _ in range(max(len(a) - 1, 0).bit_length()):
+        reach = (reach.astype(int) @ reach.astype(int)) > 0
+    return reach
+
+
+def _nonlinear(kind: Kind, rows: Sequence[int], speed: Any, moving: Any, p: Any) -> ApcError:
+    """Return the mistake that names the states and the parts whose equations are not linear."""
+    involved = []
+    for row in rows:
+        guards = guards_of(speed[row], moving) if isinstance(speed, casadi.SX) else []
+        bends = casadi.jacobian(casadi.jacobian(speed[row], moving).T, moving)
+        varies = casadi.vertcat(casadi.vec(bends), *guards)
+        reads = casadi.which_depends(varies, p, 1, False) if p.numel() else ()
+        parts = {name.rpartition(".")[0] for name, read in zip(kind.parameters, reads, strict=True) if read}
+        involved.append(parts - {""})
+    shared = set.intersection(*involved) or set.union(*involved)
+    # What moves is named already; the force that moves it is of another part, if of any.
+    shared = shared - {state.name.rpartition(".")[0] for state in kind.states} or shared
+    through = f" through {' and '.join(sorted(shared))}" if shared else ""
+    names = ", ".join(kind.states[row].name for row in rows)
+    what = (
+        f"the motion of {names} is not linear between the ticks{through}: only what is linear "
+        "there can be simulated exactly"
+    )
+    hint = "no --method (what is linear stays exact), or a part that computes its force at ticks of a clock"
+    return ApcError(Mistake("E870", Place(kind.name), what, hint=hint))

@@ -1,0 +1,349 @@
+"""A scene made ready to be played in time: one function for a stretch of frames of all peers.
+
+Takes: a `CompiledSystem`, its `Settings`, the signals wanted. Gives: `Simulation`, `prepare`.
+Guarantees: time is counted in whole quanta; what would not fit the memory is refused before it is built.
+Does not: play it (see `blocks`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.parameters import Numbers, resolve
+from apc.frame.schedule import Kept, Propagate, Schedule
+from apc.frame.scheduling import build_schedules
+from apc.frame.site import LinearSite
+from apc.network.gathering import Gate, build_gates, kept_links
+from apc.network.timetable import Route, routes_of
+from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move
+from apc.simulation.forcing import SiteForcing, forcing_of
+from apc.simulation.local_signals import LocalSignal, local_signals
+from apc.simulation.member import Member, build_member
+from apc.simulation.methods import CVODES, EXACT, WHERE_NEEDED, Method, check_step
+from apc.simulation.native import native
+from apc.simulation.pairs import count_pairs
+from apc.simulation.population import Population, build_population, exchanges_within, refuse_unheard_of
+from apc.simulation.program import Program
+from apc.simulation.propagate import Transitions, perturbed, rates, transitions
+from apc.simulation.quadrature import Kernel, kernel_of
+from apc.simulation.scales import state_scales
+from apc.simulation.settings import Settings
+from apc.simulation.signals import Choice, Signal, choose, signals_of
+from apc.simulation.writing import build_program
+from apc.trouble import finite_equations
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# Numbers that one call of the chunked function gives out, at most, if a frame gives fewer: 4 MiB stay in the
+# machine's caches, and CasADi builds the function in a tenth of a second.
+CHUNK = 2**19
+ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
+# Numbers that come into one call, at most: 4 MiB. Of an unreliable link they are one a way and tick. For
+# twice as many, CasADi builds the function in more than a second instead of a tenth.
+TOLD = 2**19
+MOST_FRAMES = 2000  # of one chunk: the function of a chunk is built in a time that grows with it
+NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
+# Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
+MOST_NUMBERS = 2**26
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """A scene ready to be played.
+
+    `signals` are the columns of what comes out; `marks` the instants of a frame's rows, in quanta, of which
+    those not in `ticks` make a row at time 0 only; `forces` are those that change with time, of each group's
+    different sites. `chunk` is the frame of all peers, `length` times in a row;
+    `compiled` says that it runs in machine code. `gates` are the unreliable links, `seed` is what their luck
+    begins from: that of the settings, or of the experiment. `tolerances` are of the states that CVODES moves.
+    """
+
+    system: CompiledSystem
+    settings: Settings
+    population: Population
+    choices: tuple[Choice, ...]
+    signals: tuple[Signal, ...]
+    forces: tuple[tuple[SiteForcing, ...], ...]
+    gates: tuple[Gate, ...]
+    seed: int
+    tolerances: tuple[Tolerance, ...]
+    quantum: Fraction
+    frame: int
+    marks: tuple[int, ...]
+    ticks: frozenset[int]
+    compiled: bool
+    length: int
+    chunk: Any  # casadi.Function
+
+    @property
+    def how(self) -> str:
+        """The method in words of a command line; what is exact throughout is called so."""
+        method = self.settings.method
+        if method.name != WHERE_NEEDED:
+            return str(method)
+        return f"{method}, {CVODES}:{method.tolerance:g} elsewhere" if self.tolerances else EXACT
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts whose work is added up."""
+        listed = (part for member in self.population.members for part in member.program.layout.parts)
+        return tuple(dict.fromkeys(listed))
+
+
+def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str] = ()) -> Simulation:
+    """Do what comes before the first instant.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    settings
+        How it is played.
+    signals
+        Patterns of the signals to record, all if there is none; see `signals.choose`.
+
+    Raises
+    ------
+    ApcError
+        E870 a continuous equation is not linear and the method is exact, E873 a pattern fits nothing, E874
+        the peers are too many, E893 a peer has nothing of its own to stand in for a missing packet, E913 a
+        step that does not fit; and those of `build_schedules`, `build_population` and `routes_of`.
+    """
+    refuse_unheard_of(system)
+    with finite_equations(system.name):
+        plan = _plan(system, settings.method)
+        choices = _choices(plan, signals)
+        members = _members(plan, choices, settings.method)
+        gates = build_gates(plan.routes, plan.kept, plan.exchange, plan.schedules, members)
+        compiled: list[bool] = []
+
+        def kernels(functions: Sequence[Any]) -> Sequence[Any]:
+            ready = native(functions) if settings.jit else functions
+            compiled.append(any(new is not old for new, old in zip(ready, functions, strict=True)))
+            return ready
+
+        population = build_population(system, plan.exchange, members, kernels, gates)
+    schedule = plan.schedules[0]
+    marks = schedule.marks[:-1]
+    length = _chunk_length(population.frame, settings.duration, schedule.frame_s)
+    return Simulation(
+        system=system,
+        settings=settings,
+        population=population,
+        choices=choices,
+        signals=signals_of(system, choices),
+        forces=tuple(_forces(member) for member in members),
+        gates=gates,
+        seed=system.experiment.seed if settings.seed is None else settings.seed,
+        tolerances=_tolerances(system, plan.flows),
+        quantum=schedule.quantum,
+        frame=schedule.frame,
+        marks=marks,
+        ticks=frozenset(marks if _ticks_at_zero(system, plan.numbers) else marks[1:]),
+        compiled=compiled[0],
+        length=length,
+        chunk=population.frame.mapaccum("chunk", length, len(population.start)),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Plan:
+    """What the peers of a scene do in a frame, before a function of it is built.
+
+    `sites` are the Jacobians of each kind, `flows` what the method moves of it, `schedules` what happens in a
+    frame of each group; `routes` are what is heard over unreliable links, `kept` what is kept of each.
+    """
+
+    system: CompiledSystem
+    numbers: Numbers
+    exchange: Exchange
+    sites: tuple[SiteJacobians, ...]
+    flows: tuple[Flow | None, ...]
+    routes: tuple[Route, ...]
+    schedules: tuple[Schedule, ...]
+    kept: Mapping[str, Kept]
+
+
+def _plan(system: CompiledSystem, method: Method) -> _Plan:
+    """Find out what happens in a frame, and refuse what can't be played."""
+    numbers = resolve(system)
+    sites = tuple(jacobians(kind) for kind in system.kinds)
+    flows = tuple(_flow(system, numbers, place, site, method) for place, site in enumerate(sites))
+    exchange = build_exchange(system, numbers.timings)
+    routes = routes_of(system, numbers.timings, exchange)
+    schedules, kept = _schedules(system, numbers, [site.pattern for site in sites], routes)
+    _check_size(system, exchange, schedules)
+    _check_step(system, numbers, schedules, method)
+    return _Plan(system, numbers, exchange, sites, flows, routes, schedules, kept)
+
+
+def _choices(plan: _Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
+    """Return what is recorded of each group; refuse more than fits the memory."""
+    system = plan.system
+    available = [
+        local_signals(system.kinds[group.kind], schedule)
+        for group, schedule in zip(system.groups, plan.schedules, strict=True)
+    ]
+    choices = choose(system, available, signals)
+    _check_size(system, plan.exchange, plan.schedules, choices)
+    return choices
+
+
+def _schedules(
+    system: CompiledSystem, numbers: Numbers, patterns: Sequence[LinearSite], routes: Sequence[Route]
+) -> tuple[tuple[Schedule, ...], dict[str, Kept]]:
+    """Return what happens in a frame of each group, and what is kept of unreliable links."""
+    schedules = build_schedules(system, numbers.timings, patterns)
+    kept = kept_links(routes, schedules[0].frame_s)
+    if kept:
+        schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
+    if not system.clocks:  # then there is one interval, of any length
+        schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
+    return schedules, kept
+
+
+def _members(plan: _Plan, choices: Sequence[Choice], method: Method) -> list[Member]:
+    """Return the groups as members of a population, those peers that are recorded apart from the others."""
+    system, numbers, flows = plan.system, plan.numbers, plan.flows
+    linear = [rates(kind, flow.rows if flow else ()) for kind, flow in zip(system.kinds, flows, strict=True)]
+    cuts = exchanges_within(plan.schedules)
+    programs: dict[Any, Program] = {}
+    members = []
+    groups = zip(system.groups, plan.schedules, choices, strict=True)
+    for group, (one, schedule, choice) in enumerate(groups):
+        rows, vectors = numbers.rows[group], numbers.parameters[group]
+        for peers, recorded in _recorded_and_not(choice):
+            key = (one.kind, id(schedule), recorded)
+            if key not in programs:
+                programs[key] = build_program(linear[one.kind], schedule, recorded, cuts, flows[one.kind])
+            moves = _transitions(programs[key], vectors, method)
+            numbered, site = plan.exchange.starts[group] + peers, plan.sites[one.kind]
+            members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
+    return members
+
+
+def _chunk_length(frame: Any, duration: Fraction, frame_s: Fraction) -> int:
+    """Return how many frames to play at once: equal chunks, none larger than need be."""
+    frames = int(duration / frame_s) + 1
+    told = int(frame.nnz_in())
+    most = max(1, min(MOST_FRAMES, CHUNK // max(1, int(frame.nnz_out())), TOLD // max(1, told), frames))
+    return -(-frames // -(-frames // most))
+
+
+def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
+    """Say whether the fastest clock ticks at time 0."""
+    if not system.clocks:
+        return True
+    fastest = min(system.clocks, key=lambda clock: numbers.timings[clock.period])
+    return numbers.timings[fastest.phase] == 0
+
+
+def _check_size(
+    system: CompiledSystem, exchange: Exchange, schedules: Sequence[Schedule], choices: Sequence[Choice] = ()
+) -> None:
+    """Refuse so many peers, or so many of them recorded, that one frame of them would not fit the memory."""
+    total = sum(
+        int(choice.wanted.any(axis=1).sum()) * len(choice.locals) * len(schedule.marks)
+        for choice, schedule in zip(choices, schedules, strict=bool(choices))
+    )
+    for group, schedule in zip(system.groups, schedules, strict=True):
+        kind = system.kinds[group.kind]
+        lengths = 2  # of intervals, mostly
+        own = len(kind.parameters) + lengths * len(kind.states) * (len(kind.states) + len(kind.holds) + 1)
+        total += group.count * (own + sum(schedule.depths))
+    total += NUMBERS_A_PAIR * count_pairs(system, exchange)
+    if total > MOST_NUMBERS:
+        what = (
+            f"{system.peers} peers hold {total} numbers in a frame; at most {MOST_NUMBERS} can be "
+            "simulated at once"
+        )
+        raise ApcError(Mistake("E874", Place(system.name), what, hint="fewer peers, or fewer --signals"))
+
+
+def _recorded_and_not(choice: Choice) -> list[tuple[Integers, tuple[LocalSignal, ...]]]:
+    """Split a group into the peers that are recorded and the others, neither empty."""
+    recorded = choice.wanted.any(axis=1)
+    split = [(np.flatnonzero(recorded), choice.locals), (np.flatnonzero(~recorded), ())]
+    return [(peers, signals) for peers, signals in split if len(peers)]
+
+
+def _flow(
+    system: CompiledSystem, numbers: Numbers, place: int, site: SiteJacobians, method: Method
+) -> Flow | None:
+    """Return what the method moves of a kind, None if that is nothing."""
+    kind = system.kinds[place]
+    rows = rows_to_move(kind, method)
+    if not rows:
+        return None
+    vectors = [
+        vector
+        for group, own in zip(system.groups, numbers.parameters, strict=True)
+        if group.kind == place
+        for vector in own
+    ]
+    return flow_of(kind, method, rows, state_scales(system, kind, site, vectors))
+
+
+def _tolerances(system: CompiledSystem, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
+    """Return the tolerances of all states, each state of several kinds once, with the smallest."""
+    found: dict[str, Tolerance] = {}
+    for kind, flow in zip(system.kinds, flows, strict=True):
+        for one in flow.tolerances(kind) if flow else ():
+            if one.state not in found or one.absolute < found[one.state].absolute:
+                found[one.state] = one
+    return tuple(found.values())
+
+
+def _check_step(
+    system: CompiledSystem, numbers: Numbers, schedules: Sequence[Schedule], method: Method
+) -> None:
+    fastest = min((numbers.timings[one.period] for one in system.clocks), default=ROW)
+    lengths = [
+        event.duration * one.quantum
+        for one in schedules
+        for event in one.events
+        if isinstance(event, Propagate)
+    ]
+    check_step(system, method, fastest, max(lengths, default=fastest))
+
+
+def _transitions(program: Program, vectors: Floats, method: Method) -> list[Transitions]:
+    """Return what each different site of a group does over every interval; equal ones are one object."""
+    seconds = [length * program.schedule.quantum for length in program.durations]
+    known: dict[bytes, Transitions] = {}
+    found = []
+    for vector in vectors:
+        # Sites that differ in nothing the continuous equations read share a transition.
+        key = np.asarray(program.rates.matrices(vector)).tobytes()
+        if key not in known:
+            known[key] = transitions(program.rates, vector, seconds)
+            if method.perturbed:
+                known[key] = perturbed(known[key], len(known))
+        found.append(known[key])
+    return found
+
+
+def _forces(member: Member) -> tuple[SiteForcing, ...]:
+    """Return the forces that change with time on each different site of a group; none if none does."""
+    program = member.program
+    if not program.impulse_rows:
+        return ()
+    seconds = [length * program.schedule.quantum for length in program.durations]
+    forcing = forcing_of(program.rates)
+    kernels: dict[int, tuple[Kernel, ...]] = {}
+    for one in member.transitions:  # equal ones are one object
+        if id(one) not in kernels:
+            kernels[id(one)] = tuple(kernel_of(one.a, forcing.pushed, length) for length in seconds)
+    pairs = zip(member.parameters, member.transitions, strict=True)
+    return tuple(SiteForcing(forcing, vector, kernels[id(own)]) for vector, own in pairs)

@@ -1,0 +1,179 @@
+"""A picture of how a scene begins: every peer's bodies side by side, and the surfaces between them.
+
+Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `draw_still`, `save_still`.
+Guarantees: everything is found in the equations: a body is a position (a state in metres); where something is
+decided by the distance of two of them, or of one from a fixed place, in metres, there is a surface.
+Does not: play the scene, or know what a part is called.
+
+A decision on x_a − x_b + w, as a contact takes, says that the two touch at the distance w. The body that is
+sent to the others, or else the second, is drawn with a half width of w, the other as a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem, Kind
+from apc.frame.guards import guards_of
+from apc.frame.jacobians import jacobians
+from apc.frame.parameters import resolve
+from apc.frame.start import start_values
+from apc.optional import need
+from apc.simulation.figures import check_format, write_figure
+from apc.simulation.local_signals import sent_states
+
+Floats = NDArray[np.float64]
+
+MOST_PEERS = 12  # drawn: more rows can't be told apart
+MM = 1e3
+HEIGHT = 0.36  # half of a body's, of the distance of two rows
+WIDTH, ROW, MARGIN, DPI_POINTS = 7.0, 0.62, 1.1, 7.0  # inches: of the figure, a row, title and axis; points
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A position of a peer at the start, in m, and half its width, 0 for a point."""
+
+    name: str
+    place: float
+    half_width: float
+
+
+@dataclass(frozen=True, slots=True)
+class Wall:
+    """A fixed place, in m, that something is decided by."""
+
+    place: float
+
+
+def bodies_of(kind: Kind, vector: Sequence[float], start: Sequence[float]) -> tuple[list[Body], list[Wall]]:
+    """Return what a peer's start looks like.
+
+    Parameters
+    ----------
+    kind
+        The peer's kind.
+    vector
+        Its parameters (n_p,), SI.
+    start
+        Its states at the start (n_x,), SI.
+    """
+    places = [i for i, state in enumerate(kind.states) if state.unit == "m"]
+    widths = dict.fromkeys(places, 0.0)
+    sent = sent_states(kind)
+    walls: dict[float, None] = {}
+    for slopes, offset in _distances(kind, vector):
+        moving = np.flatnonzero(slopes).tolist()
+        if not set(moving) <= set(places) or not (np.abs(slopes[moving]) == 1).all():
+            continue  # decided by something else than a distance
+        if len(moving) == 1:
+            walls[float(-offset / slopes[moving[0]])] = None
+        elif len(moving) == 2 and slopes.sum() == 0:
+            wide = next((i for i in moving if i in sent), moving[1])
+            widths[wide] = max(widths[wide], abs(float(offset)))
+    bodies = [Body(kind.states[i].name.rpartition(".")[0], float(start[i]), widths[i]) for i in places]
+    return bodies, [Wall(place) for place in walls]
+
+
+def _distances(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, float]]:
+    """Return the slopes (n_x,) and the value at the origin of what decides, where that is linear."""
+    found = []
+    for function in (kind.derivative, *(one.tick for one in kind.clocks)):
+        if not function.is_a("SXFunction"):
+            continue
+        inputs = function.sx_in()
+        x, p = inputs[0], inputs[-2]
+        column = casadi.vertcat(*guards_of(casadi.densify(function(*inputs)), x))
+        slopes = casadi.jacobian(column, x)
+        at = casadi.Function("at", inputs, [casadi.densify(slopes), casadi.densify(column)])
+        zeros = [np.zeros(one.shape) for one in inputs]
+        zeros[-2] = np.reshape(vector, p.shape)
+        numbers = [np.asarray(one, dtype=np.float64) for one in at(*zeros)]
+        for row in range(column.numel()):
+            others = casadi.vertcat(*(one for i, one in enumerate(inputs) if i not in (0, len(inputs) - 2)))
+            alone = not casadi.depends_on(column[row], others)
+            if alone and not casadi.depends_on(slopes[row, :], x):
+                found.append((numbers[0][row], float(numbers[1][row, 0])))
+    return found
+
+
+def draw_still(system: CompiledSystem) -> Any:
+    """Draw how a scene begins, a row a peer; return the matplotlib Figure.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+
+    Raises
+    ------
+    ApcError
+        E875 matplotlib is not installed.
+    """
+    figures, patches = need("matplotlib.figure", "plot"), need("matplotlib.patches", "plot")
+    rows = _rows(system)
+    figure = figures.Figure(figsize=(WIDTH, ROW * len(rows) + MARGIN), layout="constrained")
+    ax = figure.subplots()
+    names = list(dict.fromkeys(body.name for _, bodies, _ in rows for body in bodies))
+    for y, (_, bodies, walls) in enumerate(rows):
+        for wall in walls:
+            ax.plot([MM * wall.place] * 2, [y - 0.45, y + 0.45], color="0.25", linewidth=3)
+        for body in sorted(bodies, key=lambda one: -one.half_width):
+            colour = f"C{names.index(body.name) % 10}"
+            if body.half_width:
+                corner = (MM * (body.place - body.half_width), y - HEIGHT)
+                size = (2 * MM * body.half_width, 2 * HEIGHT)
+                ax.add_patch(patches.Rectangle(corner, *size, facecolor=colour, alpha=0.35, edgecolor="k"))
+            marker = "s" if body.half_width else "o"
+            ax.plot(MM * body.place, y, marker, color=colour, markersize=DPI_POINTS, markeredgecolor="k")
+            above = HEIGHT if body.half_width else 0.12
+            ax.annotate(
+                body.name,
+                (MM * body.place, y - above),
+                (0, 2),
+                textcoords="offset points",
+                ha="center",
+                va="bottom",
+                fontsize=7,
+                bbox={"facecolor": "w", "linewidth": 0, "alpha": 0.7, "pad": 0.5},
+            )
+    ax.set_ylim(len(rows) - 0.45, -0.55)
+    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    ax.margins(x=0.08)
+    ax.grid(visible=True, axis="x", linewidth=0.4, alpha=0.5)
+    ax.set_xlabel("position [mm]")
+    left = system.peers - len(rows)
+    ax.set_title(f"{system.name}: at the start" + (f" ({left} more peers)" if left else ""), fontsize=11)
+    return figure
+
+
+def _rows(system: CompiledSystem) -> list[tuple[str, list[Body], list[Wall]]]:
+    """Return the peers that are drawn: name, bodies, walls."""
+    numbers = resolve(system)
+    sites = [jacobians(kind) for kind in system.kinds]
+    found: list[tuple[str, list[Body], list[Wall]]] = []
+    for group, one in enumerate(system.groups):
+        for peer in range(min(one.count, MOST_PEERS - len(found))):
+            vector = [float(v) for v in numbers.parameters[group][numbers.rows[group][peer]]]
+            start, _, _ = start_values(sites[one.kind], vector)
+            found.append((f"{one.name}[{peer + 1}]", *bodies_of(system.kinds[one.kind], vector, start)))
+    return found
+
+
+def save_still(system: CompiledSystem, path: Path) -> None:
+    """Draw how a scene begins into a file, its format chosen by the suffix.
+
+    Raises
+    ------
+    ApcError
+        E878 no such format, E601 it can't be written, E875 matplotlib is not installed.
+    """
+    check_format(path, "--still")
+    write_figure(draw_still(system), path)

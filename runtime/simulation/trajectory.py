@@ -1,0 +1,391 @@
+"""A scene played in time, as a person gets it: rows, columns with names and units, and what made them.
+
+Takes: a `Simulation`. Gives: `Trajectory`, `Provenance`, `provenance_of`, `simulate`.
+Guarantees: no number is NaN or infinite; what diverges is kept up to the last finite row, and says so.
+Does not: write files (see `recording`), or draw (see `figures`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.distribution import versions
+from apc.given import given
+from apc.optional import need
+from apc.simulation.accuracy import ErrorEstimate, compare_with, error_text
+from apc.simulation.blocks import Block, blocks
+from apc.simulation.flow import Tolerance
+from apc.simulation.methods import DEFAULT, EXACT, Method
+from apc.simulation.settings import Settings
+from apc.simulation.signals import Signal
+from apc.simulation.simulation import Simulation, prepare
+from apc.simulation.summary import Summary, Watch, summary_text
+
+Floats = NDArray[np.float64]
+
+MOST_KEPT = 2**27  # numbers that are kept in memory: 1 GiB
+MOST_LISTED = 1000  # peers whose own numbers are written out; the digest of their table covers the others
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """What made a result: `texts` is the SHA-256 of all texts of the scene, `parameters` (name, SI, unit)."""
+
+    topology: str
+    texts: str
+    duration_s: str
+    method: str
+    tolerances: tuple[Tolerance, ...]
+    seed: int
+    parameters: tuple[tuple[str, float, str], ...]
+    timings: tuple[tuple[str, str], ...]
+    versions: tuple[tuple[str, str], ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data, ready for JSON."""
+        return {
+            "topology": self.topology,
+            "sha256": self.texts,
+            "duration_s": self.duration_s,
+            "method": self.method,
+            "tolerances": {
+                one.state: {"relative": one.relative, "absolute": one.absolute, "unit": one.unit}
+                for one in self.tolerances
+            },
+            "seed": self.seed,
+            "parameters": {name: {"value": value, "unit": unit} for name, value, unit in self.parameters},
+            "timings_s": dict(self.timings),
+            "versions": dict(self.versions),
+        }
+
+    def to_json(self) -> str:
+        """Return it as one line of JSON."""
+        return json.dumps(self.to_dict(), ensure_ascii=False, allow_nan=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Rows over time: `time` (rows,) in seconds, `values` (rows, signals) in SI, a column a signal.
+
+    A row holds what was before the tick at its time. `interrupted` says that it ended before its time;
+    `error` is there if it was asked for.
+    """
+
+    topology: str
+    time: Floats
+    values: Floats
+    signals: tuple[Signal, ...]
+    summary: Summary
+    provenance: Provenance
+    interrupted: bool = False
+    error: ErrorEstimate | None = None
+
+    def __str__(self) -> str:
+        """Return the summary in words."""
+        return result_text(self.topology, self.summary, self.provenance, self.error)
+
+    def __getitem__(self, name: str) -> Floats:
+        """Return the column of a signal (rows,). Raises KeyError if there is none of that name."""
+        for place, signal in enumerate(self.signals):
+            if signal.name == name:
+                return self.values[:, place]
+        raise KeyError(name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the summary as plain data, ready for JSON; the rows are not in it."""
+        return result_document(self.topology, self.summary, self.provenance, self.interrupted, self.error)
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame: index `time [s]`, a column a signal, headings with units."""
+        pandas = need("pandas", "data")
+        columns = [signal.heading for signal in self.signals]
+        return pandas.DataFrame(self.values, pandas.Index(self.time, name="time [s]"), columns)
+
+    def to_xarray(self) -> Any:
+        """Return an xarray Dataset over `time`, a variable a signal with its unit as attribute."""
+        xarray = need("xarray", "data")
+        variables = {
+            signal.name: ("time", self.values[:, place], {"units": signal.unit})
+            for place, signal in enumerate(self.signals)
+        }
+        time = ("time", self.time, {"units": "s"})
+        return xarray.Dataset(variables, {"time": time}, {"provenance": self.provenance.to_json()})
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw a panel a quantity, or all signals into one matplotlib Axes; return the Figure.
+
+        Parameters
+        ----------
+        ax
+            Where to draw; signals of more than one unit need a figure of their own.
+        """
+        from apc.simulation.figures import draw  # it needs this module
+
+        return draw(self, ax)
+
+
+def result_text(
+    topology: str, summary: Summary, provenance: Provenance, error: ErrorEstimate | None = None
+) -> str:
+    """Return what `apc simulate` prints: the summary, the method if it is not exact, the error if known.
+
+    Parameters
+    ----------
+    topology
+        The scene's name.
+    summary, provenance
+        What the motion amounts to, and what made it.
+    error
+        How far off it is, if that was estimated.
+    """
+    notes = [] if provenance.method == EXACT else [("method", method_text(provenance))]
+    return summary_text(topology, summary, notes + ([("error", error_text(error))] if error else []))
+
+
+def method_text(provenance: Provenance) -> str:
+    """Return the method with its tolerances, of each unit the smallest."""
+    smallest: dict[str, float] = {}
+    for one in provenance.tolerances:
+        smallest[one.unit] = min(smallest.get(one.unit, one.absolute), one.absolute)
+    absolute = ", ".join(f"{value:.1g} {unit}" for unit, value in smallest.items())
+    return provenance.method + (f"; absolute tolerances from {absolute}" if absolute else "")
+
+
+def result_document(
+    topology: str,
+    summary: Summary,
+    provenance: Provenance,
+    interrupted: bool,
+    error: ErrorEstimate | None = None,
+) -> dict[str, Any]:
+    """Return what `apc simulate --json` prints.
+
+    Parameters
+    ----------
+    topology, summary, provenance, error
+        As for `result_text`.
+    interrupted
+        Whether the run ended before its time.
+    """
+
+    def named(pair: tuple[str, float] | None, key: str) -> dict[str, Any] | None:
+        return None if pair is None else {"signal": pair[0], key: pair[1]}
+
+    force, swing = summary.largest_force, summary.swing
+    return {
+        "topology": topology,
+        "verdict": summary.verdict,
+        "settled_s": summary.settled,
+        "diverged": {"signal": summary.stopped, "time_s": summary.stopped_at} if summary.stopped else None,
+        "interrupted": interrupted,
+        "swing": None if swing is None else {"signal": swing[0], "size": swing[1], "frequency_hz": swing[2]},
+        "overshoot": named(summary.overshoot, "part"),
+        "largest_force": None if force is None else {"signal": force[0], "N": force[1], "time_s": force[2]},
+        "copies_apart": dict(summary.copies),
+        "work_J": dict(summary.work),
+        "rows": summary.rows,
+        "end_s": summary.end,
+        "signals": [
+            {
+                "name": one.name,
+                "unit": one.unit,
+                "first": one.first,
+                "last": one.last,
+                "low": one.low,
+                "high": one.high,
+                "settled_s": one.settled,
+            }
+            for one in summary.extents
+        ],
+        "error_estimate": None if error is None else error.to_dict(),
+        "provenance": provenance.to_dict(),
+    }
+
+
+def provenance_of(simulation: Simulation) -> Provenance:
+    """Return what makes a simulation's results."""
+    system = simulation.system
+    parameters = [(one.name, one.value, one.unit) for one in system.parameters]
+    for group in system.groups:
+        parameters += [(f"{group.name}.{one.name}", one.value, one.unit) for one in group.values]
+    units = {one.name: one.unit for one in system.parameters}
+    for group in system.groups:
+        for column in group.columns:
+            parameters += [
+                (f"{group.name}[{i + 1}].{column.name}", float(one), units.get(column.name, "1"))
+                for i, one in enumerate(column.values[:MOST_LISTED])
+            ]
+    texts = "\n".join(f"{name} {digest}" for name, digest in system.origin.texts)
+    return Provenance(
+        topology=system.name,
+        texts=hashlib.sha256(texts.encode()).hexdigest(),
+        duration_s=str(simulation.settings.duration),
+        method=simulation.how,
+        tolerances=simulation.tolerances,
+        seed=simulation.seed,
+        parameters=tuple(parameters),
+        timings=tuple((one.name, str(one.value)) for one in system.timings),
+        versions=versions("casadi", "numpy"),
+    )
+
+
+class Sink(Protocol):
+    """What takes the blocks of a simulation as they come."""
+
+    def take(self, block: Block) -> None:
+        """Take one block."""
+
+
+class Keeper:
+    """Keeps the rows in memory."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        rows = int(simulation.settings.duration / simulation.quantum) // simulation.frame + 1
+        if rows * len(simulation.marks) * len(simulation.signals) > MOST_KEPT:
+            seconds = float(simulation.settings.duration)
+            what = (
+                f"{len(simulation.signals)} signals over {seconds:g} s are more than "
+                f"{MOST_KEPT} numbers, too many to keep in memory"
+            )
+            hint = "fewer --signals, a shorter --duration, or --out FILE.parquet alone"
+            raise ApcError(Mistake("E876", Place(simulation.system.name), what, hint=hint))
+        self.signals = len(simulation.signals)
+        self.time: list[Floats] = []
+        self.values: list[Floats] = []
+
+    def take(self, block: Block) -> None:
+        """Keep one block."""
+        self.time.append(block.time)
+        self.values.append(block.values)
+
+
+def play(
+    simulation: Simulation, sinks: Sequence[Sink], *, progress: Callable[[float], None] | None = None
+) -> tuple[Summary, bool]:
+    """Play a simulation into sinks; return its summary, and whether Ctrl-C ended it early.
+
+    Parameters
+    ----------
+    simulation
+        The scene, ready.
+    sinks
+        What takes the blocks.
+    progress
+        Is told the simulated time, in seconds, after each block.
+    """
+    watch, interrupted = Watch(simulation), False
+    try:
+        for block in blocks(simulation):
+            watch.take(block)
+            for sink in sinks:
+                sink.take(block)
+            if progress is not None and len(block.time):
+                progress(float(block.time[-1]))
+    except KeyboardInterrupt:
+        if not watch.rows:
+            raise
+        interrupted = True
+    return watch.summary(), interrupted
+
+
+def simulate(
+    system: CompiledSystem,
+    *,
+    duration: Fraction | None = None,
+    signals: Sequence[str] = (),
+    jit: bool = True,
+    seed: int | None = None,
+    method: Method = DEFAULT,
+    error: bool = False,
+) -> Trajectory:
+    """Play a scene in time and keep its rows.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    duration
+        In seconds; that of the scene's experiment if not given.
+    signals
+        Patterns of the signals to keep, all if there is none; see `signals.choose`.
+    jit
+        Whether to compile to machine code where there is a C compiler.
+    seed
+        Of what is random; the experiment's if not given.
+    method
+        How the continuous states move between events.
+    error
+        Whether to estimate the error, by a second run.
+
+    Raises
+    ------
+    ApcError
+        E877 no duration is known, E876 too many numbers to keep; and those of `simulation.prepare`.
+    """
+    settings = Settings(duration_of(system, duration), method, seed, jit)
+    simulation = prepare(system, settings, signals=signals)
+    keeper = Keeper(simulation)
+    comparison = compare_with(simulation, signals=signals) if error else None
+    summary, interrupted = play(simulation, [keeper, *([comparison] if comparison else [])])
+    estimate = comparison.estimate() if comparison else None
+    return trajectory_of(simulation, keeper, summary, interrupted, estimate)
+
+
+def trajectory_of(
+    simulation: Simulation,
+    keeper: Keeper,
+    summary: Summary,
+    interrupted: bool,
+    error: ErrorEstimate | None = None,
+) -> Trajectory:
+    """Return what was kept as a trajectory.
+
+    Parameters
+    ----------
+    simulation
+        The scene that was played.
+    keeper
+        Its rows.
+    summary, interrupted
+        As `play` returns them.
+    error
+        How far off it is, if that was estimated.
+    """
+    return Trajectory(
+        topology=simulation.system.name,
+        time=np.concatenate(keeper.time),
+        values=np.concatenate(keeper.values),
+        signals=simulation.signals,
+        summary=summary,
+        provenance=provenance_of(simulation),
+        interrupted=interrupted,
+        error=error,
+    )
+
+
+def parse_duration(text: str) -> Fraction:
+    """Read a duration such as "2 s". Raises ApcError if it is none."""
+    return given("--duration", text, what="duration", unit="s")
+
+
+def duration_of(system: CompiledSystem, duration: Fraction | None) -> Fraction:
+    """Return how long to simulate. Raises ApcError (E877) if neither call nor scene says it."""
+    found = system.experiment.duration if duration is None else duration
+    if found is None:
+        what = "the scene says no duration"
+        hint = 'experiment: {duration: 3 s}  (or --duration "3 s")'
+        raise ApcError(Mistake("E877", Place(system.name), what, hint=hint))
+    if found <= 0:
+        expected, got = "more than 0 s", f"{float(found):g} s"
+        raise ApcError(Mistake("E877", Place(system.name), "the duration", expected=expected, got=got))
+    return found

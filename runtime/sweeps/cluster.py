@@ -1,0 +1,109 @@
+"""Parts of a sweep computed by a running Dask cluster.
+
+Takes: `Work`, the address of a scheduler. Gives: `cluster_workers`.
+Guarantees: the workers compute what a process here computes, with the same function; a cluster that isn't
+there, or lost, is told in a sentence.
+Does not: start a cluster, or install anything on it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import re
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, Future
+from contextlib import contextmanager
+
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.distribution import install_line
+from apc.sweeps.local import Workers
+from apc.sweeps.work import Computed, Work, compute_part
+
+# A scheduler in the same building answers within milliseconds; one across the world within a second.
+PATIENCE_S = 5
+
+# Dask's own reading of addresses hangs on some that are none.
+_ADDRESS = re.compile(r"([a-z]+://)?([\w.-]+|\[[0-9a-fA-F:.]+\]):[0-9]{1,5}")
+
+
+@contextmanager
+def cluster_workers(work: Work, address: str) -> Iterator[Workers]:
+    """Connect to a Dask scheduler and hand it the work.
+
+    Parameters
+    ----------
+    work
+        The sweep.
+    address
+        The scheduler's, such as `tcp://host:8786`.
+
+    Raises
+    ------
+    ApcError
+        E888 distributed isn't installed, nobody answers at the address, or the cluster has no workers.
+    """
+    place = Place(address[:80])
+    form = "--cluster tcp://HOST:8786"
+    if not _ADDRESS.fullmatch(address):
+        raise ApcError(Mistake("E888", place, "a scheduler's address", "HOST:PORT", address[:80], form))
+    if importlib.util.find_spec("distributed") is None:
+        what = "a cluster needs Dask's distributed, here and on its workers"
+        raise ApcError(Mistake("E888", place, what, hint=install_line("cluster")))
+    import distributed
+
+    # What goes wrong is told once, by us.
+    loggers = [logging.getLogger(name) for name in ("distributed", "tornado")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        try:
+            client = distributed.Client(address, timeout=PATIENCE_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            what = f"no Dask scheduler answers there within {PATIENCE_S} s"
+            raise ApcError(Mistake("E888", place, what, hint=form)) from error
+        except (TypeError, RuntimeError) as error:  # what it says of an address it can't be asked at
+            what = "Dask has no certificate for it (distributed.comm.tls in its own configuration)"
+            raise ApcError(Mistake("E888", place, what, hint=form)) from error
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=PATIENCE_S)
+            except TimeoutError as error:
+                raise ApcError(Mistake("E888", place, "the cluster there has no workers")) from error
+            executor = client.get_executor(pure=False)
+            # A task like the others: to scatter it would wait for every worker, frozen ones included.
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of a large model, which is sent once
+                sent = client.submit(_taken, work, pure=False)
+
+            def submit(part: int) -> Future[Computed]:
+                future: Future[Computed] = executor.submit(compute_part, sent, part)
+                return future
+
+            yield Workers(submit, 2 * len(client.nthreads()), lambda error: _trouble(error, place))
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def _taken(work: Work) -> Work:
+    """Keep the work on a worker, from which the others have it."""
+    return work
+
+
+def _trouble(error: BaseException, place: Place) -> ApcError | None:
+    """Return what to tell of a part that did not come back."""
+    from distributed import KilledWorker
+    from distributed.comm import CommClosedError
+
+    if isinstance(error, KilledWorker):
+        what = "several workers of the cluster died on the same part of the sweep: out of memory, or stopped"
+    elif isinstance(error, (CancelledError, CommClosedError, TimeoutError, OSError)):
+        what = "the connection to the cluster is lost"
+    elif isinstance(error, ImportError) or "deserializ" in str(error):
+        what = "the workers of the cluster can't load apc: install the same version there"
+    else:
+        return None
+    return ApcError(Mistake("E888", place, what))

@@ -1,0 +1,220 @@
+"""Which parameters a sweep varies, and every combination of their values.
+
+Takes: a `CompiledSystem`, names of parameters, and texts such as `0 N/m:3000 N/m:11` or `0, 8 ms`.
+Gives: `GridAxis`, `Grid`, `parse_axis`, `build_grid`, `check_size`.
+Guarantees: values are exact rationals in SI; the order of points is that of the axes as given, the last one
+turning fastest; what can be known to be out of bounds is told before any point is computed.
+Does not: compute points.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from apc.compiler.compiled import PEERS, CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.names import find, unit_of
+from apc.frame.overrides import Override, apply
+
+PLACE = Place("sweep")
+
+# Of a range that does not say how many: ten steps, so that the ends and the middle are round numbers.
+DEFAULT_COUNT = 11
+# A result of so many rows takes a gigabyte of memory, and weeks on one core.
+MOST_POINTS = 10_000_000
+MOST_DIGITS = 20  # of a count that are read: it is too large anyway
+
+_FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class GridAxis:
+    """One swept parameter: of one group, or of all (`group` None); `values` in SI, in the order swept."""
+
+    name: str
+    group: str | None
+    unit: str
+    values: tuple[Fraction, ...]
+
+    @property
+    def label(self) -> str:
+        """The parameter's name, its group before it."""
+        return f"{self.group}.{self.name}" if self.group else self.name
+
+    @property
+    def heading(self) -> str:
+        """The heading of its column: name and SI unit, if it has one."""
+        return self.label if self.unit == "1" else f"{self.label} [{self.unit}]"
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Every combination of the axes' values; point numbers count from 0, the last axis turns fastest."""
+
+    axes: tuple[GridAxis, ...]
+
+    @property
+    def points(self) -> int:
+        """The number of points."""
+        return math.prod(len(axis.values) for axis in self.axes)
+
+    def values(self, point: int) -> tuple[Fraction, ...]:
+        """Return the value of each axis at a point."""
+        found = []
+        for axis in reversed(self.axes):
+            point, place = divmod(point, len(axis.values))
+            found.append(axis.values[place])
+        return tuple(reversed(found))
+
+    def overrides(self, point: int) -> tuple[Override, ...]:
+        """Return what a point sets."""
+        pairs = zip(self.axes, self.values(point), strict=True)
+        return tuple(Override(axis.name, axis.group, value) for axis, value in pairs)
+
+
+def build_grid(axes: Sequence[GridAxis]) -> Grid:
+    """Return the grid of some axes. Raises ApcError E883 when they make none, or one too large."""
+    if not axes:
+        raise ApcError(Mistake("E883", PLACE, "nothing is swept", hint=_FORM))
+    labels = [axis.label for axis in axes]
+    for place, label in enumerate(labels):
+        if label in labels[:place]:
+            raise ApcError(Mistake("E883", PLACE, f"{label} is swept twice"))
+    _refuse_many([len(axis.values) for axis in axes])
+    return Grid(tuple(axes))
+
+
+def check_size(texts: Sequence[str]) -> None:
+    """Refuse a grid that is too large by the texts of its axes, before any value of them is built (E883)."""
+    counts = []
+    for text in texts:
+        parts = [part.strip() for part in text.split(":")]
+        given = [part for part in parts[2:3] if part.isascii() and part.isdecimal()]
+        if len(parts) == 1:
+            counts.append(text.count(",") + 1)
+        else:
+            # What is no count is told of when it is read.
+            counts.append(int(given[0][:MOST_DIGITS]) if given else DEFAULT_COUNT)
+    _refuse_many(counts)
+
+
+def _refuse_many(counts: Sequence[int]) -> None:
+    points = math.prod(counts)
+    if points > MOST_POINTS:
+        sizes = " × ".join(f"{count:,}" for count in counts)
+        got = f"{sizes} = {points:,}" if len(counts) > 1 else sizes
+        raise ApcError(Mistake("E883", PLACE, "a sweep", f"at most {MOST_POINTS:,} points", got))
+
+
+def parse_axis(system: CompiledSystem, name: str, text: str) -> GridAxis:
+    """Read the values of a swept parameter.
+
+    Parameters
+    ----------
+    system
+        The scene.
+    name
+        A parameter or timing, as in `--set`.
+    text
+        `LOW:HIGH`, `LOW:HIGH:COUNT`, `LOW:HIGH:COUNT:log` (equal ratios instead of equal steps), or a list
+        `V1, V2, V3`. A number without a unit takes the unit of the last one: `0,8 ms`.
+
+    Raises
+    ------
+    ApcError
+        E881 a range or list at fault; E882 a number of peers; E622 no such parameter; E204 and others of a
+        quantity; E624 or E625 a value out of the parameter's bounds.
+    """
+    known, group = _find(system, name.strip())
+    unit = unit_of(system, known)
+    label = f"{group}.{known}" if group else known
+    values = _range(label, unit, text) if ":" in text else _list(label, unit, text)
+    axis = GridAxis(known, group, unit, values)
+    for value in (min(values), max(values)):
+        _check_bounds(system, axis, value)
+    return axis
+
+
+def _find(system: CompiledSystem, name: str) -> tuple[str, str | None]:
+    """Return the parameter and group a name means; a number of peers has its own message."""
+    last = name.rpartition(".")[2]
+    known = {parameter.name for parameter in system.parameters}
+    if name == PEERS or (last in (PEERS, "count") and name not in known):
+        what = f"{name} is a number of peers, which can't vary: it is compiled in"
+        raise ApcError(Mistake("E882", PLACE, what, hint="one topology a number of peers"))
+    return find(system, name, PLACE)
+
+
+def _list(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
+    values = _quantities(label, unit, text.split(","))
+    for place, value in enumerate(values):
+        if value in values[:place]:
+            got = f"{float(value):g} {unit} twice"
+            raise ApcError(Mistake("E881", PLACE, f"the list of {label}", "different values", got))
+    return values
+
+
+def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
+    """Return the values of LOW:HIGH, LOW:HIGH:COUNT or LOW:HIGH:COUNT:log."""
+    what = f"the range of {label}"
+    ends, rest = text.split(":")[:2], text.split(":")[2:]
+    logarithmic = bool(rest) and rest[-1].strip() == "log"
+    if logarithmic:
+        rest = rest[:-1]
+    if len(rest) > 1:
+        raise ApcError(Mistake("E881", PLACE, what, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM))
+    count = _count(what, rest[0].strip()) if rest else DEFAULT_COUNT
+    low, high = _quantities(label, unit, ends)
+    if low >= high:
+        got = f"{ends[0].strip()} to {ends[1].strip()}"
+        expected = "its lower end first, and the upper above it"
+        raise ApcError(Mistake("E881", PLACE, what, expected, got))
+    if not logarithmic:
+        return tuple(low + (high - low) * step / (count - 1) for step in range(count))
+    if low <= 0:
+        got = f"{float(low):g} {unit}"
+        raise ApcError(Mistake("E881", PLACE, what, "a lower end above 0 for equal ratios", got))
+    ratio = float(high / low)
+    # The shortest decimal of the float, so that a table shows it whole; the ends are those given.
+    inner = (Fraction(repr(float(low) * ratio ** (step / (count - 1)))) for step in range(1, count - 1))
+    return (low, *inner, high)
+
+
+def _count(what: str, text: str) -> int:
+    """Read the number of values: a single value is written as a value, not as a range."""
+    if not (text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS and int(text) >= 2):
+        raise ApcError(Mistake("E881", PLACE, what, "2 values or more", text[:40] or "nothing", _FORM))
+    return int(text)
+
+
+def _quantities(label: str, unit: str, texts: Sequence[str]) -> tuple[Fraction, ...]:
+    """Read quantities; one without a unit takes that of the last."""
+    from apc.compiler.language.units import quantity
+
+    last = _NUMBER.sub("", texts[-1], count=1).strip()
+    complete = [f"{text.strip()} {last}" if last and _NUMBER.fullmatch(text) else text for text in texts]
+    return tuple(quantity(text, PLACE, what=label, unit=unit).value for text in complete)
+
+
+def _check_bounds(system: CompiledSystem, axis: GridAxis, value: Fraction) -> None:
+    """Raise what `apply` says of this value itself, whatever the other axes are.
+
+    What it says of the value together with others (a phase beyond its clock's period, something that depends
+    on it by an expression) is the affair of each point, where they may fit.
+    """
+    try:
+        apply(system, [Override(axis.name, axis.group, value)])
+    except ApcError as error:
+        own = [
+            mistake
+            for mistake in error.mistakes
+            if mistake.what in (axis.label, axis.name)
+            and (mistake.code == "E624" or (mistake.code == "E625" and mistake.expected.startswith("a time")))
+        ]
+        if own:
+            raise ApcError(replace(own[0], place=PLACE)) from None

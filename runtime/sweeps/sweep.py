@@ -1,0 +1,357 @@
+"""One result at every combination of some parameters' values, with what is finished kept as it comes.
+
+Takes: a `CompiledSystem`, the values of each swept parameter, what to compute.
+Gives: `Sweep`, `sweep`.
+Guarantees: the same rows in the same order whoever computes them, interrupted or not; a sweep with a target
+takes up its finished parts; the target is written when all of it is there, and its parts are removed then.
+Does not: start processes itself (see `sweep.local`, `sweep.cluster`), or print.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import counted, with_unit, wrapped
+from apc.frame.jacobians import jacobians
+from apc.frame.names import Free
+from apc.network.nominal import left_out, refuse_channel_number
+from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
+from apc.sweeps.local import Workers, cores, local_processes, this_process
+from apc.sweeps.quantities import VERDICT, Cell, Row, find_quantity
+from apc.sweeps.store import Parts, open_parts, remove_parts
+from apc.sweeps.table_file import check_table_path, write_table
+from apc.sweeps.work import Computed, Work, model_bytes, program_versions
+
+if TYPE_CHECKING:
+    import pandas
+
+PLACE = Place("sweep")
+
+# Points of a part: a third of a second of analyses, which is what a kill can cost; and no more files in a
+# folder than one likes to list.
+PART_POINTS = 64
+MOST_PARTS = 10_000
+
+# Seconds without a part after which that is told, and again after twice as many.
+SILENCE = 60.0
+
+Progress = Callable[[int, int], None]  # points done, points in all
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """What to do while no part comes: `told` hears of it; after `limit` seconds the sweep ends."""
+
+    limit: float | None = None
+    told: Callable[[str], None] = lambda _: None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """The rows of a sweep, by columns: swept parameters first, in SI, then results.
+
+    A column of numbers is a float64 array (n,), NaN where a point has no number; others are object arrays.
+    `made_of` says what made it: model, axes, versions. `notes` tell what was out of the ordinary.
+    """
+
+    topology: str
+    of: str
+    grid: Grid
+    headings: tuple[str, ...]
+    columns: tuple[NDArray[Any], ...]
+    out: Path | None
+    made_of: Mapping[str, Any]
+    notes: tuple[str, ...]
+
+    @property
+    def points(self) -> int:
+        """The number of rows."""
+        return self.grid.points
+
+    def column(self, heading: str) -> NDArray[Any]:
+        """Return the column of a heading, such as `verdict` or `contact.stiffness [N/m]`."""
+        return self.columns[self.headings.index(heading)]
+
+    @property
+    def verdicts(self) -> tuple[tuple[str, int], ...]:
+        """Each verdict and how many points have it, the most frequent first."""
+        counts = Counter(self.column(VERDICT.heading).tolist())
+        return tuple(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return the sweep as a pandas table, with the headings as its columns."""
+        import pandas
+
+        return pandas.DataFrame(dict(zip(self.headings, self.columns, strict=True)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what the sweep is and how it came out, without its rows, ready for JSON."""
+        return {
+            **self.made_of,
+            "columns": list(self.headings),
+            "verdicts": dict(self.verdicts),
+            "out": str(self.out) if self.out else None,
+            "notes": list(self.notes),
+        }
+
+    def __str__(self) -> str:
+        """Return the sweep in a few lines: where the rows are, what was swept, the verdicts."""
+        where = f" → {self.out}" if self.out else ""
+        lines = [f"{self.topology}: {self.points:,} points{where}"]
+        for note in self.made_of["left_out"]:
+            lines += wrapped(note, "  ", "    ")
+        for axis in self.grid.axes:
+            ends = f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}"
+            lines.append(
+                f"  {axis.label}: {with_unit(ends, axis.unit)}, {counted(len(axis.values), 'value')}"
+            )
+        lines += [f"  {count:>10,} × {verdict}" for verdict, count in self.verdicts]
+        messages = Counter(cell for cell in self.columns[-1].tolist() if cell)
+        if messages:
+            text, count = messages.most_common(1)[0]
+            lines += wrapped(f"at {count:,} of them: {text}", "  ", "    ")
+        return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
+
+
+def sweep(
+    system: CompiledSystem,
+    over: Mapping[str, str | Sequence[str]],
+    *,
+    of: str = "analyze",
+    out: Path | None = None,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    progress: Progress | None = None,
+    patience: Patience | None = None,
+) -> Sweep:
+    """Compute a result at every combination of some parameters' values.
+
+    Parameters
+    ----------
+    system
+        The compiled scene; its numbers hold for what is not swept.
+    over
+        The values of each swept parameter by its name: a range `"0 N/m:3000 N/m:31"` (`LOW:HIGH:COUNT`, and
+        `:log` for equal ratios), or a list, `"0,8 ms"` or `["0 ms", "8 ms"]`. The last one turns fastest.
+    of
+        What to compute, see `quantities.QUANTITIES`: `analyze`, …
+    out
+        The file to write, .csv or .parquet. Finished parts are kept beside it until all is done, and the
+        same sweep takes them up again. Without it the rows are only returned.
+    jobs
+        How many processes compute; as many as there are cores if not given. With 1 it is this process.
+    cluster
+        The address of a Dask scheduler that computes instead.
+    progress
+        Called with the points done and the points in all, at the start and after each part.
+    patience
+        How long to wait for processes or a cluster of which nothing comes; for ever if not given.
+
+    Raises
+    ------
+    ApcError
+        An axis is at fault (E622, E881 to E883, E896, E204, …); E884 nothing is computed under that name;
+        E885 other work stands at the target; E887 or E601 the target can't be written; E888 the cluster;
+        E889 a process ended, or nothing came for too long. What is finished is kept.
+    """
+    texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
+    check_size(list(texts.values()))
+    grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
+    quantity = find_quantity(system, of)
+    for axis in grid.axes:
+        refuse_channel_number(system, Free(axis.name, axis.group), PLACE)
+        if axis.label == of.partition(":")[2].strip():
+            what = f"{axis.label} is swept: there is nothing to look for at one value of it"
+            raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
+    if out is not None:
+        check_table_path(out)
+    if jobs is not None and jobs < 1:
+        raise ApcError(Mistake("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
+    work = Work(model_bytes(system), of, grid, max(PART_POINTS, -(-grid.points // MOST_PARTS)))
+    made_of = _description(system, work)
+    with _kept(out, made_of) as kept:
+        whose = Whose(jobs or cores(), cluster, patience or Patience())
+        notes = _compute_missing(work, kept, whose, progress)
+        headings = (*(axis.heading for axis in grid.axes), *(one.heading for one in quantity.columns))
+        kinds = (*("number" for _ in grid.axes), *(one.kind for one in quantity.columns))
+        columns = _columns(work, kept, kinds)
+        if out is not None:
+            write_table(out, headings, kinds, _rows(work, kept), made_of)
+            remove_parts(out)
+    return Sweep(system.name, of, grid, headings, columns, out, made_of, notes)
+
+
+def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
+    """Return what a sweep is, as plain data: two with the same description have the same rows."""
+    parameters = {one.name: one.value for one in system.parameters}
+    parameters |= {one.name: float(one.value) for one in system.timings}
+    parameters |= {f"{group.name}.{one.name}": one.value for group in system.groups for one in group.values}
+    return {
+        "topology": system.name,
+        "peers": system.peers,
+        "of": work.of,
+        "left_out": list(left_out(system, linear=all(jacobians(kind).affine for kind in system.kinds))),
+        "points": work.grid.points,
+        "over": [
+            {"parameter": axis.label, "unit": axis.unit, "values": [float(value) for value in axis.values]}
+            for axis in work.grid.axes
+        ],
+        "parameters": parameters,
+        "texts": dict(system.origin.texts),
+        "model": hashlib.sha256(work.model).hexdigest(),
+        "part_points": work.part_points,
+        "versions": dict(program_versions()),
+    }
+
+
+class _Memory:
+    """Parts that are nowhere but here, as `store.Parts` are on disk."""
+
+    def __init__(self) -> None:
+        self._rows: dict[int, tuple[Row, ...]] = {}
+
+    def write(self, part: int, rows: tuple[Row, ...]) -> None:
+        self._rows[part] = rows
+
+    def read(self, part: int) -> tuple[Row, ...] | None:
+        return self._rows.get(part)
+
+    def there(self) -> set[int]:
+        return set(self._rows)
+
+
+_Kept = Parts | _Memory
+
+
+@contextmanager
+def _kept(out: Path | None, made_of: Mapping[str, Any]) -> Iterator[_Kept]:
+    if out is None:
+        yield _Memory()
+        return
+    with open_parts(out, made_of) as parts:
+        yield parts
+
+
+@dataclass(frozen=True, slots=True)
+class Whose:
+    """Who computes: so many processes here, or a cluster at this address; and the patience with them."""
+
+    jobs: int
+    cluster: str | None
+    patience: Patience
+
+
+def _compute_missing(work: Work, kept: _Kept, whose: Whose, progress: Progress | None) -> tuple[str, ...]:
+    """Compute the parts that aren't there, keep each as it comes, and return what to tell of it."""
+    there = kept.there()
+    missing = [part for part in range(work.parts) if part not in there or kept.read(part) is None]
+    damaged = [part for part in missing if part in there]
+    done = work.grid.points - sum(len(work.points_of(part)) for part in missing)
+    notes = [f"part {part} was damaged and is computed again" for part in damaged]
+    if done:
+        notes.append(f"{done:,} points were there already")
+    if progress:
+        progress(done, work.grid.points)
+    if not missing:
+        return tuple(notes)
+    with _workers(work, min(whose.jobs, len(missing)), whose.cluster) as workers:
+        for computed in _computed(workers, missing, whose.patience):
+            if computed.versions != program_versions():
+                raise ApcError(_other_versions(computed, whose.cluster))
+            kept.write(computed.part, computed.rows)
+            done += len(computed.rows)
+            if progress:
+                progress(done, work.grid.points)
+    return tuple(notes)
+
+
+def _workers(work: Work, jobs: int, cluster: str | None) -> AbstractContextManager[Workers]:
+    if cluster is not None:
+        from apc.sweeps.cluster import cluster_workers
+
+        return cluster_workers(work, cluster)
+    return nullcontext(this_process(work)) if jobs == 1 else local_processes(work, jobs)
+
+
+def _computed(workers: Workers, missing: Sequence[int], patience: Patience) -> Iterator[Computed]:
+    """Yield each part as it comes; never more of them are handed out than keep the workers busy."""
+    silent = 0.0  # seconds since the last part
+    left = iter(missing)
+    running: set[Future[Computed]] = set()
+    try:
+        while True:
+            for part in left:
+                running.add(workers.submit(part))
+                if len(running) >= workers.waiting:
+                    break
+            if not running:
+                return
+            pause = silent or SILENCE
+            if patience.limit is not None:
+                pause = min(pause, patience.limit - silent)
+            finished, running = wait(running, pause, return_when=FIRST_COMPLETED)
+            silent = 0.0 if finished else silent + pause
+            if silent:
+                _tell_silence(silent, patience)
+            for future in finished:
+                yield future.result()
+    except ApcError:
+        raise
+    except Exception as error:
+        told = workers.trouble(error)
+        if told is None:
+            raise
+        raise told from error
+
+
+def _tell_silence(seconds: float, patience: Patience) -> None:
+    """Say that nothing came for a while. Raises ApcError E889 if that is too long."""
+    what = f"nothing has come from those who compute for {seconds:g} s"
+    if patience.limit is not None and seconds >= patience.limit:
+        what += ": they are stuck, or a part takes longer"
+        raise ApcError(Mistake("E889", PLACE, what, hint=f'--patience "{2 * seconds:g} s"'))
+    patience.told(f"{what}; still waiting")
+
+
+def _other_versions(computed: Computed, cluster: str | None) -> Mistake:
+    """Return the message for numbers that come from other libraries than those here."""
+    here = dict(program_versions())
+    other = [f"{name} {got} (here {here[name]})" for name, got in computed.versions if here[name] != got]
+    what = f"a worker has {', '.join(other)}: the same numbers can't be promised; install the same there"
+    return Mistake("E888", Place(cluster or "sweep"), what)
+
+
+def _rows(work: Work, kept: _Kept) -> Iterator[Row]:
+    """Yield every row: the values of the axes, then the results."""
+    for part in range(work.parts):
+        results = kept.read(part)
+        assert results is not None, f"part {part} was written and is gone"
+        for point, row in zip(work.points_of(part), results, strict=True):
+            yield (*(float(value) for value in work.grid.values(point)), *row)
+
+
+def _columns(work: Work, kept: _Kept, kinds: Sequence[str]) -> tuple[NDArray[Any], ...]:
+    """Return the columns as arrays."""
+    columns: list[NDArray[Any]] = [
+        np.empty(work.grid.points, dtype=np.float64 if kind == "number" else object) for kind in kinds
+    ]
+    words: dict[Cell, Cell] = {}  # a verdict that stands in a million rows is held once
+    for place, row in enumerate(_rows(work, kept)):
+        for column, cell, kind in zip(columns, row, kinds, strict=True):
+            if kind == "number":
+                column[place] = np.nan if cell is None else cell
+            else:
+                column[place] = words.setdefault(cell, cell)
+    return tuple(columns)

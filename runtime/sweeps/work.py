@@ -1,0 +1,105 @@
+"""The part of a sweep that one process does: open the model once, compute the points it is handed.
+
+Takes: `Work`, plain data that can be sent to another process or machine.
+Gives: `Work`, `Computed`, `compute_part`, `program_versions`.
+Guarantees: a part's rows depend on the work and the part alone, not on who computes it or in what order; one
+BLAS thread; one part at a time in a process, as the libraries of numbers keep global settings.
+Does not: start processes, or keep results.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+import threading
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+
+from apc.compiler import store
+from apc.compiler.cache import program_digest
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.distribution import versions
+from apc.frame.overrides import apply
+from apc.sweeps.grid import Grid
+from apc.sweeps.quantities import Quantity, Row, faulty, find_quantity
+from apc.threads import single_threaded
+
+# What makes the numbers: with another version of one of them, the last digits may be others.
+LIBRARIES = ("casadi", "numpy", "python-flint", "scipy")
+
+_ONE_AT_A_TIME = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """A whole sweep: the compiled model as the bytes of NAME.apc, what to compute, and where.
+
+    Part i holds the points from i·`part_points` on, `part_points` of them or what is left.
+    """
+
+    model: bytes
+    of: str
+    grid: Grid
+    part_points: int
+
+    @property
+    def parts(self) -> int:
+        """The number of parts."""
+        return -(-self.grid.points // self.part_points)
+
+    def points_of(self, part: int) -> range:
+        """Return the numbers of a part's points."""
+        first = part * self.part_points
+        return range(first, min(first + self.part_points, self.grid.points))
+
+
+@dataclass(frozen=True, slots=True)
+class Computed:
+    """The rows of a part, and the versions of what computed them."""
+
+    part: int
+    rows: tuple[Row, ...]
+    versions: tuple[tuple[str, str], ...]
+
+
+def model_bytes(system: CompiledSystem) -> bytes:
+    """Return a compiled model as the bytes of its file; equal models give equal bytes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.apc"
+        store.save(system, path)
+        return path.read_bytes()
+
+
+def compute_part(work: Work, part: int) -> Computed:
+    """Compute one part of a sweep. A point that can't be computed becomes a row that says why."""
+    with _ONE_AT_A_TIME, single_threaded():
+        system, quantity = _opened(work.model, work.of)
+        rows = []
+        for point in work.points_of(part):
+            try:
+                rows.append(quantity.evaluate(apply(system, work.grid.overrides(point))))
+            except ApcError as error:
+                rows.append(faulty(quantity.columns, error))
+    return Computed(part, tuple(rows), program_versions())
+
+
+@cache
+def program_versions() -> tuple[tuple[str, str], ...]:
+    """Return what computes here: the versions of the libraries, and a digest of the program's own text."""
+    whole = hashlib.sha256(program_digest().encode())
+    runtime = Path(__file__).resolve().parents[1]
+    for path in sorted(runtime.rglob("*.py")):
+        whole.update(f"\0{path.relative_to(runtime)}\0".encode())
+        whole.update(path.read_bytes())
+    return (*versions(*LIBRARIES), ("program", whole.hexdigest()[:16]))
+
+
+@lru_cache(maxsize=1)
+def _opened(model: bytes, of: str) -> tuple[CompiledSystem, Quantity]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.apc"
+        path.write_bytes(model)
+        system = store.load(path)
+    return system, find_quantity(system, of)
