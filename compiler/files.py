@@ -1,11 +1,12 @@
 """What is read from disk and written to it, whoever named the file.
 
 Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `is_bounded`, `same_file`;
-`write_file`, `check_target`, and for what is written piece by piece `begin_file`, `finish_file`, `drop_file`,
-`partial_name`.
+`write_file`, `check_target`, `is_special`, `is_stdout`, and for what is written piece by piece `begin_file`,
+`finish_file`, `drop_file`, `partial_name`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a
-link stays and its file is written; a device or pipe is written to, never replaced.
+link stays and its file is written; a device or pipe, or what standard output writes to, is written to, never
+replaced.
 Does not: know a format, or say at which line a file was named.
 """
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +26,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 # Of a folder of a user's components: the largest library we know of has a hundred files, three deep.
 MOST_ENTRIES = 10_000
 MOST_DEPTH = 8
+STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
 
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
@@ -218,7 +221,7 @@ def begin_file(path: Path) -> Path:
     target = _target(path)
     if target.is_dir():
         raise IsADirectoryError(None, "it is a folder")
-    folder = None if _is_special(target) else target.parent
+    folder = None if is_special(path) else target.parent
     # The name of the target need not fit: a temporary's is longer.
     handle, name = tempfile.mkstemp(prefix=f".{target.name[:64]}.", dir=folder)
     os.close(handle)
@@ -233,11 +236,11 @@ def finish_file(temporary: Path, path: Path) -> None:
     OSError
         It can't be put there.
     """
-    target = _target(path)
-    if _is_special(target):
-        with temporary.open("rb") as source, open(target, "wb", buffering=0, opener=_existing) as drain:
+    if is_special(path):
+        with temporary.open("rb") as source, os.fdopen(_drain(path), "wb") as drain:
             shutil.copyfileobj(source, drain)
         return
+    target = _target(path)
     try:
         before = target.stat()
     except FileNotFoundError:
@@ -255,7 +258,8 @@ def finish_file(temporary: Path, path: Path) -> None:
 def partial_name(path: Path) -> Path:
     """Return where a part of what was to be written goes: a file that is there whole is not given for it."""
     target = _target(path)
-    return target.with_name(f"{target.stem}.partial{target.suffix}") if target.is_file() else path
+    new = is_special(path) or not target.is_file()
+    return path if new else target.with_name(f"{target.stem}.partial{target.suffix}")
 
 
 def drop_file(temporary: Path) -> None:
@@ -266,14 +270,26 @@ def drop_file(temporary: Path) -> None:
 def _target(path: Path) -> Path:
     """Return what a path leads to, whether or not it is there."""
     try:
-        return path.resolve() if path.is_symlink() else path
+        return path.resolve() if path.is_symlink() and not is_special(path) else path
     except RuntimeError as error:  # a loop of links
         raise OSError(None, "its links lead to one another") from error
 
 
-def _is_special(target: Path) -> bool:
-    """Return whether something is there that is neither a file nor a folder."""
-    return target.exists() and not (target.is_file() or target.is_dir())
+def is_special(path: Path) -> bool:
+    """Return whether a path leads to what is written to in place: a device, a pipe, our standard output."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or is_stdout(path)
+
+
+def is_stdout(path: Path) -> bool:
+    """Return whether a path leads to where our standard output goes, by whatever name, a file included."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(STDOUT))
+    except (OSError, ValueError):
+        return False
 
 
 def _give(temporary: Path, before: os.stat_result) -> None:
@@ -284,6 +300,9 @@ def _give(temporary: Path, before: os.stat_result) -> None:
         return
 
 
-def _existing(name: str, flags: int) -> int:
-    """Open what is there, and make nothing."""
-    return os.open(name, flags & ~(os.O_CREAT | os.O_TRUNC))
+def _drain(path: Path) -> int:
+    """Open what is there, and make nothing; standard output goes on where it is."""
+    if not is_stdout(path):
+        return os.open(path, os.O_WRONLY | getattr(os, "O_CLOEXEC", 0))
+    sys.stdout.flush()
+    return os.dup(STDOUT)

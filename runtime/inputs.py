@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from apc.compiler.cache import DAMAGE, LARGEST, Archive, Record, changed, read_archive, record_of
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_file, check_target, is_bounded, read_file, same_file
+from apc.suffixes import written
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -179,7 +180,7 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
     texts
         What it names, from its folder: files, and folders of components.
     outputs
-        What will be written, by the option that says so; None is nothing.
+        What will be written, by the option that says so (see `check_suffix`); None is nothing.
 
     Raises
     ------
@@ -190,7 +191,7 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
     given = [(option, output) for option, output in outputs.items() if output is not None]
     for place, (option, output) in enumerate(given):
         check_target(output)
-        hint = f"{option} {output.with_name(f'{output.stem}-result{output.suffix}')}"
+        hint = written(option, output.with_name(f"{output.stem}-result{output.suffix}"))
         for other, before in given[:place]:
             if output.absolute() == before.absolute() or same_file(output, before):
                 what = f"is given to {other} and to {option}: the second would replace the first"
@@ -198,7 +199,7 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
         if not output.is_file():
             continue
         if any(same_file(output, one) or _is_below(output, one) for one in named):
-            what = f"is read by this command: {option} would replace it"
+            what = f"is read by this command: {option.removesuffix('=')} would replace it"
             raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
 
 

@@ -148,7 +148,7 @@ def test_the_drawn_outline_encloses_the_stable_area() -> None:
         (["--x", Y, "--y", Y], "E902 coordination.stiffness is on both axes"),
         (
             ["--out", "region.bmp"],
-            "region.bmp: E908 --out wants one of .png, .svg, .pdf,",
+            "region.bmp: E878 the suffix of --out wants one of .png, .svg, .pdf,",
         ),
         (["--out", "nowhere/region.csv"], "E601 can't be written: No such file or directory"),
         (["--vary", "lan.delay"], "--vary: E907 --vary wants NAME=VALUE,VALUE,…"),

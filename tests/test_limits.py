@@ -8,10 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apc.analysis.analysis import lifted_groups
 from apc.analysis.selfcheck import check_frame
+from apc.answers import answer as answering
+from apc.answers.answer import answer
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.language import tables
 from apc.compiler.language.tables import read_table
+from apc.compiler.pipeline import compile_topology
+from apc.eigen import rigid
+from apc.eigen.modes import dense
 from apc.frame import discretize as discretizing
 from apc.frame import scheduling
 from apc.frame.discretize import discretize, moved_together
@@ -108,3 +114,80 @@ def test_peers_on_a_graph_have_a_limit_and_those_on_a_complete_one_none(graph: s
         "Write: graph: complete"
     )
     assert told(compiled, many) == []
+
+
+def leaf_and_levels(folder: Path, levels: int, width: int) -> str:
+    """Write components, each of so many of the one before; return a topology that has the last."""
+    folder.mkdir()
+    leaf = (
+        "component: L0\nconnectors: {flange: Flange}\nparameters: {k: {unit: N/m, default: 1}}\n"
+        "equations: [flange.f = -k*flange.x]\n"
+    )
+    (folder / "l0.yaml").write_text(leaf, encoding="utf-8")
+    for level in range(1, levels + 1):
+        parts = ", ".join(f"p{i}: {{type: L{level - 1}}}" for i in range(width))
+        text = (
+            f"component: L{level}\nconnectors: {{flange: Flange}}\nparts: {{{parts}}}\n"
+            "connect: {flange: p0.flange}\n"
+        )
+        (folder / f"l{level}.yaml").write_text(text, encoding="utf-8")
+    return f"{AVERAGE}library: ./{folder.name}\nhands: {{h: {{type: L{levels}, flange: device}}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("levels", "width", "message"),
+    [
+        (
+            9,
+            10,
+            ":1:12: E216 L3 holds 1,111 parts, those inside parts included, and 1000 are the most",
+        ),
+        (11, 1, ":1:12: E216 the parts of L10 stand inside one another more than 10 deep"),
+        (500, 1, "E212 components contain or extend one another more than 50 deep"),
+    ],
+)
+def test_parts_in_parts_are_counted_where_they_are_defined(
+    tmp_path: Path, levels: int, width: int, message: str
+) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(leaf_and_levels(tmp_path / "parts", levels, width), encoding="utf-8")
+    assert any(message in one for one in told(compile_topology, scene))
+
+
+@pytest.mark.parametrize(
+    ("limit", "why"),
+    [
+        ("MOST_TICKS", "8 ticks in a frame take too long"),
+        ("MOST_ENTRIES", "{} numbers of 4 states take too long"),
+    ],
+)
+def test_what_is_too_large_is_judged_and_not_varied(
+    monkeypatch: pytest.MonkeyPatch, limit: str, why: str
+) -> None:
+    model = compiled(AVERAGE)
+    (kind,) = model.kinds
+    monkeypatch.setattr(answering, limit, 7)
+    monkeypatch.setattr(answering, "margins", lambda *_, **__: pytest.fail("margins are looked for"))
+    monkeypatch.setattr(answering, "sensitivities", lambda *_, **__: pytest.fail("it is differentiated"))
+    found = answer(model)
+    assert found.analysis.stable
+    told_of = f"not looked for: {why.format(len(kind.parameters))}"
+    assert found.margins.note == told_of
+    assert found.sensitivities.note == f"what moves it most: {told_of}"
+
+
+def test_what_stands_still_is_written_out_once_however_many_ways_there_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = []
+    standing = rigid._standing
+    monkeypatch.setattr(rigid, "_standing", lambda *given: calls.append(1) or standing(*given))
+
+    def counted(free: int) -> int:
+        text = f"  free: {{mass: 1 kg, damping: 1 N*s/m, count: {free}}}\ncouplers:"
+        system = dense(*lifted_groups(compiled(replaced(AVERAGE, ("couplers:", text)))))
+        calls.clear()
+        assert rigid.stays_rigid(system, [group.exact for group in system.sites])
+        return len(calls)
+
+    assert counted(2) == counted(9)

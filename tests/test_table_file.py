@@ -49,9 +49,11 @@ def test_the_same_rows_give_the_same_bytes_over_many_blocks(tmp_path: Path, suff
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
-@pytest.mark.parametrize(("name", "got"), [("t.xlsx", ".xlsx"), ("t", "no suffix")])
+@pytest.mark.parametrize(("name", "got"), [("t.xlsx", ".xlsx"), ("t", "none")])
 def test_another_suffix_is_refused(name: str, got: str) -> None:
-    assert told(check_table_path, Path(name)) == [f"{name}: E887 a table wants .csv or .parquet, got {got}."]
+    assert told(check_table_path, Path(name), "--out") == [
+        f"{name}: E878 the suffix of --out wants one of .csv, .parquet, got {got}. Write: --out t.csv"
+    ]
 
 
 def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,11 +61,11 @@ def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", missing)
-    assert told(check_table_path, Path("t.parquet")) == [
-        "t.parquet: E887 is a Parquet file, which needs pyarrow; without it, --out can end in .csv. "
+    assert told(check_table_path, Path("t.parquet"), "--out") == [
+        "t.parquet: E887 is a Parquet file, which needs pyarrow; without it, the name can end in .csv. "
         "Write: pip install '.[data]'  # in the folder of apc's own pyproject.toml"
     ]
-    assert told(check_table_path, Path("t.csv")) == []
+    assert told(check_table_path, Path("t.csv"), "--out") == []
 
 
 def test_an_unwritable_folder_is_told_and_nothing_is_left(tmp_path: Path) -> None:
@@ -75,4 +77,4 @@ def test_an_unwritable_folder_is_told_and_nothing_is_left(tmp_path: Path) -> Non
 def test_a_folder_in_the_way_is_told_before_anything_is_computed(tmp_path: Path) -> None:
     (tmp_path / "r.csv").mkdir()
     path = tmp_path / "r.csv"
-    assert told(check_table_path, path) == [f"{path}: E601 can't be written: it is a folder."]
+    assert told(check_table_path, path, "--out") == [f"{path}: E601 can't be written: it is a folder."]

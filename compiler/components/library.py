@@ -20,6 +20,7 @@ from apc.compiler.source.reading import brief
 from apc.compiler.source.source import MAX_BYTES, Source, read_source
 
 SUFFIX = ".yaml"
+LONGEST_CHAIN = 50  # of components that are read for one another, each by several calls of Python's stack
 
 
 class Library:
@@ -78,6 +79,9 @@ class Library:
                 chain = " → ".join([*self._open[self._open.index(name) :], name])
                 what = f"components contain or extend each other: {chain}"
                 raise ApcError(Mistake("E212", source.root.place, what))
+            if len(self._open) == LONGEST_CHAIN:
+                what = f"components contain or extend one another more than {LONGEST_CHAIN} deep"
+                raise ApcError(Mistake("E212", source.root.place, what, hint="fewer of them in one another"))
             if name in self._failed:
                 raise self._failed[name]  # read once, even if a hundred parts are of it
             self._open.append(name)

@@ -31,6 +31,10 @@ SAME_RADIUS = 1e-11
 # More peers than this, that differ or stand on a graph, are more than can be differentiated in passing.
 FEW_PEERS = 100
 
+# What is varied is composed hundreds of times, tick by tick: with more ticks in a frame for over ten seconds.
+# A number's effect on the exponentials has as many entries as these, a few hundred megabytes for all numbers.
+MOST_TICKS, MOST_ENTRIES = 500, 2_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class Answer:
@@ -159,9 +163,8 @@ def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis
     found
         Its analysis.
     """
-    if _is_large(system, found):
-        note = "what moves it most: not looked for in so large a population"
-        return Sensitivities(found.spectral_radius, (), (), note)
+    if why := _too_large(system, prepared, found):
+        return Sensitivities(found.spectral_radius, (), (), f"what moves it most: {why}")
     try:
         told = sensitivities(system, prepared=prepared)
     except ApcError as error:
@@ -175,17 +178,26 @@ def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis
     return told
 
 
-def _is_large(system: CompiledSystem, found: Analysis) -> bool:
-    """Say whether the population is more than few small matrices, which are what is differentiated."""
+def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> str:
+    """Return why nothing is varied, "" unless the scene is more than few small matrices and short frames."""
     complete = all(link.graph.shape == "complete" for link in system.links)
     apart = found.method in ("determinant", "krylov") or not complete
-    return apart and system.peers > FEW_PEERS
+    if apart and system.peers > FEW_PEERS:
+        return "not looked for in so large a population"
+    ticks = max(sum(schedule.ticks) for schedule in prepared.schedules)
+    if ticks > MOST_TICKS:
+        return f"not looked for: {ticks:,} ticks in a frame take too long"
+    for kind in system.kinds:
+        if len(kind.parameters) * len(kind.states) ** 2 > MOST_ENTRIES:
+            what = f"{len(kind.parameters):,} numbers of {len(kind.states):,} states take too long"
+            return f"not looked for: {what}"
+    return ""
 
 
 def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Margins:
     """Return the margins, or only why they couldn't be had."""
-    if _is_large(system, found):
-        return Margins((), "not looked for in so large a population")
+    if why := _too_large(system, prepared, found):
+        return Margins((), why)
     try:
         return margins(system, prepared=prepared)
     except ApcError as error:

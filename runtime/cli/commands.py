@@ -18,7 +18,7 @@ import click
 from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
 from apc.cli.critical import critical_command
-from apc.cli.options import tell
+from apc.cli.options import beside, tell
 from apc.cli.region import region_command
 from apc.cli.simulate import simulate_command
 from apc.cli.sweep import sweep_command
@@ -221,8 +221,8 @@ def show(file: str | None, format_: str | None, out: Path | None) -> None:
 
     wanted = format_ or "text"
     if out is not None and (out.suffix or not format_):
-        check_suffix(out, [suffix for suffix in FORMATS if format_ in (None, FORMATS[suffix])], "--out")
-        wanted = FORMATS[out.suffix.lower()]
+        known = [suffix for suffix in FORMATS if format_ in (None, FORMATS[suffix])]
+        wanted = FORMATS[check_suffix(out, known, "--out")]
     path = Path(file) if file else find_input(compiled_too=False)
     check_topology_outputs(path, {"--out": out})
     _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
@@ -257,4 +257,4 @@ def _print_or_write(text: str, out: Path | None) -> None:
         temporary.write_bytes(f"{text}\n".encode())
 
     write_file(out, write)
-    tell(f"{out} is written")
+    tell(f"{out} is written", err=beside(out))

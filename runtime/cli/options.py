@@ -1,6 +1,7 @@
 """What commands have in common: the options `--set` and `--json`, and how a result is printed.
 
-Takes: a result. Gives: `set_option`, `json_option`, `WholeNumber`; `print_result`, `print_document`, `tell`.
+Takes: a result. Gives: `set_option`, `json_option`, `WholeNumber`; `print_result`, `print_document`, `tell`,
+`beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
@@ -8,12 +9,14 @@ Does not: know any command.
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any, Protocol
 
 import click
 
 from apc.compiler.digits import plain_int
 from apc.compiler.errors import visible
+from apc.compiler.files import is_stdout
 
 set_option = click.option(
     "--set",
@@ -45,17 +48,22 @@ class Result(Protocol):
         """Return the result as plain data, ready for JSON."""
 
 
-def print_result(found: Result, *, as_json: bool) -> None:
+def print_result(found: Result, *, as_json: bool, err: bool = False) -> None:
     """Print a result, as one JSON document or in words."""
     if as_json:
-        print_document(found.to_dict())
+        print_document(found.to_dict(), err=err)
     else:
-        tell(str(found))
+        tell(str(found), err=err)
 
 
-def print_document(document: Any) -> None:
+def print_document(document: Any, *, err: bool = False) -> None:
     """Print plain data as one JSON document."""
-    tell(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
+    tell(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2), err=err)
+
+
+def beside(*outputs: Path | None) -> bool:
+    """Return whether what is printed goes to stderr, as one of the files written is stdout."""
+    return any(output is not None and is_stdout(output) for output in outputs)
 
 
 def tell(text: str, *, err: bool = False) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from apc.cli.options import WholeNumber, json_option, print_document, print_result, set_option, tell
+from apc.cli.options import WholeNumber, beside, json_option, print_document, print_result, set_option, tell
 from apc.cli.progress import progress_bar
 from apc.compiler.errors import ApcError
 from apc.compiler.files import partial_name
@@ -211,13 +211,14 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
         plot = partial_name(plot) if interrupted else plot
         save(trajectory_of(simulation, keeper, summary, interrupted), plot)
     provenance = provenance_of(simulation)
+    err = beside(out, plot, kept.still)
     if as_json:
-        print_document(result_document(system.name, summary, provenance, interrupted, estimate))
+        print_document(result_document(system.name, summary, provenance, interrupted, estimate), err=err)
     else:
-        tell(result_text(system.name, summary, provenance, estimate))
+        tell(result_text(system.name, summary, provenance, estimate), err=err)
         for written in (out, plot, kept.still):
             if written is not None:
-                tell(f"  {written} is written")
+                tell(f"  {written} is written", err=err)
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
         tell(f"stopped at {until}; what was done is kept", err=True)
@@ -232,11 +233,13 @@ def _play_into(
     What was done is in the file even if the run can't go on.
     """
     from apc.simulation.length import size_note
-    from apc.simulation.recording import open_recording
+    from apc.simulation.recording import SUFFIXES, open_recording
     from apc.simulation.trajectory import play
 
     recording = open_recording(out, simulation) if out is not None else None
-    if out is not None and (note := size_note(simulation, decimal=out.suffix.lower() == ".csv")):
+    if out is not None and (
+        note := size_note(simulation, decimal=check_suffix(out, SUFFIXES, "--out") == ".csv")
+    ):
         tell(f"{out} {note}", err=True)
     total = float(simulation.settings.duration)
     try:

@@ -186,8 +186,12 @@ def stays_rigid(
     other = system if coupling is None else replace(system, coupling=coupling)
     numbering = _Numbering(system.sites)
     exact = [group.exact for group in system.sites]
-    for solution in _standing_solutions(system, exact, numbering):
-        if any(_value(form, solution) for form in _standing(other, others, numbering)):
+    solutions = _standing_solutions(system, exact, numbering)
+    forms = (
+        list(_standing(other, others, numbering)) if solutions else []
+    )  # of the matrices alone: once for all
+    for solution in solutions:
+        if any(_value(form, solution) for form in forms):
             return False
         moved = zip(
             _standing_state(system, others, numbering, solution),

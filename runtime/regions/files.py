@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target, write_file
 from apc.distribution import program_version
 from apc.optional import need
@@ -22,6 +21,7 @@ from apc.regions.figure import draw_panels
 from apc.regions.panels import Panels
 from apc.regions.region import Region
 from apc.simulation.figures import FORMATS, write_figure
+from apc.suffixes import check_suffix
 from apc.sweeps.quantities import Row
 from apc.sweeps.table_file import SUFFIXES, check_table_path, write_table
 
@@ -32,30 +32,26 @@ COLUMNS = (
 )
 
 
-def check_region_path(path: Path) -> None:
-    """Refuse a file that can't be written here, or of no known format.
+def check_region_path(path: Path) -> str:
+    """Refuse a file that can't be written here, or of no known format; return the suffix of its format.
 
     Raises
     ------
     ApcError
-        E908 the suffix, E601 the place, E887 or E875 a library that is missing.
+        E878 the suffix, E601 the place, E887 or E875 a library that is missing.
     """
-    suffix = path.suffix.lower()
-    known = (*FORMATS, *SUFFIXES, ".json")
-    if suffix not in known:
-        got = suffix or "no suffix"
-        raise ApcError(Mistake("E908", Place(str(path)), "--out", f"one of {', '.join(known)}", got))
+    suffix = check_suffix(path, (*FORMATS, *SUFFIXES, ".json"), "--out")
     check_target(path)
     if suffix in SUFFIXES:
-        check_table_path(path)
+        check_table_path(path, "--out")
     elif suffix in FORMATS:
         need("matplotlib.figure", "plot")
+    return suffix
 
 
 def write_panels(path: Path, found: Panels) -> None:
     """Write regions to a file, its format chosen by the suffix. Raises ApcError E601 if it can't."""
-    check_region_path(path)
-    suffix = path.suffix.lower()
+    suffix = check_region_path(path)
     if suffix in FORMATS:
         write_figure(draw_panels(found), path)
     elif suffix in SUFFIXES:

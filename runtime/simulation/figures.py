@@ -90,7 +90,7 @@ def write_figure(figure: Any, path: Path) -> None:
     # No date in the file, and the same names inside it.
     matplotlib = need("matplotlib", "plot")
     dates: dict[str, dict[str, None]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-    suffix = path.suffix.lower()
+    suffix = check_suffix(path, FORMATS, "--plot")
 
     def write(temporary: Path) -> None:
         with matplotlib.rc_context({"svg.hashsalt": "apc"}):

@@ -15,7 +15,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import begin_file, drop_file, finish_file, partial_name
+from apc.compiler.files import begin_file, drop_file, finish_file, is_special, partial_name
 from apc.simulation.blocks import Block
 from apc.simulation.formats import WRITERS
 from apc.simulation.simulation import Simulation
@@ -40,8 +40,10 @@ class Recording:
         provenance = provenance_of(simulation).to_json()
         try:
             temporary = self._temporary("")
-            self._writer = WRITERS[path.suffix.lower()](temporary, simulation.signals, provenance)
-            if self._writer.beside:  # now, while there is room
+            self._writer = WRITERS[check_suffix(path, SUFFIXES, "--out")](
+                temporary, simulation.signals, provenance
+            )
+            if self._writer.beside and not is_special(path):  # now, while there is room
                 beside = self._temporary(".json")
                 beside.write_text(self._writer.beside, encoding="utf-8")
         except (OSError, ValueError) as error:
@@ -133,7 +135,6 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
     ApcError
         E878 no such format, E879 it can't be written, E875 a library it needs is not installed.
     """
-    check_suffix(path, SUFFIXES, "--out")
     return Recording(path, simulation)
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import is_special
 from apc.compiler.words import counted, with_unit, wrapped
 from apc.frame.jacobians import jacobians
 from apc.frame.names import Free
@@ -163,8 +164,8 @@ def sweep(
     ------
     ApcError
         An axis is at fault (E622, E881 to E883, E896, E204, …); E884 nothing is computed under that name;
-        E885 other work stands at the target; E887 or E601 the target can't be written; E888 the cluster;
-        E889 a process ended, or nothing came for too long. What is finished is kept.
+        E885 other work stands at the target; E878, E887 or E601 the target can't be written; E888 the
+        cluster; E889 a process ended, or nothing came for too long. What is finished is kept.
     """
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
@@ -176,7 +177,7 @@ def sweep(
             what = f"{axis.label} is swept: there is nothing to look for at one value of it"
             raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
     if out is not None:
-        check_table_path(out)
+        check_table_path(out, "out=")
     if jobs is not None and jobs < 1:
         raise ApcError(Mistake("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
     work = Work(model_bytes(system), of, grid, max(PART_POINTS, -(-grid.points // MOST_PARTS)))
@@ -189,7 +190,8 @@ def sweep(
         columns = _columns(work, kept, kinds)
         if out is not None:
             write_table(out, headings, kinds, _rows(work, kept), made_of)
-            remove_parts(out)
+            if isinstance(kept, Parts):
+                remove_parts(out)
     return Sweep(system.name, of, grid, headings, columns, out, made_of, notes)
 
 
@@ -237,7 +239,7 @@ _Kept = Parts | _Memory
 
 @contextmanager
 def _kept(out: Path | None, made_of: Mapping[str, Any]) -> Iterator[_Kept]:
-    if out is None:
+    if out is None or is_special(out):
         yield _Memory()
         return
     with open_parts(out, made_of) as parts:

@@ -19,6 +19,7 @@ from typing import Any
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target, write_file
 from apc.distribution import install_line
+from apc.suffixes import check_suffix
 from apc.sweeps.quantities import Cell, Row
 
 SUFFIXES = (".csv", ".parquet")
@@ -27,16 +28,16 @@ BLOCK = 65_536
 METADATA = b"apc"  # the key of what made a table, in a Parquet file's own metadata
 
 
-def check_table_path(path: Path) -> None:
-    """Raise ApcError if no table can be written there: E887 by its suffix, E601 by its place."""
-    if path.suffix.lower() not in SUFFIXES:
-        got = path.suffix or "no suffix"
-        raise ApcError(Mistake("E887", Place(str(path)), "a table", " or ".join(SUFFIXES), got))
-    if path.suffix.lower() == ".parquet":
+def check_table_path(path: Path, option: str) -> None:
+    """Raise ApcError if no table can be written where an option says.
+
+    E878 the suffix, E887 a library that is missing, E601 the place.
+    """
+    if check_suffix(path, SUFFIXES, option) == ".parquet":
         try:
             importlib.import_module("pyarrow.parquet")
         except ImportError:
-            what = "is a Parquet file, which needs pyarrow; without it, --out can end in .csv"
+            what = "is a Parquet file, which needs pyarrow; without it, the name can end in .csv"
             hint = install_line("data")
             raise ApcError(Mistake("E887", Place(str(path)), what, hint=hint)) from None
     check_target(path)
@@ -54,7 +55,7 @@ def write_table(
     Parameters
     ----------
     path
-        The file; its suffix says the format, see `check_table_path`.
+        The file; its suffix says the format, see `check_suffix`.
     headings, kinds
         Of each column; a kind is "number", "count" or "text".
     rows
@@ -67,7 +68,7 @@ def write_table(
     ApcError
         E601 the file can't be written.
     """
-    if path.suffix.lower() == ".csv":
+    if check_suffix(path, SUFFIXES, "out=") == ".csv":
         write_file(path, lambda temporary: _write_csv(temporary, headings, rows))
     else:
         write_file(path, _parquet_writer(headings, kinds, rows, metadata))
