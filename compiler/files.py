@@ -1,6 +1,6 @@
 """What is read from disk and written to it, whoever named the file.
 
-Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `is_bounded`, `same_file`;
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
 `write_file`, `check_target`, `is_special`, `is_stdout`, and for what is written piece by piece `begin_file`,
 `finish_file`, `drop_file`, `partial_name`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
@@ -28,6 +28,7 @@ MOST_ENTRIES = 10_000
 MOST_DEPTH = 8
 STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
+KERNELS_OWN = "is an answer of the system's kernel"
 
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
 
@@ -58,8 +59,11 @@ def read_file(path: Path, most: int) -> bytes:
     try:
         check_file(path, most)  # first, as opening a device can already do something
         with open(path, "rb", opener=_without_waiting) as stream:
-            _check(os.fstat(stream.fileno()), most)  # of what was opened
-            data = stream.read(most + 1)
+            found = os.fstat(stream.fileno())
+            _check(found, most)  # of what was opened
+            data = stream.read(found.st_size + 1)  # as many bytes are set aside
+            if len(data) > found.st_size:
+                data += stream.read(most + 1 - len(data))
     except (OSError, ValueError) as error:
         raise _refusal(error) from None
     if len(data) > most:  # it grew meanwhile
@@ -90,7 +94,7 @@ def _check(found: os.stat_result, most: int) -> None:
     if not stat.S_ISREG(found.st_mode):
         raise RefusedError("special", "is a device, pipe or socket")
     if found.st_dev in _kernels_devices():
-        raise RefusedError("special", "is an answer of the system's kernel")
+        raise RefusedError("special", KERNELS_OWN)
     if found.st_size > most:
         raise _too_large(most)
 
@@ -124,8 +128,10 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
     Raises
     ------
     RefusedError
-        It can't be read, has more than `MOST_ENTRIES` entries, or is more than `MOST_DEPTH` folders deep.
+        It can't be read, is or holds a folder of the kernel's, has more than `MOST_ENTRIES` entries, or is
+        more than `MOST_DEPTH` folders deep.
     """
+    kernels = _kernels_devices()
     found: list[Path] = []
     seen = 0
     waiting = [(folder, 1)]
@@ -134,6 +140,8 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
         if depth > MOST_DEPTH:
             raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
         try:
+            if os.stat(here).st_dev in kernels:  # noqa: PTH116 -- as in os.scandir
+                raise RefusedError("special", KERNELS_OWN)
             with os.scandir(here) as entries:
                 for entry in entries:
                     seen += 1
@@ -146,17 +154,6 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
         except (OSError, ValueError) as error:
             raise _refusal(error) from None
     return tuple(sorted(found))
-
-
-def is_bounded(path: Path, most: int, suffix: str) -> bool:
-    """Return whether a path is a file that `read_file` would read, or a folder that `files_below` would."""
-    try:
-        if path.is_dir():
-            return all(is_bounded(file, most, suffix) for file in files_below(path, suffix))
-        check_file(path, most)
-    except (RefusedError, OSError, ValueError):
-        return False
-    return True
 
 
 def same_file(one: Path, other: Path) -> bool:

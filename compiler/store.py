@@ -37,7 +37,6 @@ import numpy as np
 from apc.compiler.cache import (
     DAMAGE,
     FORMAT,
-    LARGEST,
     MEMBER,
     SEAL,
     Archive,
@@ -48,7 +47,8 @@ from apc.compiler.cache import (
 )
 from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind, counts_peers
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, check_file, write_file
+from apc.compiler.files import RefusedError, write_file
+from apc.compiler.language.unit_text import is_si
 from apc.compiler.plain import PlainFunction, plain, read_function
 from apc.compiler.seal import seal
 
@@ -66,7 +66,7 @@ def save(system: CompiledSystem, path: Path, *, sealed: bool = False) -> None:
     mark = {SEAL: seal(text).encode()} if sealed else {}
 
     def write(temporary: Path) -> None:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(temporary, "w") as archive:
             for name, content in {MEMBER: text, **members, **mark}.items():
                 # A fixed date: the same model gives the same bytes.
                 archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
@@ -82,17 +82,12 @@ def load(path: Path) -> CompiledSystem:
 def load_with_record(path: Path) -> tuple[CompiledSystem, Record]:
     """Read a compiled model, and what it was made from as far as it may be looked up. Raises as `load`."""
     try:
-        check_file(path, LARGEST)
         archive = read_archive(path)
         return unpacked(archive, path), record_of(archive)
     except RefusedError as refused:
         hint = "apc compile" if refused.why == "missing" else ""
         other = ", not a compiled model" if refused.why in ("folder", "special") else ""
         raise ApcError(Mistake("E602", Place(str(path)), f"{refused.words}{other}", hint=hint)) from None
-    except OSError as error:
-        if error.strerror is None:  # a decompressor's
-            raise _damaged(path, FOREIGN) from error
-        raise ApcError(Mistake("E602", Place(str(path)), f"can't be read: {error.strerror}")) from error
     except DamageError as error:
         raise _damaged(path, str(error)) from error
     except DAMAGE as error:
@@ -161,10 +156,34 @@ def _is_consistent(system: CompiledSystem) -> bool:
         and all(_is_kind_consistent(kind, set(timings), clocks, parameters) for kind in system.kinds)
         and links.issuperset(sending.link for kind in system.kinds for sending in kind.sends)
         and all(_is_heard(kind, system) for kind in system.kinds)
+        and _are_units_consistent(system)
         and (duration is None or duration > 0)
         and 0 <= system.experiment.seed < 2**63
         and len(system.region) <= 2
         and all(axis.low < axis.high for axis in system.region)
+    )
+
+
+def _are_units_consistent(system: CompiledSystem) -> bool:
+    """Return whether every unit is of SI, as every number is, and no number has two.
+
+    A unit that is another, but of SI, is a false word of the file's, as a false stiffness is.
+    """
+    units = {parameter.name: parameter.unit for parameter in system.parameters}
+    values = [value for group in system.groups for value in group.values]
+    states = [state for kind in system.kinds for state in kind.states]
+    clocks = [partition for kind in system.kinds for partition in kind.clocks]
+    sent = (unit for kind in system.kinds for sending in kind.sends for unit in sending.units)
+    ticked = (unit for partition in clocks for unit in partition.units)
+    return (
+        all(map(is_si, {*units.values(), *sent, *ticked}))
+        and all(units[value.name] == value.unit for value in values)
+        and all(units[state.start] == state.unit for state in states)
+        and all(
+            units[start] == partition.units[memory]
+            for partition in clocks
+            for memory, start in zip(partition.memories, partition.starts, strict=True)
+        )
     )
 
 

@@ -18,7 +18,6 @@ from apc.compiler.files import (
     begin_file,
     files_below,
     finish_file,
-    is_bounded,
     read_file,
     write_file,
 )
@@ -31,7 +30,6 @@ def refused(path: Path, most: int = 100) -> tuple[str, str]:
     """Return why a file is not read, and the words."""
     with pytest.raises(RefusedError) as caught:
         read_file(path, most)
-    assert not is_bounded(path, most, ".yaml") or caught.value.why == "folder"
     return caught.value.why, caught.value.words
 
 
@@ -231,6 +229,37 @@ def test_a_pipe_as_a_model_or_as_what_a_model_was_made_of_is_not_waited_for(
             capsys, "analyze", "scene.yaml"
         )
         Path("users.csv").unlink()
+
+
+@FIFO
+def test_a_model_is_never_compiled_into_what_is_none(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whoever packed a folder may have put anything under the model's name."""
+    model, own = Path("scene.apc"), Path("own.txt")
+    own.write_text("mine", encoding="utf-8")
+    os.mkfifo("pipe")
+    link = "scene.apc: E601 can't be written: it is a link to what is no compiled model. Write: rm scene.apc"
+    special = "scene.apc: E601 can't be written: it is a device, pipe or socket. Write: rm scene.apc"
+    for target, message in ((own, link), ("new.txt", link), ("pipe", special), ("/dev/zero", special)):
+        model.symlink_to(target)
+        assert failed(capsys, "compile", "scene.yaml") == message
+        model.unlink()
+    os.mkfifo(model)
+    assert failed(capsys, "compile", "scene.yaml") == special
+    model.unlink()
+    assert own.read_text() == "mine" and not Path("new.txt").exists()
+    model.symlink_to("other.apc")
+    assert run(["compile", "scene.yaml"]) == 0
+    assert model.is_symlink() and Path("other.apc").is_file()
+
+
+def test_a_folder_of_the_kernel_s_is_no_library(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = replaced(AVERAGE, ("topology: three-users-average\n", "topology: a\nlibrary: /proc/self\n"))
+    Path("scene.yaml").write_text(text, encoding="utf-8")
+    assert "E214 the library folder /proc/self is an answer of the system's kernel." in failed(
+        capsys, "check", "scene.yaml"
+    )
 
 
 def test_a_library_that_is_the_whole_disk_is_refused(

@@ -12,9 +12,12 @@ from apc.analysis.analysis import lifted_groups
 from apc.analysis.selfcheck import check_frame
 from apc.answers import answer as answering
 from apc.answers.answer import answer
+from apc.api import simulate
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.language import tables
+from apc.compiler.language.recordings import read_time_table, read_trace
 from apc.compiler.language.tables import read_table
+from apc.compiler.language.units import parse_unit
 from apc.compiler.pipeline import compile_topology
 from apc.eigen import rigid
 from apc.eigen.modes import dense
@@ -59,6 +62,36 @@ def test_a_heading_of_spaces_and_brackets_is_read_in_one_pass(tmp_path: Path) ->
     for heading in (" " * 100_000 + "[", "[" * 100_000, "a" + " " * 100_000 + "] [kg]"):
         (message,) = told(read_table, table(tmp_path, f"b [kg],{heading}\n"), NOWHERE)
         assert ":1:8: E702 a heading wants a name and its unit" in message
+
+
+def test_a_heading_without_end_is_told_in_a_few_words(tmp_path: Path) -> None:
+    """Of every reader of a table: what a heading says is shown cut."""
+    long = "a" * 10_000
+    newton = parse_unit("N", NOWHERE)
+    path = table(tmp_path, f"time [s],{long}\n0,1\n1,2\n")
+    shown = f"{'a' * 57}..."
+    assert told(read_time_table, path, "force", newton, NOWHERE) == [
+        f"{path}:1:10: E702 {shown} wants N, got 1."
+    ]
+    path.write_text(f"from,to,{long}\n1,2,1\n", encoding="utf-8")
+    edges = ("delay: 8 ms}", "delay: 8 ms, graph: {edges: users.csv}}")
+    (tmp_path / "scene.yaml").write_text(replaced(AVERAGE, edges), encoding="utf-8")
+    (message,) = told(compile_topology, tmp_path / "scene.yaml")
+    assert message.endswith(f"wants the headings from, to and weight or none, got from, to, {'a' * 47}...")
+
+
+def test_a_row_is_at_the_line_it_begins_in(tmp_path: Path) -> None:
+    """A cell in quotes may go over lines, to the end of the file if they are never closed."""
+    path = table(tmp_path, 'a,b,c\n\n1,"2\n",3\n4,x,6\n7,8,"9\n\n')
+    assert told(read_table, path, NOWHERE) == [f"{path}:5:3: E703 a cell wants a finite number, got x."]
+    path.write_text('a,b\n1,2\n,"x\n\n', encoding="utf-8")
+    assert told(read_table, path, NOWHERE) == [
+        f"{path}:3:1: E703 a cell wants a finite number, got nothing.",
+        f"{path}:3:2: E703 a cell wants a finite number, got x.",
+    ]
+    path.write_text('delay [ms],b\n"1\n",2\n1,2\nx,"\n\n', encoding="utf-8")
+    (message,) = told(read_trace, path, NOWHERE)
+    assert f"{path}:5:1: E703 a delay wants" in message
 
 
 @pytest.mark.parametrize("cell", ["1_0", "١٠", "nan", "infinity", "0x10"])
@@ -191,3 +224,22 @@ def test_what_stands_still_is_written_out_once_however_many_ways_there_are(
         return len(calls)
 
     assert counted(2) == counted(9)
+
+
+def test_a_force_that_has_no_value_from_some_instant_on_ends_the_run_there(tmp_path: Path) -> None:
+    """Where halves of an interval are integrated until they agree, what has no value never would."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts/own.yaml").write_text(
+        "component: Own\nconnectors: {flange: Flange}\n"
+        "parameters: {F: {unit: N, default: 1}, T0: {unit: s, default: 0.0105}}\n"
+        "equations: [flange.f = F*sqrt(1 - time/T0)]\n",
+        encoding="utf-8",
+    )
+    (tmp_path / "scene.yaml").write_text(
+        "topology: scene\nlibrary: parts\nclocks: {haptic: 1 ms}\npeers: {user: {count: 1}}\n"
+        "masses: {device: {mass: 1 kg, damping: 1 N*s/m}}\nhands: {hand: {type: Own, flange: device}}\n",
+        encoding="utf-8",
+    )
+    ran = simulate(compile_topology(tmp_path / "scene.yaml"), duration="20 ms", jit=False)
+    assert ran.time[-1] == pytest.approx(0.01)
+    assert np.isfinite(ran.values).all()

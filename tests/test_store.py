@@ -17,6 +17,7 @@ from apc.compiler import cache, store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.files import write_file
+from tests.fuzz.models import zipped
 from tests.topologies import AVERAGE, MESH, compiled, replaced, told
 
 TWO_KINDS = replaced(
@@ -123,7 +124,10 @@ def test_a_field_of_another_type_is_refused(model: Path, key: str, value: object
 
 
 def test_a_file_that_unpacks_too_far_is_refused(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cache, "LARGEST", 10)
+    with zipfile.ZipFile(model) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    model.write_bytes(zipped(members))
+    monkeypatch.setattr(cache, "LARGEST", model.stat().st_size)
     (line,) = told(store.load, model)
     assert "E604 is damaged: it unpacks to more than 0 MiB" in line
 

@@ -15,9 +15,10 @@ from collections.abc import Mapping as MappingType
 from dataclasses import dataclass
 from pathlib import Path
 
+from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Settable
-from apc.compiler.components.library import SUFFIX, Library
+from apc.compiler.components.library import Library
 from apc.compiler.errors import Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.values import (

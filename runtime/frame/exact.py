@@ -115,9 +115,9 @@ def evaluate_exact(
         elif code == casadi.OP_OUTPUT:
             results[outputs[0]][outputs[1]] = work[inputs[0]]
         elif code == casadi.OP_CONST:
-            if math.isnan(constant):
+            if math.isnan(constant) and code not in own:
                 raise ValueError("math domain error")  # of constants alone, which CasADi evaluates at once
-            work[outputs[0]] = number(constant)
+            work[outputs[0]] = own[code](constant) if code in own else number(constant)
         elif code in own:
             work[outputs[0]] = own[code](*(work[place] for place in inputs))
         elif code == casadi.OP_DIV:

@@ -28,6 +28,7 @@ MOST = 8192
 
 # Where Python's operators won't do for arrays. A condition is 0 or 1, as in CasADi.
 _RULES: dict[int, Callable[..., Any]] = {
+    casadi.OP_CONST: np.float64,  # NaN too: what comes of it is no number, and is told as such
     casadi.OP_SIGN: np.sign,
     casadi.OP_NOT: lambda a: 1.0 * (a == 0),
     casadi.OP_FLOOR: np.floor,
