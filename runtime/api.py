@@ -127,7 +127,7 @@ def analyze(
     ApcError
         The input is at fault, or the method can't serve the scene.
     """
-    from apc.answers.answer import judge
+    from apc.answer import judge
 
     return judge(_model(model, set), method=method, certify=certify)
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apc import answer as answering
 from apc.analysis.analysis import lifted_groups
 from apc.analysis.selfcheck import check_frame
-from apc.answers import answer as answering
-from apc.answers.answer import answer
+from apc.answer import answer
 from apc.api import simulate
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.language import tables

@@ -35,6 +35,7 @@ from apc.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, sol
 from apc.frame.discretize import UNIT
 from apc.frame.lift import COEFFICIENT_ROUNDINGS
 from apc.network.nominal import left_out
+from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 
@@ -48,8 +49,10 @@ RIGID_ROUNDINGS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NamedMatrix:
+class NamedMatrix(Result):
     """A matrix (rows, columns) and what its rows and columns are."""
+
+    shown_by = "analysis:matrix"
 
     values: Floats
     rows: tuple[str, ...]
@@ -60,23 +63,17 @@ class NamedMatrix:
         """The number of rows and of columns."""
         return len(self.rows), len(self.columns)
 
-    def __str__(self) -> str:
-        """Return the shape and the ends of the names."""
-        rows, columns = self.rows, self.columns
-        shown = f"{len(rows)} × {len(columns)}"
-        return (
-            f"{shown}: {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if self.values.size else shown
-        )
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperRoute:
+class PaperRoute(Result):
     """Every matrix of the paper's section III, for n peers at ratio R.
 
     `a`, `b`, `c` are eq. (18); `a_d`, `b_d`, `c_d`, `d_d` eq. (19), without delays; `a_aug` … `d_aug` the
     same with the delays; `f_d` the feedback; `closed` A_cl of eq. (20); `eigenvalues` its eigenvalues, the
     largest first, rigid ones included.
     """
+
+    shown_by = "analysis:paper_route"
 
     ratio: int
     frame_s: float
@@ -94,16 +91,6 @@ class PaperRoute:
     f_d: NamedMatrix
     closed: NamedMatrix
     eigenvalues: NDArray[np.complex128]
-
-    def __str__(self) -> str:
-        """Return the shapes, a line a matrix."""
-        named = (
-            *(("A", self.a), ("B", self.b), ("C", self.c), ("A_D", self.a_d), ("B_D", self.b_d)),
-            *(("C_D", self.c_d), ("D_D", self.d_d), ("A_aug", self.a_aug), ("B_aug", self.b_aug)),
-            *(("C_aug", self.c_aug), ("D_aug", self.d_aug), ("F_D", self.f_d), ("A_cl", self.closed)),
-        )
-        lines = [f"  {name:<6} {len(one.rows):>4} × {len(one.columns)}" for name, one in named]
-        return "\n".join([f"ratio {self.ratio}, frame {self.frame_s * 1e3:.6g} ms", *lines])
 
 
 def paper_route(system: CompiledSystem) -> PaperRoute:

@@ -23,7 +23,7 @@ from apc.cli.region import region_command
 from apc.cli.simulate import simulate_command
 from apc.cli.sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import write_file
+from apc.compiler.files import write_text
 from apc.compiler.words import counted
 from apc.suffixes import check_suffix
 from apc.threads import start_single_threaded
@@ -172,9 +172,9 @@ def _compile(path: Path, *, timings: bool) -> None:
     """Compile, check, save and report; with `timings`, how long each of it took."""
     from apc.analysis.needs import needs
     from apc.analysis.selfcheck import check_frame
-    from apc.answers.report import compile_report, timings_report
     from apc.compiler.pipeline import each_stage
     from apc.compiler.store import save
+    from apc.present.analysis import compile_text, timings_text
 
     taken: list[tuple[str, float]] = []
     last = time.perf_counter()
@@ -194,9 +194,9 @@ def _compile(path: Path, *, timings: bool) -> None:
     lap("self-check")
     save(system, target := path.with_suffix(".apc"), sealed=True)
     lap("save")
-    tell(compile_report(system, needs(system), target, difference))
+    tell(compile_text(system, needs(system), target, difference))
     if timings:
-        tell(timings_report(taken))
+        tell(timings_text(taken))
 
 
 @apc.command()
@@ -253,8 +253,5 @@ def _print_or_write(text: str, out: Path | None) -> None:
         tell(text)
         return
 
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(f"{text}\n".encode())
-
-    write_file(out, write)
+    write_text(out, text)
     tell(f"{out} is written", err=beside(out))

@@ -1,22 +1,22 @@
 """What commands have in common: the options `--set` and `--json`, and how a result is printed.
 
-Takes: a result. Gives: `set_option`, `json_option`, `WholeNumber`; `print_result`, `print_document`, `tell`,
-`beside`.
+Takes: a result. Gives: `set_option`, `json_option`, `WholeNumber`; `print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import click
 
 from apc.compiler.digits import plain_int
 from apc.compiler.errors import visible
 from apc.compiler.files import is_stdout
+from apc.present.forms import json_text
+from apc.result import Result
 
 set_option = click.option(
     "--set",
@@ -41,24 +41,9 @@ class WholeNumber(click.IntRange):
         return super().convert(value, param, ctx)
 
 
-class Result(Protocol):
-    """What a command finds: it prints itself, and gives itself as plain data."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result as plain data, ready for JSON."""
-
-
 def print_result(found: Result, *, as_json: bool, err: bool = False) -> None:
     """Print a result, as one JSON document or in words."""
-    if as_json:
-        print_document(found.to_dict(), err=err)
-    else:
-        tell(str(found), err=err)
-
-
-def print_document(document: Any, *, err: bool = False) -> None:
-    """Print plain data as one JSON document."""
-    tell(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2), err=err)
+    tell(json_text(found.to_dict()) if as_json else str(found), err=err)
 
 
 def beside(*outputs: Path | None) -> bool:

@@ -87,7 +87,7 @@ def region_command(
     """
     start_single_threaded()
     from apc.inputs import open_scene
-    from apc.regions.files import check_region_path, write_panels
+    from apc.present.region import check_region_path, write_panels
     from apc.regions.panels import compare_regions, parse_panel, parse_vary
 
     if out is not None:

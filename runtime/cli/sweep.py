@@ -87,7 +87,7 @@ def sweep_command(
     """
     from apc.inputs import open_scene
     from apc.sweeps.sweep import Patience, sweep
-    from apc.sweeps.table_file import check_table_path
+    from apc.tables import check_table_path
 
     check_table_path(out, "--out")
     waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))

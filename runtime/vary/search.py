@@ -15,7 +15,6 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
 from apc.eigen.rigid import RigidModes, find_rigid_modes
-from apc.eigen.spectrum import DRIFTS, finite, solve_spectrum
+from apc.eigen.spectrum import DRIFTS, solve_spectrum
 from apc.frame.names import Free, parameter_of
 from apc.vary.batch import BatchEvaluator
 from apc.vary.bends import bends
@@ -83,17 +82,6 @@ class Crossing:
     frequency_hz: float
     kind: str
     proof: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the crossing as plain data, ready for JSON."""
-        return {
-            "value": self.value,
-            "error": self.error,
-            "stable_side": self.stable_side,
-            "frequency_hz": finite(self.frequency_hz),
-            "kind": self.kind,
-            "proof": self.proof,
-        }
 
 
 @dataclass(frozen=True, slots=True)

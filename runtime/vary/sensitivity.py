@@ -1,7 +1,7 @@
 """What moves the spectral radius most: its derivative with respect to every parameter.
 
 Takes: a `CompiledSystem`.
-Gives: `Sensitivity`, `Sensitivities`, `sensitivities`, `sensitivity_report`.
+Gives: `Sensitivity`, `Sensitivities`, `sensitivities`.
 Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, with a bound on its
 error; each name can be set as it stands; where several eigenvalues share the radius, one row for each of them
 and no gradient that belongs to none.
@@ -13,22 +13,21 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import counted, with_unit, wrapped
+from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.rigid import find_rigid_modes, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
+from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator, matrix_errors
@@ -48,9 +47,6 @@ CLOSE = 1e-7
 
 # A cluster of vectors worse conditioned than this has no derivative worth the name.
 WORST = 1e8
-
-# Rows of the table.
-SHOWN = 6
 
 NO_MATRIX = "what moves it most: not looked for: the present values have no frame matrix of their own"
 
@@ -73,7 +69,7 @@ class Sensitivity:
 
 
 @dataclass(frozen=True, slots=True)
-class Sensitivities:
+class Sensitivities(Result):
     """All derivatives, those that move most first, and the eigenvalues they belong to.
 
     `active` are the eigenvalues that share the radius, each named by its system: more than one at a crossing,
@@ -81,36 +77,12 @@ class Sensitivities:
     there is none.
     """
 
+    shown_by = "vary:sensitivities"
+
     radius: float
     active: tuple[tuple[complex, str], ...]
     rows: tuple[Sensitivity, ...]
     note: str
-
-    def __str__(self) -> str:
-        """Return the table of what moves the radius most."""
-        return sensitivity_report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the derivatives as plain data, ready for JSON."""
-        return {
-            "spectral_radius": self.radius,
-            "active": [
-                {"eigenvalue": [value.real, value.imag], "system": name} for value, name in self.active
-            ],
-            "derivatives": [
-                {
-                    "parameter": row.parameter,
-                    "unit": row.unit,
-                    "value": row.value,
-                    "derivative": row.derivative,
-                    "relative": row.relative,
-                    "error": row.error,
-                    "mode": row.mode,
-                }
-                for row in self.rows
-            ],
-            "note": self.note,
-        }
 
 
 def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -> Sensitivities:
@@ -269,12 +241,6 @@ def _defective(one: _Cluster) -> str:
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
 
-NONE_TOLD = "what moves the radius most: no change of it can be told from rounding"
-
-# Digits of a change.
-DIGITS = 3
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cluster:
     """Eigenvalues (c,) that are one within rounding, of a system without its rigid motions V.
@@ -387,32 +353,3 @@ def _rates(one: _Cluster) -> Iterator[tuple[Floats | None, float]]:
 def _without(vectors: Complexes, rigid: Floats) -> Complexes:
     """Return what of vectors is no rigid motion (of orthonormal ones)."""
     return vectors - rigid @ (rigid.T @ vectors)
-
-
-def sensitivity_report(found: Sensitivities) -> str:
-    """Return the table "what moves it most", of at most 80 columns."""
-    # Eigenvalues that share the radius often change alike, and then one row tells it.
-    alike: dict[tuple[str, str], list[Sensitivity]] = {}
-    for row in found.rows:
-        if abs(row.derivative) > row.error and row.relative:  # else it can't be told from 0
-            change = _change(row.relative / 100, row.error * abs(row.value) / 100)
-            alike.setdefault((row.parameter, change), []).append(row)
-    shown = list(alike.items())[:SHOWN]
-    if not shown:
-        note = found.note if len(found.active) < 2 else ""
-        return "\n".join(wrapped(note or NONE_TOLD, "  ", "    "))
-    width = max(len(name) for (name, _), _ in shown)
-    lines = ["  what moves it most" + " " * max(width - 16, 2) + "value            per percent"]
-    for (name, change), rows in shown:
-        some = ", ".join(str(row.mode + 1) for row in rows) if len(rows) < len(found.active) else ""
-        value = with_unit(f"{rows[0].value:.6g}", rows[0].unit)
-        lines.append(f"  {name:<{width}}  {value:<16} {change}{f'  mode {some}' if some else ''}")
-    if found.note:
-        lines += wrapped(found.note, "  ", "    ")
-    return "\n".join(lines)
-
-
-def _change(value: float, error: float) -> str:
-    """Return a change to three digits, fewer where its error leaves them open."""
-    known = math.floor(math.log10(abs(value) / error)) if error else DIGITS
-    return f"{value:+.{min(max(known, 1), DIGITS) - 1}e}"

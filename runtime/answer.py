@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.analysis.contact_modes import ContactModes, contact_modes
 from apc.analysis.conventions import Conventions, conventions
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.result import Result
 from apc.vary.margins import Margins, margins
 from apc.vary.sensitivity import Sensitivities, sensitivities
 
@@ -37,13 +38,15 @@ MOST_TICKS, MOST_ENTRIES = 500, 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(Result):
     """An analysis with what moves its spectral radius most, its margins, and its modes of contact.
 
     `conventions` holds the analyses under every order of coincident events, or under those that could be had
     in passing; `detailed` says that they were asked for. `box` is the proof over a box of parameters, where
     one was asked for.
     """
+
+    shown_by = "analysis:answer"
 
     analysis: Analysis
     sensitivities: Sensitivities
@@ -52,27 +55,6 @@ class Answer:
     conventions: Conventions
     detailed: bool
     box: BoxProof | None
-
-    def __str__(self) -> str:
-        """Return the answer as text of at most 80 columns."""
-        from apc.answers.report import answer_report  # it needs this module
-
-        return answer_report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the answer as plain data, ready for JSON: the analysis with more keys."""
-        found = self.analysis.to_dict() | {
-            "sensitivities": self.sensitivities.to_dict(),
-            "margins": [one.to_dict() for one in self.margins.rows],
-            "margins_note": self.margins.note,
-            "contact_modes": self.contact_modes.to_dict() if self.contact_modes else None,
-            "warnings": [self.conventions.warning] if self.conventions.warning else [],
-        }
-        if self.detailed:
-            found["conventions"] = self.conventions.to_dict()
-        if self.box is not None:
-            found["box"] = self.box.to_dict()
-        return found
 
 
 def judge(
