@@ -64,7 +64,7 @@ def close_loop(loop: Loop) -> ClosedSystem:
     """
     lifted = [group.lifted for group in loop.sites]
     layout = lay_out(loop)
-    exact = [(site.p, site.q, site.s, site.d) for site in lifted]
+    exact = [site.blocks for site in lifted]
     matrix, heard = _closed(exact, _links(loop, layout, lambda weight, _: float(weight)), layout)
     motion = [
         offset + place
@@ -81,7 +81,7 @@ def close_loop(loop: Loop) -> ClosedSystem:
         offsets=layout.offsets,
         packets=layout.packets,
         matrix=matrix,
-        error=_closing_errors(loop, layout, exact),
+        error=_closing_errors(loop, layout),
         heard=tuple(heard),
         motion=tuple(motion),
         doubts=loop.doubts,
@@ -89,22 +89,15 @@ def close_loop(loop: Loop) -> ClosedSystem:
     )
 
 
-def _closing_errors(loop: Loop, layout: StateLayout, exact: Sequence[Sequence[Floats]]) -> Floats:
+def _closing_errors(loop: Loop, layout: StateLayout) -> Floats:
     """Return bounds on the errors of a closed matrix, entry by entry: its sites', its weights' and rounding.
 
     The magnitudes, and the magnitudes with their errors: the difference bounds the error to all orders.
     """
     lifted = [group.lifted for group in loop.sites]
-    large = [tuple(np.abs(block) for block in blocks) for blocks in exact]
-    wide = [
-        tuple(
-            block + error
-            for block, error in zip(
-                blocks, (site.p_error, site.q_error, site.s_error, site.d_error), strict=True
-            )
-        )
-        for blocks, site in zip(large, lifted, strict=True)
-    ]
+    sizes = [site.mapped(np.abs) for site in lifted]
+    large = [one.blocks for one in sizes]
+    wide = [one.mapped(np.add, site.error).blocks for one, site in zip(sizes, lifted, strict=True)]
     weights = _links(loop, layout, lambda weight, _: float(abs(weight)))
     doubtful = (
         _links(loop, layout, lambda weight, doubt: float(abs(weight)) + doubt) if loop.doubts else weights

@@ -9,14 +9,14 @@ Does not: merge equal peers of different groups (see `peers`), or take sites tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.frame.batch_lift import CHUNK, LiftedRows, lift_rows
+from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.discretize import UNIT
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import LiftedSite
@@ -28,9 +28,6 @@ from apc.large.transfer import StateSpace
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-
-# The matrices of `LiftedRows`, one a site.
-ROWS = ("p", "q", "s", "d", "p_error", "q_error", "s_error", "d_error")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +43,7 @@ class Crowd:
     jacobians: SiteJacobians
     schedule: Schedule
     parameters: Floats
-    lifted: LiftedRows
+    lifted: LiftedSite
     rows: Integers
     counts: Floats
 
@@ -84,29 +81,19 @@ def crowds(
     return tuple(found)
 
 
-def some_rows(lifted: LiftedRows, places: slice | Integers) -> LiftedRows:
+def some_rows(lifted: LiftedSite, places: slice | Integers) -> LiftedSite:
     """Return some of the sites."""
-    return replace(lifted, **{name: getattr(lifted, name)[places] for name in ROWS})
+    return _every_block(lifted, lambda block: block[places])
 
 
-def rows_of(lifted: LiftedSite, count: int) -> LiftedRows:
+def rows_of(lifted: LiftedSite, count: int) -> LiftedSite:
     """Return `count` copies of one lifted site."""
+    return _every_block(lifted, lambda block: np.broadcast_to(block, (count, *block.shape)))
 
-    def copies(matrix: Floats) -> Floats:
-        return np.broadcast_to(matrix, (count, *matrix.shape))
 
-    return LiftedRows(
-        z_names=lifted.z_names,
-        frame_s=lifted.frame_s,
-        p=copies(lifted.p),
-        q=copies(lifted.q),
-        s=copies(lifted.s),
-        d=copies(lifted.d),
-        p_error=copies(lifted.p_error),
-        q_error=copies(lifted.q_error),
-        s_error=copies(lifted.s_error),
-        d_error=copies(lifted.d_error),
-    )
+def _every_block(lifted: LiftedSite, change: Callable[[Floats], Floats]) -> LiftedSite:
+    p, q, s, d = lifted.mapped(change).blocks
+    return replace(lifted, p=p, q=q, s=s, d=d, error=lifted.error.mapped(change))
 
 
 def site_one(crowd: Crowd, row: int) -> LinearSite:
@@ -114,7 +101,7 @@ def site_one(crowd: Crowd, row: int) -> LinearSite:
     return site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, crowd.parameters[[row]])[0])
 
 
-def hear_themselves(lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats) -> StateSpace:
+def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> StateSpace:
     """Let every site hear its own packets, weighed, and leave the rest of what it hears open.
 
     Parameters
@@ -143,25 +130,23 @@ def hear_themselves(lifted: LiftedRows, schedule: Schedule, own: Floats, others:
 
 
 def hear_roughly(
-    lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats
+    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return M, B, S and D as `hear_themselves` has them, without their errors."""
     now, before, count = lines_of(schedule)
-    return _closed((lifted.p, lifted.q, lifted.s, lifted.d), own, others, now, before, schedule, count)
+    return _closed(lifted.blocks, own, others, now, before, schedule, count)
 
 
 def _hear_themselves(
-    lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats
+    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, ...]:
     """Close a chunk of sites, with the errors."""
     now, before, count = lines_of(schedule)
-    blocks = (lifted.p, lifted.q, lifted.s, lifted.d)
-    errors = (lifted.p_error, lifted.q_error, lifted.s_error, lifted.d_error)
-    large = [np.abs(block) for block in blocks]
-    wide = [block + error for block, error in zip(large, errors, strict=True)]
-    value = _closed(blocks, own, others, now, before, schedule, count)
-    bound = _closed(large, np.abs(own), np.abs(others), now, before, schedule, count)
-    upper = _closed(wide, np.abs(own), np.abs(others), now, before, schedule, count)
+    large = lifted.mapped(np.abs)
+    wide = large.mapped(np.add, lifted.error)
+    value = _closed(lifted.blocks, own, others, now, before, schedule, count)
+    bound = _closed(large.blocks, np.abs(own), np.abs(others), now, before, schedule, count)
+    upper = _closed(wide.blocks, np.abs(own), np.abs(others), now, before, schedule, count)
     terms = lifted.p.shape[-1] + 2 * len(schedule.heard) + 4
     roundings = 4 * terms * (1 + len(schedule.sent)) * UNIT
     return (*value, *((u - b) + roundings * u for u, b in zip(upper, bound, strict=True)))

@@ -1,7 +1,7 @@
 """Closing the loop of one system for many points at once, and taking its rigid motions out.
 
 Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
-Gives: `Lifted`, `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_weights`,
+Gives: `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_weights`,
 `are_rigid`, `site_key`.
 Guarantees: the matrices are those of `modes.close_loop` in relative coordinates, to rounding; where the
 directions are not those of a rigid motion they are NaN.
@@ -22,6 +22,7 @@ from apc.eigen.closing import ClosedSystem
 from apc.eigen.loop import Packet, packet_places
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates, relative_places
+from apc.frame.lift import FrameMap
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
@@ -33,16 +34,6 @@ RIGID = 1e-9
 # An eigenvalue nearer to 1 than this, the rigid directions taken out, may be the second of a Jordan pair
 # (rounding splits one by about the root of UNIT): then the exact search for drifts is worth its time.
 NEAR_ONE = 1e-6
-
-
-@dataclass(frozen=True, slots=True)
-class Lifted:
-    """The one-frame maps of one group of peers at k points: z⁺ = P z + Q r, s = S z + D r."""
-
-    p: Matrices  # (k, n_z, n_z)
-    q: Matrices  # (k, n_z, n_r)
-    s: Matrices  # (k, n_s, n_z)
-    d: Matrices  # (k, n_s, n_r)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +130,7 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
     )
 
 
-def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], Lifted]) -> Matrices:
+def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
     """Close the loop of one system at all points: its matrices (k, n, n), see `modes.close_loop`."""
     system = wiring.system
     n = len(system.names)
