@@ -54,7 +54,7 @@ HOUSE = (
     (
         "apc.eigen",
         """
-        runs graph_modes peer_group listening peers loop closing coupling graph_loops twins modes
+        runs graph_modes peer_group listening peers closing coupling graph_loops twins modes
         rigid components pseudospectrum enclosure balls roots certify ratios duals spectrum
         """,
     ),

@@ -22,9 +22,8 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedSystem, Packet, shift_packets
 from apc.eigen.graph_modes import Surd
-from apc.eigen.loop import Packet, packet_places
 from apc.frame.discretize import step_balls
 from apc.frame.exact import is_rational
 from apc.frame.lift import follow
@@ -119,7 +118,7 @@ def compose(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[S
     """
     n = len(system.names)
     unit = np.eye(n, dtype=np.int64).astype(object)
-    place_of = packet_places(system.sites, system.packets, system.offsets)
+    place_of = system.layout.places
     rows_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
     weights = _weights(system)
     sent: dict[tuple[int, int], Balls] = {}
@@ -158,9 +157,7 @@ def compose(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[S
                 matrix[system.offsets[g] : system.offsets[g] + len(state)] = state
                 del courses[g]
         assert (len(courses), len(sent)) != known, "a packet is heard before it is sent"
-    for packet, place in place_of.items():
-        earlier = Packet(packet.site, packet.row, packet.lag - 1)
-        matrix[place] = unit[place_of[earlier]] if packet.lag > 1 else sent[packet.site, packet.row]
+    shift_packets(matrix, system.layout, lambda packet: sent[packet.site, packet.row])
     return matrix
 
 

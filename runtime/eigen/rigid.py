@@ -29,9 +29,8 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedSystem, Coupling, Loop
 from apc.eigen.graph_modes import QUICK_PRIME
-from apc.eigen.loop import Coupling, Loop
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.frame.schedule import Act, Propagate, Send, Tick, Value
 from apc.frame.site import LinearSite

@@ -100,7 +100,17 @@ def step_durations(schedule: Schedule) -> list[int]:
 def named(
     kind: Kind, schedule: Schedule, frame: FrameMap, error: FrameMap, *, estimated: bool = False
 ) -> LiftedSite:
-    """Return a frame's map and its error with the names of its states."""
+    """Return a frame's map and its error with the names of its states.
+
+    Parameters
+    ----------
+    kind, schedule
+        Of the site or sites.
+    frame, error
+        Their map, and the bounds on it.
+    estimated
+        Whether these are an estimate.
+    """
     return LiftedSite(
         *frame.blocks,
         error=error,

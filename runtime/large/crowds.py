@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.eigen.closing import Closed, Hearing, StateLayout, close, closing_errors, lay_out
 from apc.frame.batch_lift import CHUNK, lift_rows
-from apc.frame.discretize import UNIT
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import LiftedSite
 from apc.frame.linearize import linearize_rows, site_of_row
@@ -119,7 +119,7 @@ def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others:
     -----
     The state is z, then the packets on their way, row by row of s, the youngest first. With A₀ and B_p
     picking what each line hears of this frame's packets and of those on their way,
-    r = others·τ + own·(A₀ s + B_p q) and s = S z + D r: as in `modes.close_loop`, D A₀ is nilpotent.
+    r = others·τ + own·(A₀ s + B_p q) and s = S z + D r: as in `closing.close`, D A₀ is nilpotent.
     """
     parts = []
     for start in range(0, len(own), CHUNK):
@@ -133,23 +133,36 @@ def hear_roughly(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return M, B, S and D as `hear_themselves` has them, without their errors."""
-    now, before, count = lines_of(schedule)
-    return _closed(lifted.blocks, own, others, now, before, schedule, count)
+    layout, hearing = _open_loop(lifted, schedule, own, others)
+    return _cut(close([lifted], [hearing], layout))
 
 
 def _hear_themselves(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, ...]:
     """Close a chunk of sites, with the errors."""
-    now, before, count = lines_of(schedule)
-    large = lifted.mapped(np.abs)
-    wide = large.mapped(np.add, lifted.error)
-    value = _closed(lifted.blocks, own, others, now, before, schedule, count)
-    bound = _closed(large.blocks, np.abs(own), np.abs(others), now, before, schedule, count)
-    upper = _closed(wide.blocks, np.abs(own), np.abs(others), now, before, schedule, count)
-    terms = lifted.p.shape[-1] + 2 * len(schedule.heard) + 4
-    roundings = 4 * terms * (1 + len(schedule.sent)) * UNIT
-    return (*value, *((u - b) + roundings * u for u, b in zip(upper, bound, strict=True)))
+    layout, hearing = _open_loop(lifted, schedule, own, others)
+    size = lifted.mapped(np.abs)
+    wide = size.mapped(np.add, lifted.error)
+    error, _ = closing_errors([size], [wide], [hearing.size], layout)
+    return (*_cut(close([lifted], [hearing], layout)), *_cut(error))
+
+
+def _open_loop(
+    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
+) -> tuple[StateLayout, Hearing]:
+    """Return the state of each site by itself, and what it hears of it and, behind it, of the others."""
+    now, before, _ = lines_of(schedule)
+    nothing = np.zeros((*own.shape, lifted.p.shape[-1]))
+    outside = others[:, :, None] * np.eye(own.shape[1])
+    heard = np.concatenate([nothing, own[:, :, None] * before, outside], axis=-1)
+    return lay_out([lifted.z_names], [schedule]), Hearing(own[:, :, None] * now, heard)
+
+
+def _cut(closed: Closed) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return M, B, S and D of closed loops over their states and what comes from outside."""
+    n = closed.matrix.shape[-2]
+    return closed.matrix[..., :n], closed.matrix[..., n:], closed.sent[..., :n], closed.sent[..., n:]
 
 
 def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:
@@ -166,39 +179,3 @@ def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:
         else:
             before[line, starts[place[one.sent]] + one.lag - 1] = 1.0
     return now, before, int(starts[-1])
-
-
-def _closed(
-    blocks: Sequence[Floats],
-    own: Floats,
-    others: Floats,
-    now: Floats,
-    before: Floats,
-    schedule: Schedule,
-    packets: int,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return M, B, S and D of the sites with their own packets closed."""
-    p, q, s, d = blocks
-    sites, n_z = p.shape[:2]
-    in_frame = own[:, :, None] * now  # (k, n_r, n_s)
-    spread = np.broadcast_to(np.eye(len(schedule.heard)), (sites, *[len(schedule.heard)] * 2))
-    if in_frame.any() and d.any():  # Neumann's series ends: nothing is heard before it is sent
-        loop = term = in_frame @ d
-        for _ in range(len(schedule.sent)):
-            spread, term = spread + term, term @ loop
-        assert not term.any(), "a packet is heard before it is sent"
-    r_z = spread @ (in_frame @ s)
-    r_q = spread @ (own[:, :, None] * before)
-    r_t = spread * others[:, None, :]
-    s_all = np.concatenate([s + d @ r_z, d @ r_q], axis=2)
-    s_t = d @ r_t
-    m = np.zeros((sites, n_z + packets, n_z + packets))
-    b = np.zeros((sites, n_z + packets, len(schedule.heard)))
-    m[:, :n_z, :n_z], m[:, :n_z, n_z:], b[:, :n_z] = p + q @ r_z, q @ r_q, q @ r_t
-    place = n_z
-    for row, depth in enumerate(schedule.depths):
-        if depth:
-            m[:, place], b[:, place] = s_all[:, row], s_t[:, row]
-            m[:, range(place + 1, place + depth), range(place, place + depth - 1)] = 1.0
-        place += depth
-    return m, b, s_all, s_t

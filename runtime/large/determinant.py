@@ -20,7 +20,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.loop import Coupling
+from apc.eigen.closing import Coupling
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange, check_mean

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import ClosedSystem, close_loop
-from apc.eigen.loop import Loop
+from apc.eigen.closing import Closed, ClosedSystem, close_loop, closing_errors
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import find_rigid_modes
@@ -166,16 +165,7 @@ class BatchEvaluator:
             for one in system.sites
             if (new := moved[site_key(one)])
         ]
-        return close_loop(
-            Loop(
-                system.name,
-                system.multiplicity,
-                tuple(sites),
-                system.coupling,
-                system.doubts,
-                system.surds,
-            )
-        )
+        return close_loop(replace(system, sites=tuple(sites)))
 
     def exact_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems with the sites of one point (m,), for exact arithmetic.
@@ -350,7 +340,7 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
     Notes
     -----
     The composition of magnitudes and that of magnitudes with their errors differ by a bound on the error to
-    all orders, as in `modes.close_loop`; the roundings of closing are added to it.
+    all orders, as in `closing.closing_errors`; the roundings of closing are added to it.
     """
     assert not evaluator.timed, "the errors of a step belong to its time"
     plain = evaluator.lifted(values)
@@ -363,15 +353,7 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
         wide[site_key(group)] = large[site_key(group)].mapped(np.add, one.error)
     found = []
     for wiring in evaluator.wirings:
-        positive = replace(
-            wiring,
-            now=tuple(map(np.abs, wiring.now)),
-            before=tuple(map(np.abs, wiring.before)),
-        )
-        bound, upper = closed_loop(positive, large), closed_loop(positive, wide)
-        terms = max(len(group.lifted.z_names) for group in wiring.system.sites)
-        terms += sum(now.shape[0] + now.shape[1] for now in wiring.now)
-        error = (upper - bound) + 4 * (terms + 2) * (1 + len(wiring.now[0])) * UNIT * upper
+        error, upper = (one.matrix for one in _closing_errors(wiring, large, wide))
         rest, held = wiring.rest, wiring.held
         own = error[:, rest[:, None], rest]
         if len(held):
@@ -380,6 +362,20 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
             own = own + np.abs(weights) @ (below + 8 * (len(held) + 2) * UNIT * wide_below) + off @ wide_below
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
+
+
+def _closing_errors(
+    wiring: Wiring,
+    size: Mapping[tuple[int, int], FrameMap],
+    wide: Mapping[tuple[int, int], FrameMap],
+    *,
+    times: int = 1,
+) -> tuple[Closed, Closed]:
+    """Return `closing.closing_errors` of a system, from the magnitudes of its sites and these with errors."""
+    keys = [site_key(group) for group in wiring.system.sites]
+    hearing = [one.size for one in wiring.hearing]
+    sizes, wides = ([maps[key] for key in keys] for maps in (size, wide))
+    return closing_errors(sizes, wides, hearing, wiring.system.layout, times=times)
 
 
 def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tuple[Floats, ...]:
@@ -412,23 +408,20 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
     found = []
     errors, plain = matrix_errors(evaluator, values), evaluator.lifted(complex_values)
     for wiring, error in zip(evaluator.wirings, errors, strict=True):
-        whole = replace(wiring, now=tuple(map(np.abs, wiring.now)), before=tuple(map(np.abs, wiring.before)))
-        terms = max(len(group.lifted.z_names) for group in wiring.system.sites)
-        terms += sum(now.shape[0] + now.shape[1] for now in wiring.now)
-        bound, upper = (closed_loop(whole, one).imag / STEP for one in (large, wide))
-        off = (upper - bound) + 8 * (terms + 2) * (1 + len(wiring.now[0])) * UNIT * upper
+        # Of each product the slope is a sum of two: twice the roundings.
+        lost = _closing_errors(wiring, large, wide, times=2)[0].matrix.imag / STEP
         rest, held = wiring.rest, wiring.held
-        own = off[:, rest[:, None], rest]
+        own = lost[:, rest[:, None], rest]
         if len(held):
             matrix = closed_loop(wiring, plain)
             weights, _ = relative_weights(wiring, matrix)
             moved, turned = np.abs(matrix.imag / STEP), np.abs(weights.imag / STEP)
-            below = off[:, held[:, None], rest] + 8 * (len(held) + 2) * UNIT * moved[:, held[:, None], rest]
+            below = lost[:, held[:, None], rest] + 8 * (len(held) + 2) * UNIT * moved[:, held[:, None], rest]
             own = own + np.abs(weights.real) @ below
             if wiring.moving:
                 inverse = _inverse_size(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest])
                 heavy = np.abs(weights.real)
-                late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ heavy + error @ turned
+                late = lost[:, rest[:, None], held] + lost[:, rest[:, None], rest] @ heavy + error @ turned
                 late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ heavy)
                 own = own + (inverse @ late) @ np.abs(matrix.real[:, held[:, None], rest])
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))

@@ -3,7 +3,7 @@
 Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
 Gives: `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_weights`,
 `are_rigid`, `site_key`.
-Guarantees: the matrices are those of `modes.close_loop` in relative coordinates, to rounding; where the
+Guarantees: the matrices are those of `closing.close_loop` in relative coordinates, to rounding; where the
 directions are not those of a rigid motion they are NaN.
 Does not: lift a site (see `batch`).
 """
@@ -11,15 +11,14 @@ Does not: lift a site (see `batch`).
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem
-from apc.eigen.loop import Packet, packet_places
+from apc.eigen.closing import ClosedSystem, Hearing, close, hearing_of
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates, relative_places
 from apc.frame.lift import FrameMap
@@ -40,16 +39,13 @@ NEAR_ONE = 1e-6
 class Wiring:
     """How a closed system's sites hear each other, and which of its coordinates are left.
 
-    `now` and `before` are what each site hears, over all packets sent this frame and over the state; `loop`
-    says that something is heard in the frame it is sent in. `rigid` are the rigid motions, `held` as many
+    `rigid` are the rigid motions, `held` as many
     places that are given up for them, `rest` all others, and `weights` W of the relative coordinates
     x_rest − W x_held.
     """
 
     system: ClosedSystem
-    now: tuple[Floats, ...]  # (n_r, n_s of all sites), one a site
-    before: tuple[Floats, ...]  # (n_r, n), one a site
-    loop: bool
+    hearing: tuple[Hearing, ...]  # one a site
     rigid: RigidModes
     held: NDArray[np.intp]
     rest: NDArray[np.intp]
@@ -64,37 +60,21 @@ def site_key(group: PeerGroup) -> tuple[int, int]:
 
 def wire(system: ClosedSystem) -> Wiring:
     """Take down who hears whom in a closed system, and its rigid motions."""
-    n = len(system.names)
-    place_of = packet_places(system.sites, system.packets, system.offsets)
-    row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
-    starts = np.cumsum([0] + [len(group.schedule.sent) for group in system.sites])
-    listed = []
-    for g, group in enumerate(system.sites):
-        now = np.zeros((len(group.schedule.heard), starts[-1]))
-        before = np.zeros((len(group.schedule.heard), n))
-        for line, one in enumerate(group.schedule.heard):
-            for h, weight in enumerate(system.coupling[one.way][g]):
-                if weight and one.lag:
-                    before[line, place_of[Packet(h, row_of[h][one.sent], one.lag)]] = float(weight)
-                elif weight:
-                    now[line, starts[h] + row_of[h][one.sent]] = float(weight)
-        listed.append((now, before))
+    hearing = tuple(hearing_of(system, system.layout, lambda weight, _: float(weight)))
     rigid = find_rigid_modes(system, with_drifts=False)
-    wiring = _without(system, listed, rigid)
+    wiring = _without(system, hearing, rigid)
     if rigid.names:
         values = np.linalg.eigvals(reduced(wiring, system.matrix[None], 1)[0])
         if np.any(np.abs(values - 1) < NEAR_ONE):
-            wiring = _without(system, listed, find_rigid_modes(system))
+            wiring = _without(system, hearing, find_rigid_modes(system))
     return wiring
 
 
-def _without(system: ClosedSystem, listed: Sequence[tuple[Floats, Floats]], rigid: RigidModes) -> Wiring:
+def _without(system: ClosedSystem, hearing: tuple[Hearing, ...], rigid: RigidModes) -> Wiring:
     held, rest, weights = relative_coordinates(rigid.basis)
     return Wiring(
         system=system,
-        now=tuple(now for now, _ in listed),
-        before=tuple(before for _, before in listed),
-        loop=any(now.any() for now, _ in listed),
+        hearing=hearing,
         rigid=rigid,
         held=held,
         rest=rest,
@@ -131,42 +111,9 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
 
 
 def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
-    """Close the loop of one system at all points: its matrices (k, n, n), see `modes.close_loop`."""
-    system = wiring.system
-    n = len(system.names)
-    own = [lifted[site_key(group)] for group in system.sites]
-    count = max(len(one.p) for one in own)
-    kind_of_number = np.result_type(*(one.p for one in own))
-    source = np.zeros((count, wiring.now[0].shape[1], n), dtype=kind_of_number)
-    row = 0
-    for one, before, offset in zip(own, wiring.before, system.offsets, strict=True):
-        rows = slice(row, row + one.s.shape[1])
-        source[:, rows, offset : offset + one.p.shape[1]] = one.s
-        source[:, rows] += one.d @ before
-        row = rows.stop
-    sent = source
-    if wiring.loop:
-        term = source
-        parts = [one.d @ now for one, now in zip(own, wiring.now, strict=True)]
-        back = np.concatenate([np.broadcast_to(part, (count, *part.shape[1:])) for part in parts], axis=1)
-        for _ in range(back.shape[1]):
-            term = back @ term
-            if not term.any():
-                break
-            sent = sent + term
-    matrix = np.zeros((count, n, n), dtype=kind_of_number)
-    for one, now, before, offset in zip(own, wiring.now, wiring.before, system.offsets, strict=True):
-        rows = slice(offset, offset + one.p.shape[1])
-        matrix[:, rows, rows] += one.p
-        matrix[:, rows] += one.q @ (now @ sent + before if wiring.loop else before)
-    place_of = packet_places(system.sites, system.packets, system.offsets)
-    starts = np.cumsum([0] + [one.s.shape[1] for one in own])
-    for packet, place in place_of.items():
-        if packet.lag == 1:
-            matrix[:, place] = sent[:, starts[packet.site] + packet.row]
-        else:
-            matrix[:, place, place_of[Packet(packet.site, packet.row, packet.lag - 1)]] = 1.0
-    return matrix
+    """Close the loop of one system at all points: its matrices (k, n, n), see `closing.close`."""
+    maps = [lifted[site_key(group)] for group in wiring.system.sites]
+    return close(maps, wiring.hearing, wiring.system.layout).matrix
 
 
 def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
