@@ -55,7 +55,7 @@ HOUSE = (
         "apc.eigen",
         """
         runs graph_modes peer_group listening peers closing coupling graph_loops twins modes
-        rigid components pseudospectrum enclosure balls roots certify ratios duals spectrum
+        rigid components pseudospectrum relative enclosure balls roots certify ratios duals spectrum
         """,
     ),
     (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -11,6 +12,7 @@ from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import frame_balls, precision
 from apc.eigen.modes import split
+from apc.eigen.relative import relative
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator, matrix_errors
@@ -69,10 +71,7 @@ def test_derivatives_are_those_of_the_exact_matrices() -> None:
                 one, other = (frame_balls(family.exact_at([end])[place]) for end in ends)
                 rate = np.array([[float(e.mid()) if hasattr(e, 'mid') else float(e) for e in row]
                                  for row in other - one]) / (ends[1] - ends[0])  # fmt: skip
-            exact = (
-                rate[np.ix_(wiring.rest, wiring.rest)]
-                - wiring.weights @ rate[np.ix_(wiring.held, wiring.rest)]
-            )
+            exact = relative(rate, wiring.relative)
             slope = pairs[place][1][0]
             assert np.abs(slope - exact).max() <= 1e-9 * np.abs(exact).max()
 
@@ -88,11 +87,8 @@ def test_error_bounds_hold_the_true_matrices() -> None:
         for place, wiring in enumerate(family.wirings):
             with precision(200):
                 balls = frame_balls(family.exact_at(row.tolist())[place])
-                reduced = balls[np.ix_(wiring.rest, wiring.rest)]
-                if len(wiring.held):
-                    reduced = (
-                        reduced - wiring.weights.astype(object) @ balls[np.ix_(wiring.held, wiring.rest)]
-                    )
+                at = wiring.relative
+                reduced = relative(balls, replace(at, weights=at.weights.astype(object)), multiply=np.dot)
                 off = np.array([[abs(float((e - float(f)).mid()) if not isinstance(e, int) else e - f)
                                  for e, f in zip(a, b, strict=True)]
                                 for a, b in zip(reduced, found[place][k], strict=True)])  # fmt: skip

@@ -16,8 +16,7 @@ import apc
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.enclosure import enclose_eigenvalues
-from apc.eigen.rigid import independent_places
-from apc.eigen.spectrum import _relative, oscillation
+from apc.eigen.spectrum import oscillation
 from tests.bruteforce import Scene, frame_matrix
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS, RADII
 from tests.sites import MS, grouped, paper
@@ -286,25 +285,6 @@ def test_conjugates_of_a_real_matrix_are_exact_and_the_upper_one_is_first() -> N
     for upper, lower in zip(pairs[::2], pairs[1::2], strict=True):
         assert upper == lower.conjugate()
         assert upper.imag > 0
-
-
-def test_relative_coordinates_are_bounded_against_exact_rationals() -> None:
-    """V = [1 0; 1 1; 1/3 2; 0 1/7]: W = V_r V_p⁻¹ by hand in fractions."""
-    exact = [[Fraction(1), Fraction(0)], [Fraction(1), Fraction(1)], [Fraction(1, 3), Fraction(2)]]
-    exact.append([Fraction(0), Fraction(1, 7)])
-    basis = np.array([[float(entry) for entry in row] for row in exact])
-    held = independent_places(basis.T)
-    rest = [place for place in range(4) if place not in held]
-    (a, b), (c, d) = (exact[place] for place in held)
-    weights, error = _relative(basis[held], basis[rest])
-    for line, place in enumerate(rest):
-        x, y = exact[place]
-        true = ((x * d - y * c) / (a * d - b * c), (y * a - x * b) / (a * d - b * c))
-        for column in range(2):
-            off = abs(Fraction(float(weights[line, column])) - true[column])
-            assert off <= Fraction(float(error[line, column]))
-    assert np.abs(weights).max() <= 2
-    assert error.max() < 1e-13
 
 
 # ---- what a mode is called ----

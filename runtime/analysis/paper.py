@@ -30,7 +30,8 @@ from apc.analysis.analysis import Analysis
 from apc.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import ClosedSystem, Hearing, StateLayout, close
-from apc.eigen.rigid import RigidModes, find_rigid_modes, independent_places
+from apc.eigen.relative import Relative, independent_places, relative_bounded
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
 from apc.frame.discretize import UNIT
 from apc.frame.lift import COEFFICIENT_ROUNDINGS, FrameMap
@@ -343,8 +344,7 @@ def _waiting_names(loop: OpenLoop) -> tuple[str, ...]:
 def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tuple[ClosedSystem, int]:
     """Return A_cl in relative coordinates, its error and its motion; and how many zero columns were left out.
 
-    With the rigid motions V = [V_p; V_r], p as many positions as there are motions, and W = V_r V_p⁻¹, the
-    relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr.
+    As many positions are given up as there are rigid motions.
     """
     n, _, _, _, ratio = _sizes(loop)
     lifted, large = _lift(loop, loop.step), _lift(loop, loop.step_size, absolute=True)
@@ -370,13 +370,8 @@ def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tu
         wide = np.abs(basis[rest]) @ np.abs(inverse)
         off = doubt[rest] @ np.abs(inverse)
         off += wide @ (doubt[held] + wrong * np.abs(basis[held])) @ np.abs(inverse) + wrong * wide
-        error = (
-            error[np.ix_(rest, rest)]
-            + np.abs(weights) @ error[np.ix_(held, rest)]
-            + (2 * off + wrong * np.abs(weights)) @ size[np.ix_(held, rest)]
-            + UNIT * size[np.ix_(rest, rest)]
-        )
-        matrix = matrix[np.ix_(rest, rest)] - weights @ matrix[np.ix_(held, rest)]
+        at = Relative(held, rest, weights, 2 * off + wrong * np.abs(weights))
+        matrix, error = relative_bounded(matrix, error, at)
     system = ClosedSystem(
         name=METHOD,
         multiplicity=1,

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import ClosedSystem, Packet, shift_packets
 from apc.eigen.graph_modes import Surd
+from apc.eigen.relative import Relative, relative
 from apc.frame.discretize import step_balls
 from apc.frame.exact import is_rational
 from apc.frame.lift import follow
@@ -200,8 +201,8 @@ def square(balls: Balls) -> Any:
 
 def reduced_balls(
     matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: Sequence[int], rest: Sequence[int]
-) -> tuple[Balls, Balls]:
-    """Return the matrix without its rigid motions, in relative coordinates, and W = V_r V_p⁻¹.
+) -> Balls:
+    """Return the matrix without its rigid motions, in relative coordinates (see `relative`), W exact.
 
     Parameters
     ----------
@@ -211,20 +212,14 @@ def reduced_balls(
         V: the rigid motions, exact, each (n,).
     held, rest
         The places p, as many as there are motions, whose coordinates go, and all others.
-
-    Notes
-    -----
-    The relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr, as V spans an invariant space.
     """
-    within = matrix[np.ix_(rest, rest)]
-    if not vectors:
-        return within, np.zeros((len(rest), 0), dtype=object)
     exact = [[flint.fmpq(v[place].numerator, v[place].denominator) for v in vectors] for place in held]
     others = [[flint.fmpq(v[place].numerator, v[place].denominator) for v in vectors] for place in rest]
     count = len(held)
-    weights = flint.fmpq_mat(len(rest), count, [e for row in others for e in row])
-    weights = weights * flint.fmpq_mat(count, count, [e for row in exact for e in row]).inv()
-    relative: Balls = np.empty(len(rest) * count, dtype=object)
-    relative[:] = [rational_ball(Fraction(int(e.p), int(e.q))) for e in weights.entries()]
-    relative = relative.reshape(len(rest), count)
-    return within - _multiply(relative, matrix[np.ix_(held, rest)]), relative
+    quotient = flint.fmpq_mat(len(rest), count, [e for row in others for e in row])
+    quotient = quotient * flint.fmpq_mat(count, count, [e for row in exact for e in row]).inv()
+    weights: Balls = np.empty(len(rest) * count, dtype=object)
+    weights[:] = [rational_ball(Fraction(int(e.p), int(e.q))) for e in quotient.entries()]
+    weights = weights.reshape(len(rest), count)
+    places = np.array(held, dtype=np.intp), np.array(rest, dtype=np.intp)
+    return relative(matrix, Relative(*places, weights, np.zeros(weights.shape)), multiply=_multiply)

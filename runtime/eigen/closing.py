@@ -171,7 +171,7 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
     doubtful = hearing_of(loop, layout, lambda weight, doubt: float(abs(weight)) + doubt)
     sizes = [site.mapped(np.abs) for site in lifted]
     wide = [size.mapped(np.add, site.error) for size, site in zip(sizes, lifted, strict=True)]
-    error, _ = closing_errors(sizes, wide, hearing, layout, doubtful=doubtful)
+    error = closing_errors(sizes, wide, hearing, layout, doubtful=doubtful)
     return ClosedSystem(
         name=loop.name,
         multiplicity=loop.multiplicity,
@@ -335,7 +335,7 @@ def closing_errors(
     *,
     doubtful: Sequence[Hearing] | None = None,
     times: int = 1,
-) -> tuple[Closed, Closed]:
+) -> Closed:
     """Bound the errors of a closed loop, entry by entry: those of its sites and weights, and its rounding.
 
     Parameters
@@ -352,7 +352,7 @@ def closing_errors(
 
     Returns
     -------
-    The bounds, and the largest that all may be.
+    The bounds.
     """
     doubtful = hearing if doubtful is None else doubtful
     bound, upper = close(size, hearing, layout), close(wide, doubtful, layout)
@@ -362,8 +362,7 @@ def closing_errors(
         return np.asarray((large - small) + roundings * large)
 
     heard = tuple(off(*pair) for pair in zip(upper.heard, bound.heard, strict=True))
-    error = Closed(off(upper.matrix, bound.matrix), heard, off(upper.sent, bound.sent), upper.turns)
-    return error, upper
+    return Closed(off(upper.matrix, bound.matrix), heard, off(upper.sent, bound.sent), upper.turns)
 
 
 def _closing_roundings(maps: Sequence[FrameMap], hearing: Sequence[Hearing], turns: int) -> float:

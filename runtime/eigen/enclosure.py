@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.components import components
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
-from apc.eigen.rigid import independent_places
+from apc.eigen.relative import independent_places
 from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]

@@ -22,10 +22,9 @@ from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.components import components
 from apc.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
-from apc.eigen.rigid import RigidModes, find_rigid_modes, independent_places, relative_places
+from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.course import turns
-from apc.frame.discretize import UNIT
 from apc.frame.schedule import Propagate
 
 Floats = NDArray[np.float64]
@@ -214,26 +213,14 @@ def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[str, 
 
 
 def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
-    """Solve one system in floats.
-
-    With the rigid motions V = [V_p; V_r], p as many places as there are motions, and W = V_r V_p⁻¹, the
-    relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr: that map has all other eigenvalues.
-    """
-    n = len(system.names)
-    count = free.basis.shape[1]
-    if count == n:
+    """Solve one system in floats."""
+    if free.basis.shape[1] == len(system.names):
         return _Solved(free, [], 0.0, 0.0, True, 0)
-    matrix, error = system.matrix, system.error
-    held, rest = relative_places(free.basis)
-    weights, weights_error = _relative(free.basis[held], free.basis[rest])
-    reduced = matrix[np.ix_(rest, rest)] - weights @ matrix[np.ix_(held, rest)]
-    size = np.abs(matrix) + error
-    reduced_error = error[np.ix_(rest, rest)] + weights_error @ size[np.ix_(held, rest)]
-    reduced_error += np.abs(weights) @ error[np.ix_(held, rest)]
-    rounded = np.abs(weights) @ size[np.ix_(held, rest)]
-    reduced_error += (PRODUCT_ROUNDINGS * (count + 2) * UNIT) * (rounded + np.abs(reduced) * (count > 0))
-
-    values, right, left, errors, low, high = enclose_eigenvalues(reduced, reduced_error, whole=count > 0)
+    at = relative_coordinates(free.basis)
+    reduced, reduced_error = relative_bounded(system.matrix, system.error, at)
+    values, right, left, errors, low, high = enclose_eigenvalues(
+        reduced, reduced_error, whole=len(at.held) > 0
+    )
     inside = False if low > 1 else True if high < 1 else None  # NaN decides nothing
     return _Solved(free, _modes(system, free, values, right, left, errors), low, high, inside, 0)
 
@@ -323,9 +310,8 @@ def whole_vectors(
         By how much larger, relatively, each eigenvalue is taken: one of 1 leaves open how far the peers stand
         aside together.
     """
-    count, matrix = free.basis.shape[1], system.matrix
-    held, rest = relative_places(free.basis)
-    weights, _ = _relative(free.basis[held], free.basis[rest])
+    matrix, at = system.matrix, relative_coordinates(free.basis)
+    held, rest, weights, count = at.held, at.rest, at.weights, len(at.held)
     # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
     corner = matrix[np.ix_(held, held)] + matrix[np.ix_(held, rest)] @ weights
     vectors, covectors = np.zeros((2, len(system.names), len(values)), dtype=np.complex128)
@@ -342,24 +328,6 @@ def whole_vectors(
     sizes = np.abs(vectors)
     shares = np.where(total > 0, shares / total, sizes / sizes.sum(axis=0))
     return vectors, shares
-
-
-def _relative(held: Floats, rest: Floats) -> tuple[Floats, Floats]:
-    """Return W = V_r V_p⁻¹ and a bound on its error, entry by entry; V itself is rounded once.
-
-    W − W* = (V_r − W V_p + a rounding of either) V_p*⁻¹ up to sign.
-    """
-    count = len(held)
-    inverse = np.linalg.inv(held)
-    weights = rest @ inverse
-    charge = PRODUCT_ROUNDINGS * (count + 2) * UNIT
-    left = np.abs(rest - weights @ held) + charge * (np.abs(rest) + np.abs(weights) @ np.abs(held))
-    size = np.abs(inverse)
-    wrong = np.abs(np.eye(count) - inverse @ held) + 2 * charge * (size @ np.abs(held))
-    assert count == 0 or float(wrong.sum(axis=1).max()) < 0.5, "rigid motions too alike to tell apart"
-    # V_p*⁻¹ = (I − F)⁻¹ Y, and |(I − F)⁻¹| ≤ I + |F| + …, at most doubling the largest.
-    size = size + 2 * wrong.sum(axis=1, keepdims=True) * size.max(axis=0, initial=0.0)
-    return weights, left @ size
 
 
 def oscillation(magnitude: float, angle: float, frame_s: float) -> tuple[float, float]:

@@ -144,7 +144,7 @@ def _hear_themselves(
     layout, hearing = _open_loop(lifted, schedule, own, others)
     size = lifted.mapped(np.abs)
     wide = size.mapped(np.add, lifted.error)
-    error, _ = closing_errors([size], [wide], [hearing.size], layout)
+    error = closing_errors([size], [wide], [hearing.size], layout)
     return (*_cut(close([lifted], [hearing], layout)), *_cut(error))
 
 

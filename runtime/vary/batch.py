@@ -25,6 +25,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Closed, ClosedSystem, close_loop, closing_errors
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
+from apc.eigen.relative import Relative, relative_bounded
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.batch_lift import (
     HOPELESS,
@@ -47,7 +48,7 @@ from apc.vary.wiring import (
     are_rigid,
     closed_loop,
     reduced,
-    relative_weights,
+    relative_at,
     site_key,
     told_by_constants,
     wire,
@@ -353,13 +354,9 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
         wide[site_key(group)] = large[site_key(group)].mapped(np.add, one.error)
     found = []
     for wiring in evaluator.wirings:
-        error, upper = (one.matrix for one in _closing_errors(wiring, large, wide))
-        rest, held = wiring.rest, wiring.held
-        own = error[:, rest[:, None], rest]
-        if len(held):
-            weights, off = _relative_errors(wiring, closed_loop(wiring, plain), error)
-            below, wide_below = error[:, held[:, None], rest], upper[:, held[:, None], rest]
-            own = own + np.abs(weights) @ (below + 8 * (len(held) + 2) * UNIT * wide_below) + off @ wide_below
+        error = _closing_errors(wiring, large, wide).matrix
+        matrix = closed_loop(wiring, plain)
+        _, own = relative_bounded(matrix, error, _relative_here(wiring, matrix, error))
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
 
@@ -370,7 +367,7 @@ def _closing_errors(
     wide: Mapping[tuple[int, int], FrameMap],
     *,
     times: int = 1,
-) -> tuple[Closed, Closed]:
+) -> Closed:
     """Return `closing.closing_errors` of a system, from the magnitudes of its sites and these with errors."""
     keys = [site_key(group) for group in wiring.system.sites]
     hearing = [one.size for one in wiring.hearing]
@@ -402,28 +399,27 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
         built, schedule = group.jacobians, group.schedule
         rows = evaluator.rows(built, evaluator.vectors(group, complex_values))
         here = lift_rows(built, schedule, rows.real[:1])
-        size, off = _moved_blocks(sites_of_rows(built, rows), schedule, evaluator.durations)
+        size, doubt = _moved_blocks(sites_of_rows(built, rows), schedule, evaluator.durations)
         large[site_key(group)] = size
-        wide[site_key(group)] = size.mapped(lambda a, b, c: a + b + (STEP * 1j) * c, here.error, off)
+        wide[site_key(group)] = size.mapped(lambda a, b, c: a + b + (STEP * 1j) * c, here.error, doubt)
     found = []
     errors, plain = matrix_errors(evaluator, values), evaluator.lifted(complex_values)
     for wiring, error in zip(evaluator.wirings, errors, strict=True):
+        matrix = closed_loop(wiring, plain)
         # Of each product the slope is a sum of two: twice the roundings.
-        lost = _closing_errors(wiring, large, wide, times=2)[0].matrix.imag / STEP
-        rest, held = wiring.rest, wiring.held
-        own = lost[:, rest[:, None], rest]
-        if len(held):
-            matrix = closed_loop(wiring, plain)
-            weights, _ = relative_weights(wiring, matrix)
-            moved, turned = np.abs(matrix.imag / STEP), np.abs(weights.imag / STEP)
-            below = lost[:, held[:, None], rest] + 8 * (len(held) + 2) * UNIT * moved[:, held[:, None], rest]
-            own = own + np.abs(weights.real) @ below
-            if wiring.moving:
-                inverse = _inverse_size(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest])
-                heavy = np.abs(weights.real)
-                late = lost[:, rest[:, None], held] + lost[:, rest[:, None], rest] @ heavy + error @ turned
-                late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ heavy)
-                own = own + (inverse @ late) @ np.abs(matrix.real[:, held[:, None], rest])
+        off = _closing_errors(wiring, large, wide, times=2).matrix.imag / STEP
+        at = relative_at(wiring, matrix)[0]
+        turned = np.abs(at.weights.imag / STEP)
+        nothing = np.zeros((len(at.rest), len(at.held)))
+        steady = replace(at, weights=at.weights.real, doubt=nothing) if wiring.moving else at
+        _, own = relative_bounded(matrix.imag / STEP, off, steady)
+        if wiring.moving:
+            rest, held = at.rest, at.held
+            heavy, moved = np.abs(at.weights.real), np.abs(matrix.imag / STEP)
+            inverse = _inverse_size(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest])
+            late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ heavy + error @ turned
+            late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ heavy)
+            own = own + (inverse @ late) @ np.abs(matrix.real[:, held[:, None], rest])
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
 
@@ -491,20 +487,19 @@ def _inverse_size(matrices: Floats) -> Floats:
         return np.full(matrices.shape, NO_USE)
 
 
-def _relative_errors(wiring: Wiring, matrix: Floats, error: Floats) -> tuple[Floats, Floats]:
-    """Return W at each point and a bound on its error, to first order where the directions follow.
+def _relative_here(wiring: Wiring, matrix: Floats, error: Floats) -> Relative:
+    """Return the relative coordinates at each point, with a bound on W to first order where it follows.
 
     (1 − M_rr) W = M_rp: W is off by (1 − M_rr)⁻¹ times what the errors of M leave, and the solution's own.
     """
-    weights, _ = relative_weights(wiring, matrix)
+    at, _ = relative_at(wiring, matrix)
     if not wiring.moving:
-        return weights, 8 * (len(wiring.held) + 2) * UNIT * np.abs(weights)[None]
-    rest, held = wiring.rest, wiring.held
+        return at
+    rest, held, size = at.rest, at.held, np.abs(at.weights)
     system = np.eye(len(rest)) - matrix[:, rest[:, None], rest]
-    size = _inverse_size(system)
-    left = error[:, rest[:, None], held] + error[:, rest[:, None], rest] @ np.abs(weights)
-    left = left + 8 * (len(rest) + 2) * UNIT * (np.abs(system) @ np.abs(weights))
-    return weights, size @ left
+    left = error[:, rest[:, None], held] + error[:, rest[:, None], rest] @ size
+    left = left + 8 * (len(rest) + 2) * UNIT * (np.abs(system) @ size)
+    return replace(at, doubt=_inverse_size(system) @ left)
 
 
 def _moved(group: PeerGroup, vector: Floats) -> PeerGroup:

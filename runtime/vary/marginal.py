@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+from apc.eigen.relative import relative, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import angles_in_frame, whole_vectors
 
 # An eigenvalue of 1 leaves open how far the peers stand aside together; next to the boundary, where it is
@@ -57,11 +58,9 @@ def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenval
     """
     best: tuple[float, Marginal] | None = None
     for system, free in systems:
-        held, rest, weights = relative_coordinates(free.basis)
-        if not len(rest):
+        reduced = relative(system.matrix, relative_coordinates(free.basis))
+        if not len(reduced):
             continue
-        driven = system.matrix[np.ix_(held, rest)]
-        reduced = system.matrix[np.ix_(rest, rest)] - weights @ driven
         values, vectors = np.linalg.eig(reduced)
         place = int(np.argmin(np.abs(values - eigenvalue)))
         off = float(np.abs(values[place] - eigenvalue))

@@ -25,7 +25,8 @@ from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import counted, with_unit, wrapped
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.rigid import find_rigid_modes, relative_coordinates
+from apc.eigen.relative import relative_bounded, relative_coordinates
+from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
@@ -34,7 +35,7 @@ from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.batch import slope_errors as slope_errors_of
 from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters
-from apc.vary.wiring import NEAR_ONE, Wiring, relative_weights
+from apc.vary.wiring import NEAR_ONE, Wiring, relative_at
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -193,14 +194,14 @@ def _rigid_here(wiring: Wiring, system: ClosedSystem, matrix: Floats) -> Floats:
     at_one = int(np.sum(np.abs(values - 1) < NEAR_ONE))
     if at_one > free.directions.shape[1] - wiring.rigid.directions.shape[1]:
         free = find_rigid_modes(system)
-    more = free.basis.shape[1] - len(wiring.held)
+    more = free.basis.shape[1] - len(wiring.relative.held)
     if more <= 0:
         return np.zeros((len(matrix), 0))
-    weights, _ = relative_weights(wiring, system.matrix[None])
-    weights = weights if weights.ndim == 2 else weights[0]
+    at, _ = relative_at(wiring, system.matrix[None])
+    weights = at.weights if at.weights.ndim == 2 else at.weights[0]
     if not np.isfinite(weights).all():  # nor is the matrix: what follows the parameters has no one direction
         return np.zeros((len(matrix), 0))
-    relative = free.basis[wiring.rest] - weights @ free.basis[wiring.held]
+    relative = free.basis[at.rest] - weights @ free.basis[at.held]
     return np.linalg.svd(relative, full_matrices=False)[0][:, :more]
 
 
@@ -292,13 +293,12 @@ class _Cluster:
 
 def _clusters(moved: _Moved) -> list[_Cluster]:
     """Return the largest eigenvalues, of each pair one, those that are one within rounding together."""
-    held, rest, weights = relative_coordinates(moved.rigid)
-    below = moved.matrix[np.ix_(held, rest)]
-    matrix = moved.matrix[np.ix_(rest, rest)] - weights @ below
+    at = relative_coordinates(moved.rigid)
+    held, rest, weights = at.held, at.rest, at.weights
+    matrix, error = relative_bounded(moved.matrix, moved.error, at)
     if not len(matrix):
         return []
-    error = moved.error[np.ix_(rest, rest)] + np.abs(weights) @ moved.error[np.ix_(held, rest)]
-    size = error + (8 * len(matrix) * UNIT) * (np.abs(matrix) + np.abs(weights) @ np.abs(below))
+    size = error + (8 * len(matrix) * UNIT) * np.abs(matrix)
     values, right = (one.astype(np.complex128) for one in np.linalg.eig(matrix))
     found, left = (one.astype(np.complex128) for one in np.linalg.eig(matrix.T))
     largest = float(np.abs(values).max())

@@ -1,7 +1,7 @@
 """Closing the loop of one system for many points at once, and taking its rigid motions out.
 
 Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
-Gives: `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_weights`,
+Gives: `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_at`,
 `are_rigid`, `site_key`.
 Guarantees: the matrices are those of `closing.close_loop` in relative coordinates, to rounding; where the
 directions are not those of a rigid motion they are NaN.
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import ClosedSystem, Hearing, close, hearing_of
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates, relative_places
+from apc.eigen.relative import Relative, relative, relative_coordinates, relative_places
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.lift import FrameMap
 
 Floats = NDArray[np.float64]
@@ -39,17 +40,13 @@ NEAR_ONE = 1e-6
 class Wiring:
     """How a closed system's sites hear each other, and which of its coordinates are left.
 
-    `rigid` are the rigid motions, `held` as many
-    places that are given up for them, `rest` all others, and `weights` W of the relative coordinates
-    x_rest − W x_held.
+    `rigid` are the rigid motions, `relative` the coordinates that are left.
     """
 
     system: ClosedSystem
     hearing: tuple[Hearing, ...]  # one a site
     rigid: RigidModes
-    held: NDArray[np.intp]
-    rest: NDArray[np.intp]
-    weights: Floats  # (len(rest), len(held))
+    relative: Relative
     moving: bool  # the directions follow the free parameters, and W with them
 
 
@@ -71,16 +68,7 @@ def wire(system: ClosedSystem) -> Wiring:
 
 
 def _without(system: ClosedSystem, hearing: tuple[Hearing, ...], rigid: RigidModes) -> Wiring:
-    held, rest, weights = relative_coordinates(rigid.basis)
-    return Wiring(
-        system=system,
-        hearing=hearing,
-        rigid=rigid,
-        held=held,
-        rest=rest,
-        weights=weights,
-        moving=False,
-    )
+    return Wiring(system, hearing, rigid, relative_coordinates(rigid.basis), moving=False)
 
 
 def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
@@ -104,10 +92,7 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
     constant = np.where(np.array(same)[:, None], basis, 0.0)
     if np.linalg.matrix_rank(constant) < basis.shape[1]:
         return replace(wiring, moving=True)
-    held, rest = relative_places(constant)
-    return replace(
-        wiring, held=held, rest=rest, weights=basis[rest] @ np.linalg.inv(basis[held]), moving=True
-    )
+    return replace(wiring, relative=relative_coordinates(basis, relative_places(constant)), moving=True)
 
 
 def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
@@ -117,26 +102,26 @@ def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> M
 
 
 def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
-    """Take the rigid motions out: M_rr − W M_pr, NaN where the directions are not rigid."""
-    rest, held = wiring.rest, wiring.held
-    within = matrix[:, rest[:, None], rest]
-    if len(held):
-        weights, sound = relative_weights(wiring, matrix)
-        within = within - weights @ matrix[:, held[:, None], rest]
-        within[~sound] = np.nan
+    """Take the rigid motions out; NaN where the directions are not rigid."""
+    at, sound = relative_at(wiring, matrix)
+    within = relative(matrix, at)
+    within[~sound] = np.nan
     within[~np.isfinite(within).all(axis=(1, 2))] = np.nan
     return np.broadcast_to(within, (count, *within.shape[1:])).copy() if len(within) < count else within
 
 
-def relative_weights(wiring: Wiring, matrix: Matrices) -> tuple[Matrices, NDArray[np.bool_]]:
-    """Return W of the relative coordinates at each point, and whether it is of rigid motions.
+def relative_at(wiring: Wiring, matrix: Matrices) -> tuple[Relative, NDArray[np.bool_]]:
+    """Return the relative coordinates at each point, and whether they are relative to rigid motions.
 
     Directions that follow the parameters, as where two forces hold each other, solve M V = V with V_p = 1:
-    (1 − M_rr) W = M_rp, and M_pp + M_pr W = 1.
+    (1 − M_rr) W = M_rp, and M_pp + M_pr W = 1. How far W is off is not said then.
     """
-    rest, held = wiring.rest, wiring.held
+    at = wiring.relative
+    rest, held = at.rest, at.held
+    if not len(held):
+        return at, np.ones(len(matrix), dtype=np.bool_)
     if not wiring.moving:
-        return wiring.weights, are_rigid(wiring, matrix.real)
+        return at, are_rigid(wiring, matrix.real)
     unit = np.eye(len(rest))
     weights = np.full((len(matrix), len(rest), len(held)), np.nan, dtype=matrix.dtype)
     for k, one in enumerate(matrix):
@@ -146,16 +131,18 @@ def relative_weights(wiring: Wiring, matrix: Matrices) -> tuple[Matrices, NDArra
     own = matrix[:, held[:, None], held] + matrix[:, held[:, None], rest] @ weights
     size = 1 + np.abs(matrix[:, held[:, None], rest].real) @ np.abs(weights.real)
     still = np.abs(own.real - np.eye(len(held))) <= RIGID * size
-    return weights, np.asarray(still.all(axis=(1, 2)))
+    nothing = np.full(weights.shape, np.nan)
+    return Relative(held, rest, weights, nothing), np.asarray(still.all(axis=(1, 2)))
 
 
 def are_rigid(wiring: Wiring, matrix: Floats) -> NDArray[np.bool_]:
     """Say of each matrix (k, n, n) whether the rigid motions V move by themselves, M V = V C, C_ii = 1."""
     basis = wiring.rigid.basis
-    inverse = np.linalg.inv(basis[wiring.held])
+    held = wiring.relative.held
+    inverse = np.linalg.inv(basis[held])
     moved, size = matrix @ basis, np.abs(matrix) @ np.abs(basis)
-    own = inverse @ moved[:, wiring.held]
-    own_size = np.abs(inverse) @ size[:, wiring.held]
+    own = inverse @ moved[:, held]
+    own_size = np.abs(inverse) @ size[:, held]
     span = np.abs(moved - basis @ own) <= RIGID * (1 + size + np.abs(basis) @ own_size)
     still = np.abs(np.diagonal(own, axis1=1, axis2=2) - 1) <= RIGID * (
         1 + np.diagonal(own_size, axis1=1, axis2=2)
