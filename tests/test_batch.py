@@ -1,4 +1,4 @@
-"""Claims about `apc.vary.batch`, `evaluator` and `eigenvalues`."""
+"""Claims about `apc.vary.batch` and `evaluator`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from apc.eigen.relative import relative
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator, matrix_errors
-from apc.vary.eigenvalues import eigenvalues
 from apc.vary.evaluator import evaluator, reaches_time
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
@@ -118,19 +117,6 @@ def test_a_translation_that_is_none_at_a_point_gives_no_number() -> None:
     family = evaluator(scene("star-lecture"), [Free("arm.stiffness")])
     found = family.matrices(np.array([[0.0], [100.0]]))
     assert all(np.isfinite(one).all() for one in found)
-
-
-def test_slopes_of_eigenvalues_survive_a_defective_cluster() -> None:
-    matrix = np.zeros((1, 5, 5))
-    matrix[0, 0, 1] = matrix[0, 1, 2] = 1.0  # a Jordan block at zero
-    matrix[0, 3:, 3:] = [[0.6, -0.8], [0.8, 0.6]]
-    slope = np.zeros_like(matrix)
-    slope[0, 3:, 3:] = np.eye(2)
-    values, rates = eigenvalues(matrix, slope)
-    upper = int(np.argmax(values[0].imag))
-    assert values[0, upper] == pytest.approx(0.6 + 0.8j)
-    assert rates[0, upper] == pytest.approx(1.0)
-    assert np.isfinite(rates).all()
 
 
 def test_what_reaches_a_time_is_told_from_what_does_not() -> None:

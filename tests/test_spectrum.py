@@ -199,7 +199,8 @@ def test_the_bound_of_a_nearly_defective_pair_is_honest(spread: float) -> None:
     error = np.full((2, 2), 1e-14)
     moved = matrix.copy()
     moved[1, 0] += 1e-14
-    values, _, _, errors, low, high = enclose_eigenvalues(matrix, error)
+    pairs, found = enclose_eigenvalues(matrix, error)
+    values, errors, low, high = pairs.values, found.errors, found.low, found.high
     truth = [0.5 + math.sqrt(spread + 1e-14), 0.5 - math.sqrt(spread + 1e-14)]
     for value, bound in zip(values, errors, strict=True):
         assert min(abs(value - one) for one in truth) <= bound
@@ -211,7 +212,8 @@ def test_the_bound_of_a_large_jordan_block_is_honest() -> None:
     n = 6
     matrix, error = np.eye(n, k=1), np.zeros((n, n))
     error[-1, 0] = 1e-12
-    values, _, _, errors, _, high = enclose_eigenvalues(matrix, error)
+    pairs, found = enclose_eigenvalues(matrix, error)
+    values, errors, high = pairs.values, found.errors, found.high
     assert high >= 1e-12 ** (1 / n)
     assert all(bound + abs(value) >= 1e-12 ** (1 / n) for value, bound in zip(values, errors, strict=True))
 
@@ -266,7 +268,8 @@ def test_whatever_the_matrix_every_bound_is_finite_and_holds_the_truth() -> None
         for _ in range(20):
             for matrix in _matrices(generator):
                 error = np.abs(matrix) * 10.0 ** generator.integers(-16, -7)
-                values, _, _, errors, low, high = enclose_eigenvalues(matrix, error)
+                pairs, found = enclose_eigenvalues(matrix, error)
+                values, errors, low, high = pairs.values, found.errors, found.low, found.high
                 assert np.isfinite([*errors, high]).all()
                 signs = generator.choice([-1, 1], size=matrix.shape)
                 rows = [[flint.acb(complex(e)) for e in row] for row in matrix + 0.999 * signs * error]

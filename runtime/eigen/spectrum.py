@@ -21,6 +21,7 @@ from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.components import components
+from apc.eigen.eigenpairs import Eigenpairs
 from apc.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
 from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
@@ -218,11 +219,9 @@ def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
         return _Solved(free, [], 0.0, 0.0, True, 0)
     at = relative_coordinates(free.basis)
     reduced, reduced_error = relative_bounded(system.matrix, system.error, at)
-    values, right, left, errors, low, high = enclose_eigenvalues(
-        reduced, reduced_error, whole=len(at.held) > 0
-    )
-    inside = False if low > 1 else True if high < 1 else None  # NaN decides nothing
-    return _Solved(free, _modes(system, free, values, right, left, errors), low, high, inside, 0)
+    pairs, found = enclose_eigenvalues(reduced, reduced_error, whole=len(at.held) > 0)
+    inside = False if found.low > 1 else True if found.high < 1 else None  # NaN decides nothing
+    return _Solved(free, _modes(system, free, pairs, found.errors), found.low, found.high, inside, 0)
 
 
 def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
@@ -240,7 +239,8 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     modes = estimate.modes
     known = not found.high - found.low > estimate.high - estimate.low
     if known and proof.right is not None and proof.left is not None:
-        modes = _modes(system, proof.free, proof.values, proof.right, proof.left, found.errors)
+        pairs = Eigenpairs(proof.values, proof.right, proof.left)
+        modes = _modes(system, proof.free, pairs, found.errors)
     low, high = max(estimate.low, found.low), min(estimate.high, found.high)
     return _Solved(proof.free, modes, low, high, inside, bits)
 
@@ -248,13 +248,12 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
 def _modes(
     system: ClosedSystem,
     free: RigidModes,
-    values: Complexes,
-    right: Complexes,
-    left: Complexes,
+    pairs: Eigenpairs,
     errors: Floats,
 ) -> list[Mode]:
-    """Describe eigenvalues of the relative coordinates, their vectors as columns and rows."""
-    vectors, shares = whole_vectors(system, free, values, right, left)
+    """Describe eigenvalues of the relative coordinates."""
+    vectors, shares = whole_vectors(system, free, pairs)
+    values = pairs.values
     magnitudes = np.abs(values)
     gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(errors, SMALL))
     angles = np.zeros(len(values))
@@ -292,9 +291,7 @@ def _ticks(system: ClosedSystem) -> bool:
 def whole_vectors(
     system: ClosedSystem,
     free: RigidModes,
-    values: Complexes,
-    right: Complexes,
-    left: Complexes,
+    pairs: Eigenpairs,
     *,
     aside: float = 0.0,
 ) -> tuple[Complexes, Floats]:
@@ -304,8 +301,8 @@ def whole_vectors(
     ----------
     system, free
         The closed system and its rigid motions.
-    values, right, left
-        Eigenvalues (k,) of the relative coordinates, with their vectors as columns and as rows.
+    pairs
+        Eigenvalues (k,) of the relative coordinates, with their vectors.
     aside
         By how much larger, relatively, each eigenvalue is taken: one of 1 leaves open how far the peers stand
         aside together.
@@ -314,15 +311,15 @@ def whole_vectors(
     held, rest, weights, count = at.held, at.rest, at.weights, len(at.held)
     # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
     corner = matrix[np.ix_(held, held)] + matrix[np.ix_(held, rest)] @ weights
-    vectors, covectors = np.zeros((2, len(system.names), len(values)), dtype=np.complex128)
-    vectors[rest], covectors[rest] = right, left.T
+    vectors, covectors = np.zeros((2, len(system.names), len(pairs.values)), dtype=np.complex128)
+    vectors[rest], covectors[rest] = pairs.right, pairs.left.T
     if count:
-        driven = matrix[np.ix_(held, rest)] @ right
-        for place, value in enumerate(values):
+        driven = matrix[np.ix_(held, rest)] @ pairs.right
+        for place, value in enumerate(pairs.values):
             shifted = value * (1 + aside) * np.eye(count) - corner
             vectors[held, place] = np.linalg.lstsq(shifted, driven[:, place], rcond=None)[0]
         vectors[rest] += weights @ vectors[held]
-        covectors[held] = -(left @ weights).T
+        covectors[held] = -(pairs.left @ weights).T
     shares = np.abs(vectors * covectors)
     total = shares.sum(axis=0)
     sizes = np.abs(vectors)

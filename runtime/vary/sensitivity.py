@@ -25,6 +25,7 @@ from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import counted, with_unit, wrapped
 from apc.eigen.closing import ClosedSystem
+from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
 from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT
@@ -299,8 +300,8 @@ def _clusters(moved: _Moved) -> list[_Cluster]:
     if not len(matrix):
         return []
     size = error + (8 * len(matrix) * UNIT) * np.abs(matrix)
-    values, right = (one.astype(np.complex128) for one in np.linalg.eig(matrix))
-    found, left = (one.astype(np.complex128) for one in np.linalg.eig(matrix.T))
+    pairs = eigenpairs(matrix)
+    values = pairs.values
     largest = float(np.abs(values).max())
     clusters = []
     seen = (values.imag < 0) | (np.abs(values) < largest - SHARED - 2 * CLOSE * max(largest, CLOSE))
@@ -308,29 +309,26 @@ def _clusters(moved: _Moved) -> list[_Cluster]:
         if seen[place]:
             continue
         near = np.flatnonzero(np.abs(values - values[place]) <= CLOSE * max(abs(values[place]), CLOSE))
-        if len(near) > 1 and _resolved(values[near], right[:, near], found, left, size):
+        if len(near) > 1 and _resolved(pairs.at(near), size):
             near = np.array([place])
         seen[near] = True
-        partners = np.argsort(np.abs(found - values[place]), kind="stable")[: len(near)]
-        rows, columns = left[:, partners].T, right[:, near]
+        rows, columns = pairs.left[near], pairs.right[:, near]
         product = rows @ columns
         least = float(np.linalg.svd(product, compute_uv=False)[-1])
         condition = (
             float(np.linalg.norm(rows, 2) * np.linalg.norm(columns, 2) / least) if least > 0 else np.inf
         )
-        rows = np.linalg.solve(product, rows) if condition < WORST else rows
+        rows = np.linalg.solve(product, rows).astype(np.complex128) if condition < WORST else rows
         whole, covector = np.zeros((2, len(moved.matrix), len(near)), np.complex128)
         whole[rest], covector[rest], covector[held] = columns, rows.T, -(rows @ weights).T
         clusters.append(_Cluster(moved, values[near], whole, covector.T, condition))
     return clusters
 
 
-def _resolved(values: Complexes, right: Complexes, found: Complexes, left: Complexes, size: Floats) -> bool:
+def _resolved(near: Eigenpairs, size: Floats) -> bool:
     """Say whether eigenvalues near to one another differ by more than the errors of all of them."""
-    rows = left[:, [int(np.argmin(np.abs(found - value))) for value in values]].T
-    scale = np.abs(np.einsum("ij,ji->i", rows, right))
-    off = np.einsum("ij,jk,ki->i", np.abs(rows), size, np.abs(right)) / scale
-    apart = np.abs(values[:, None] - values) + np.diag(np.full(len(values), np.inf))
+    off = near.errors(size)
+    apart = np.abs(near.values[:, None] - near.values) + np.diag(np.full(len(near.values), np.inf))
     return bool((apart > 4 * (off[:, None] + off)).all())
 
 
