@@ -54,8 +54,9 @@ HOUSE = (
     (
         "apc.eigen",
         """
-        runs graph_modes peer_group listening peers loop closing coupling graph_loops twins modes
-        rigid components pseudospectrum enclosure balls roots certify ratios duals spectrum
+        runs graph_modes peer_group listening peers closing coupling graph_loops twins modes
+        rigid components pseudospectrum relative eigenpairs enclosure balls roots certify ratios duals
+        spectrum
         """,
     ),
     (
@@ -76,7 +77,7 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch evaluator symbols bends marginal eigenvalues crossings bracket delays search critical
+        wiring batch evaluator symbols bends marginal crossings bracket delays search critical
         margins sensitivity
         """,
     ),

@@ -18,8 +18,7 @@ import numpy as np
 from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import close_loop
-from apc.eigen.loop import Loop
+from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peer_group import PeerGroup, states_of, used_ways
 from apc.eigen.peers import group_of_row, peer_groups
 from apc.eigen.rigid import LENGTHS, what_stands

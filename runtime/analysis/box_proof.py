@@ -41,7 +41,8 @@ from apc.eigen.closing import ClosedSystem
 from apc.eigen.duals import Dual, mapped, slope_of, step_duals
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.ratios import Ratio
-from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid, what_stands
+from apc.eigen.relative import relative_places
+from apc.eigen.rigid import RigidModes, find_rigid_modes, stays_rigid, what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
 from apc.frame.site import LinearSite, entrywise
 from apc.result import Result
@@ -223,7 +224,7 @@ def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
     matrix = compose(question.system, sites, steps)
     if by is not None:
         matrix = mapped(slope_of, matrix)
-    return reduced_balls(matrix, question.vectors, question.held, question.rest)[0]
+    return reduced_balls(matrix, question.vectors, question.held, question.rest)
 
 
 def _site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSite:

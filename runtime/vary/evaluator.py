@@ -20,7 +20,8 @@ from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
-from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+from apc.eigen.relative import relative_bounded, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
@@ -187,14 +188,9 @@ def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
 
 
 def _reduced(system: ClosedSystem, free: RigidModes) -> tuple[Floats, Floats]:
-    """Return the frame matrix of the coordinates relative to the rigid motions, see `spectrum`; its error."""
-    held, rest, weights = relative_coordinates(free.basis)
-    moved = system.matrix[np.ix_(held, rest)]
-    found = system.matrix[np.ix_(rest, rest)] - weights @ moved
+    """Return the frame matrix of the coordinates relative to the rigid motions; its error."""
     error = system.error + (JACOBIAN_ROUNDINGS * UNIT) * np.abs(system.matrix)
-    size = np.abs(weights)
-    off = error[np.ix_(rest, rest)] + size @ error[np.ix_(held, rest)]
-    return found, off + (8 * (len(held) + 2) * UNIT) * (size @ np.abs(moved))
+    return relative_bounded(system.matrix, error, relative_coordinates(free.basis))
 
 
 def _filled_up_pairs(pairs: Sequence[Sequence[tuple[Floats, Floats]]]) -> tuple[Floats, Floats]:

@@ -24,6 +24,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
 from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
+from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, solve_spectrum
@@ -33,7 +34,6 @@ from apc.vary.bends import bends
 from apc.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.vary.crossings import Courses, Root, Scan, scan
 from apc.vary.delays import Piece, borders, delay_now, delay_pieces, system_with_delay
-from apc.vary.eigenvalues import eigenvalues
 from apc.vary.evaluator import PointEvaluator, evaluator
 from apc.vary.marginal import marginal_motion, with_rigid
 

@@ -23,7 +23,9 @@ from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.rigid import find_rigid_modes, relative_coordinates
+from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
+from apc.eigen.relative import relative_bounded, relative_coordinates
+from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
@@ -33,7 +35,7 @@ from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.batch import slope_errors as slope_errors_of
 from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters
-from apc.vary.wiring import NEAR_ONE, Wiring, relative_weights
+from apc.vary.wiring import NEAR_ONE, Wiring, relative_at
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -165,14 +167,14 @@ def _rigid_here(wiring: Wiring, system: ClosedSystem, matrix: Floats) -> Floats:
     at_one = int(np.sum(np.abs(values - 1) < NEAR_ONE))
     if at_one > free.directions.shape[1] - wiring.rigid.directions.shape[1]:
         free = find_rigid_modes(system)
-    more = free.basis.shape[1] - len(wiring.held)
+    more = free.basis.shape[1] - len(wiring.relative.held)
     if more <= 0:
         return np.zeros((len(matrix), 0))
-    weights, _ = relative_weights(wiring, system.matrix[None])
-    weights = weights if weights.ndim == 2 else weights[0]
+    at, _ = relative_at(wiring, system.matrix[None])
+    weights = at.weights if at.weights.ndim == 2 else at.weights[0]
     if not np.isfinite(weights).all():  # nor is the matrix: what follows the parameters has no one direction
         return np.zeros((len(matrix), 0))
-    relative = free.basis[wiring.rest] - weights @ free.basis[wiring.held]
+    relative = free.basis[at.rest] - weights @ free.basis[at.held]
     return np.linalg.svd(relative, full_matrices=False)[0][:, :more]
 
 
@@ -258,15 +260,14 @@ class _Cluster:
 
 def _clusters(moved: _Moved) -> list[_Cluster]:
     """Return the largest eigenvalues, of each pair one, those that are one within rounding together."""
-    held, rest, weights = relative_coordinates(moved.rigid)
-    below = moved.matrix[np.ix_(held, rest)]
-    matrix = moved.matrix[np.ix_(rest, rest)] - weights @ below
+    at = relative_coordinates(moved.rigid)
+    held, rest, weights = at.held, at.rest, at.weights
+    matrix, error = relative_bounded(moved.matrix, moved.error, at)
     if not len(matrix):
         return []
-    error = moved.error[np.ix_(rest, rest)] + np.abs(weights) @ moved.error[np.ix_(held, rest)]
-    size = error + (8 * len(matrix) * UNIT) * (np.abs(matrix) + np.abs(weights) @ np.abs(below))
-    values, right = (one.astype(np.complex128) for one in np.linalg.eig(matrix))
-    found, left = (one.astype(np.complex128) for one in np.linalg.eig(matrix.T))
+    size = error + (8 * len(matrix) * UNIT) * np.abs(matrix)
+    pairs = eigenpairs(matrix)
+    values = pairs.values
     largest = float(np.abs(values).max())
     clusters = []
     seen = (values.imag < 0) | (np.abs(values) < largest - SHARED - 2 * CLOSE * max(largest, CLOSE))
@@ -274,29 +275,26 @@ def _clusters(moved: _Moved) -> list[_Cluster]:
         if seen[place]:
             continue
         near = np.flatnonzero(np.abs(values - values[place]) <= CLOSE * max(abs(values[place]), CLOSE))
-        if len(near) > 1 and _resolved(values[near], right[:, near], found, left, size):
+        if len(near) > 1 and _resolved(pairs.at(near), size):
             near = np.array([place])
         seen[near] = True
-        partners = np.argsort(np.abs(found - values[place]), kind="stable")[: len(near)]
-        rows, columns = left[:, partners].T, right[:, near]
+        rows, columns = pairs.left[near], pairs.right[:, near]
         product = rows @ columns
         least = float(np.linalg.svd(product, compute_uv=False)[-1])
         condition = (
             float(np.linalg.norm(rows, 2) * np.linalg.norm(columns, 2) / least) if least > 0 else np.inf
         )
-        rows = np.linalg.solve(product, rows) if condition < WORST else rows
+        rows = np.linalg.solve(product, rows).astype(np.complex128) if condition < WORST else rows
         whole, covector = np.zeros((2, len(moved.matrix), len(near)), np.complex128)
         whole[rest], covector[rest], covector[held] = columns, rows.T, -(rows @ weights).T
         clusters.append(_Cluster(moved, values[near], whole, covector.T, condition))
     return clusters
 
 
-def _resolved(values: Complexes, right: Complexes, found: Complexes, left: Complexes, size: Floats) -> bool:
+def _resolved(near: Eigenpairs, size: Floats) -> bool:
     """Say whether eigenvalues near to one another differ by more than the errors of all of them."""
-    rows = left[:, [int(np.argmin(np.abs(found - value))) for value in values]].T
-    scale = np.abs(np.einsum("ij,ji->i", rows, right))
-    off = np.einsum("ij,jk,ki->i", np.abs(rows), size, np.abs(right)) / scale
-    apart = np.abs(values[:, None] - values) + np.diag(np.full(len(values), np.inf))
+    off = near.errors(size)
+    apart = np.abs(near.values[:, None] - near.values) + np.diag(np.full(len(near.values), np.inf))
     return bool((apart > 4 * (off[:, None] + off)).all())
 
 
