@@ -222,23 +222,23 @@ def _truth(condition: Callable[[int], bool]) -> Callable[[Any, Any], Any]:
     return lambda a, b: _constant(float(condition(_sign(a - b))))
 
 
-_RULES: dict[int, Callable[..., Any]] = {
-    casadi.OP_POW: _power,
-    casadi.OP_CONSTPOW: _power,
-    casadi.OP_FABS: lambda a: a if _sign(a) >= 0 else -a,
-    casadi.OP_SIGN: lambda a: _constant(_sign(a)),
-    casadi.OP_FLOOR: _floor,
-    casadi.OP_CEIL: lambda a: -_floor(-a),
-    casadi.OP_FMIN: lambda a, b: a if _sign(a - b) <= 0 else b,
-    casadi.OP_FMAX: lambda a, b: a if _sign(a - b) >= 0 else b,
-    casadi.OP_LT: _truth(lambda sign: sign < 0),
-    casadi.OP_LE: _truth(lambda sign: sign <= 0),
-    casadi.OP_EQ: _truth(lambda sign: sign == 0),
-    casadi.OP_NE: _truth(lambda sign: sign != 0),
-    casadi.OP_NOT: lambda a: _constant(float(_sign(a) == 0)),
-    casadi.OP_AND: lambda a, b: _constant(float(_sign(a) != 0 and _sign(b) != 0)),
-    casadi.OP_OR: lambda a, b: _constant(float(_sign(a) != 0 or _sign(b) != 0)),
-    casadi.OP_IF_ELSE_ZERO: lambda a, b: b if _sign(a) else _constant(0.0),
+_RULES: dict[str, Callable[..., Any]] = {
+    "pow": _power,
+    "constpow": _power,
+    "fabs": lambda a: a if _sign(a) >= 0 else -a,
+    "sign": lambda a: _constant(_sign(a)),
+    "floor": _floor,
+    "ceil": lambda a: -_floor(-a),
+    "fmin": lambda a, b: a if _sign(a - b) <= 0 else b,
+    "fmax": lambda a, b: a if _sign(a - b) >= 0 else b,
+    "lt": _truth(lambda sign: sign < 0),
+    "le": _truth(lambda sign: sign <= 0),
+    "eq": _truth(lambda sign: sign == 0),
+    "ne": _truth(lambda sign: sign != 0),
+    "not": lambda a: _constant(float(_sign(a) == 0)),
+    "and": lambda a, b: _constant(float(_sign(a) != 0 and _sign(b) != 0)),
+    "or": lambda a, b: _constant(float(_sign(a) != 0 or _sign(b) != 0)),
+    "if_else_zero": lambda a, b: b if _sign(a) else _constant(0.0),
 }
 
 
