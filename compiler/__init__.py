@@ -5,7 +5,8 @@ files                       what is read and written, whoever named it
 multiples                   common multiples and divisors of exact times
 weights                     exact sums of the decimals by which peers weigh one another
 source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
-language                    expression, lexer, grammar: text to trees; evaluation: trees to values
+language                    expression, lexer, grammar: text to trees; evaluation: trees to formulas and
+                            values
                             dimensions, unit_grammar, unit_names, units, unit_text, unit_check
                             values, tables, recordings: numbers of a scene, and in CSV files
 components                  component, parts, declarations, component_check, definitions, library
@@ -19,7 +20,8 @@ equations                   connections: where connectors meet; flatten
                             blocks: solving; jets, aliases, index: derivatives and states; structure
 functions                   casadi_writer, reached: what is written; exchange, ports: what lies beside;
                             functions
-compiled, plain, store      the compiled model; its functions as data; on disk
+compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others
+store                       the compiled model on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another
 view                        schema, listing; diagram, graphviz, marks, layers, picture, svg; contents

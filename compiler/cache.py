@@ -33,7 +33,7 @@ from typing import Any
 
 from apc.compiler.seal import is_sealed
 
-FORMAT = 6  # of NAME.apc
+FORMAT = 7  # of NAME.apc
 MEMBER = "model.json"  # of the archive: structure, numbers and the digests of the other members
 SEAL = "seal"  # of the archive: who wrote the document, see `seal`
 LARGEST = 256 * 2**20  # bytes of all members

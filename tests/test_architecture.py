@@ -15,7 +15,7 @@ from tests.topologies import AVERAGE, ROOT
 
 # Folder by folder, and in each its modules, earliest first: each may import only those before it.
 HOUSE = (
-    ("apc.compiler", "errors digits files words multiples weights compiled plain seal cache"),
+    ("apc.compiler", "errors digits files words multiples weights plain compiled formula seal cache"),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
         "apc.compiler.language",
@@ -43,7 +43,7 @@ HOUSE = (
     (
         "apc.frame",
         """
-        exact names row_arithmetic rows bounds overrides parameters
+        exact names resolver overrides parameters
         discretize exchange
         guards site jacobians start linearize
         schedule liveness hearing hyperperiod scheduling
@@ -76,7 +76,7 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch evaluator symbols bends marginal eigenvalues crossings bracket delays search critical
+        wiring batch evaluator bends marginal eigenvalues crossings bracket delays search critical
         margins sensitivity
         """,
     ),

@@ -36,6 +36,7 @@ from apc.compiler.functions.exchange import (
     all_parameters,
     check_channels,
     compiled_groups,
+    followers_of,
     used_clocks,
     used_links,
     with_rounded,
@@ -59,19 +60,22 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     links, unheard = used_links(scene, kinds, timings)
     clocks, silent = used_clocks(scene, kinds, links, timings)
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
+    parameters = all_parameters(scene, kinds, links)
+    groups = compiled_groups(scene, kinds, numbers, links, timings)
     return CompiledSystem(
         scene.name,
         scene.about,
         tuple(clocks),
         tuple(links),
         timings.found,
-        all_parameters(scene, kinds, links),
+        parameters,
         tuple(with_rounded(scene, kind, links) for kind in kinds),
-        compiled_groups(scene, kinds, numbers, links, timings),
+        groups,
         tuple(dict.fromkeys([*dropped, *unheard, *silent])),
         origin,
         scene.experiment,
         scene.region,
+        followers_of(parameters, timings.found, groups),
     )
 
 

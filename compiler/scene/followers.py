@@ -17,7 +17,6 @@ from apc.compiler.components.component import Number
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import names
-from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.values import PEERS, Value
 from apc.compiler.scene.groups import Settings
 from apc.compiler.scene.instances import Part
@@ -62,11 +61,10 @@ def with_followers(
             whole = f"{part.name}.{name}"
             if value.expression is None or whole in own or whole in by_peer:
                 continue
-            tree = parse_expression(value.expression, Place(whole, 1, 1, value.expression))
-            if not any(".".join(node.parts) in own for node in names(tree)):
+            if not any(".".join(node.parts) in own for node in names(value.expression)):
                 continue
             try:
-                found = Fraction(evaluate(tree, number, place))
+                found = Fraction(evaluate(value.expression, number, place))
             except ApcError as error:
                 mistakes.take(error)
                 continue

@@ -106,7 +106,7 @@ def evaluate_exact(
         for (_, size), argument in zip(known.inputs, arguments, strict=True)
         for entry in _of_size(argument, size)
     ]
-    own = {**_SHORT, "pow": _power_of(number), "constpow": _power_of(number)}
+    own: dict[str, Callable[..., Any]] = {**_SHORT, "pow": _power_of(number), "constpow": _power_of(number)}
     for name, of_float in ROUNDED.items():
         own[name] = _rounding(name, of_float, number, rounded)
     own.update(rules or {})

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.frame.overrides import Override, apply
-from apc.frame.rows import Floats, different_rows
+from apc.frame.resolver import Floats, different_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,19 +15,17 @@ import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi
 import flint
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.plain import symbolic
 from apc.frame.exact import evaluate_exact
-from apc.frame.rows import free_values
+from apc.frame.resolver import free_values
 from apc.vary.batch import BatchEvaluator
-
-if TYPE_CHECKING:
-    from apc.compiler.language.expression import Expr
 
 Floats = NDArray[np.float64]
 
@@ -142,7 +140,7 @@ def bends(family: BatchEvaluator, base: Floats, column: int) -> Bends | None:
         if not built.walkable:
             return None
         place, peer = family.first_peer(group)
-        vector = free_values(family.system, family.system.groups[place], peer, free, _symbolic)
+        vector = free_values(family.system, family.system.groups[place], peer, free, symbolic)
         key = (built.kind.name, tuple(one if isinstance(one, float) else None for one in vector))
         if key not in functions:
             functions[key] = _bending(built.function, value, casadi.vertcat(*vector))
@@ -166,13 +164,6 @@ def _bending(function: Any, value: Any, vector: Any) -> Any:
             return None
         whole = casadi.Function("coefficients", [value], [flat[bent]])
     return whole
-
-
-def _symbolic(tree: Expr, value_of: Callable[[str], Any]) -> Any:
-    """Return the value of an expression of parameters, some of which are CasADi's symbols."""
-    from apc.vary.symbols import compute_symbols  # few parameters follow from others
-
-    return compute_symbols(tree, value_of)
 
 
 # ---- Taylor series with balls for coefficients, as numbers ----

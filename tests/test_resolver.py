@@ -1,4 +1,4 @@
-"""Claims about `apc.frame.rows`."""
+"""Claims about `apc.frame.resolver`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
-from apc.frame.rows import free_rows
+from apc.frame.resolver import free_rows
 from tests.sites import NAMES, columned, derived, paper
 
 
