@@ -165,6 +165,13 @@ def test_scenes_that_are_no_rational_function_of_the_parameter_are_refused() -> 
     )
 
 
+def test_what_a_box_does_not_ask_for_may_be_no_rational_function() -> None:
+    system = derived(paper(), coordination__stiffness="if peers > 2 then kt else sqrt(kt)/(peers - 3)")
+    assert _proof(system, "kt=±1%").stable is True
+    divided = derived(paper(), coordination__stiffness="kt/(peers - 3)")
+    assert _message(divided, "kt=±1%") == "E832 coordination.stiffness = kt/(peers - 3) divides by zero."
+
+
 def test_a_memory_that_nobody_reads_is_no_translation_of_a_box(tmp_path: Path) -> None:
     part = """\
 component: Sum

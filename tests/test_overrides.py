@@ -84,6 +84,43 @@ def test_setting_a_dependent_parameter_ends_its_dependence() -> None:
     assert _value(again, "coordination.stiffness") == 5.0
 
 
+@pytest.mark.parametrize(
+    ("text", "setting", "message"),
+    [
+        ("2 + 500/(kt - 3)", "kt=3 N/m", "1:5: E331 500/(kt - 3) divides by zero."),
+        ("500*(1 + log(kt))", "kt=0 N/m", "1:10: E331 log(kt) has no real value."),
+        ("max(1, exp(kt), 2)", "kt=1000 N/m", "1:8: E331 exp(kt) is too large for a number."),
+        ("if not kt > 3 then 1/(kt - 3) else sqrt(kt)", "kt=3 N/m", "1:20: E331 1/(kt - 3) divides by zero."),
+        ("-(kt - 3)^(-2)", "kt=3 N/m", "1:2: E331 (kt - 3)^(-2) divides by zero."),
+    ],
+)
+def test_what_has_no_value_any_more_is_told_with_its_place(text: str, setting: str, message: str) -> None:
+    system = derived(paper(), coordination__stiffness=text)
+    with pytest.raises(ApcError) as caught:
+        apply(system, [parse_override(system, setting)])
+    assert str(caught.value).splitlines()[0] == f"coordination.stiffness:{message}"
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("if kt == 0 then 7 else 1/kt", 7.0),
+        ("if kt != 0 and 1/kt > 2 then 1 else 2", 2.0),
+        ("if kt == 0 or log(kt) > 2 then 1 else 2", 1.0),
+        ("sqrt(kt + 4/9)*3", 2.0),
+        ("(kt + 4)^(-1/2) + floor(kt - 1/2) + 2*sign(kt + 1) + abs(kt - 1)", 2.5),
+        ("min(kt, 1, -3) + max(kt, 1, -3)", -2.0),
+    ],
+)
+def test_what_is_not_asked_for_does_no_harm_and_rationals_stay_exact(text: str, value: float) -> None:
+    system = derived(paper(), coordination__stiffness=text, coordination__damping="0*kt")
+    free = replace(system, parameters=tuple(replace(one, minimum=None) for one in system.parameters))
+    changed = apply(free, [Override("kt", None, Fraction(0))])
+    assert _value(changed, "coordination.stiffness") == value
+    found = next(one for one in changed.parameters if one.name == "coordination.stiffness")
+    assert found.exact == Fraction(value)
+
+
 def test_a_time_is_exact() -> None:
     override = parse_override(paper(), "clocks.network.period=1/90 s")
     assert override == Override("network.period", None, Fraction(1, 90))
