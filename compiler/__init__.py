@@ -18,7 +18,7 @@ equations                   connections: where connectors meet; flatten
                             clocks
                             symbolic, zero_test: SymPy; solution, matching, residuals, elimination, tearing,
                             blocks: solving; jets, aliases, index: derivatives and states; structure
-functions                   casadi_writer, reached: what is written; exchange, ports: what lies beside;
+functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
 compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others
 store                       the compiled model on disk

@@ -36,14 +36,14 @@ HOUSE = (
         residuals elimination tearing blocks jets aliases index structure
         """,
     ),
-    ("apc.compiler.functions", "casadi_writer reached exchange ports functions"),
+    ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
     ("apc.compiler.view", "schema listing diagram graphviz marks layers picture svg contents"),
     ("apc", "threads trouble distribution suffixes optional given"),
     (
         "apc.frame",
         """
-        exact names resolver overrides parameters
+        exact names parameters overrides
         discretize exchange
         guards site jacobians start linearize
         schedule liveness hearing hyperperiod scheduling

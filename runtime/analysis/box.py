@@ -34,8 +34,7 @@ from apc.frame.exact import evaluate_exact
 from apc.frame.linearize import site_of_row
 from apc.frame.names import Free, find
 from apc.frame.overrides import Override, apply
-from apc.frame.parameters import exact_numbers
-from apc.frame.resolver import scope_of
+from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
 from apc.network.nominal import refuse_channel_number
 

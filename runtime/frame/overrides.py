@@ -22,7 +22,7 @@ from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.formula import exact_value
 from apc.compiler.words import with_unit
 from apc.frame.names import OVERRIDE, find, unit_of
-from apc.frame.resolver import Scope, columns_of, scope_of
+from apc.frame.parameters import Scope, columns_of, scope_of
 
 N = TypeVar("N", Parameter, Timing)
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.plain import symbolic
 from apc.frame.exact import evaluate_exact
-from apc.frame.resolver import free_values
+from apc.frame.parameters import free_values
 from apc.vary.batch import BatchEvaluator
 
 Floats = NDArray[np.float64]

@@ -24,7 +24,7 @@ from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
-from apc.frame.resolver import free_rows, scope_of
+from apc.frame.parameters import free_rows, scope_of
 from apc.vary.batch import BatchEvaluator, batch_evaluator
 
 Floats = NDArray[np.float64]
