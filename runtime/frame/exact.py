@@ -26,40 +26,73 @@ BITS = 2**20
 
 
 def _row_power(base: Any, exponent: Any) -> Any:
-    """Return base^exponent; of a complex step, with the derivative as imaginary part."""
-    value = np.float_power(np.real(base), np.real(exponent))
+    """Return base^exponent."""
+    b, e = np.real(base), np.real(exponent)
+    value = np.float_power(b, e)
     if not (np.iscomplexobj(base) or np.iscomplexobj(exponent)):
         return value
-    b, e = np.real(base), np.real(exponent)
     slope = e * np.float_power(b, e - 1) * np.imag(base)
     growing = np.imag(exponent)
     if np.any(growing):
         slope = slope + value * np.log(b) * growing
-    return value + 1j * slope
+    return _step(value, slope)
+
+
+def _row_quotient(above: Any, below: Any) -> Any:
+    """Return a quotient; a complex step doesn't lead around a division by zero."""
+    if not (np.iscomplexobj(above) or np.iscomplexobj(below)):
+        return np.true_divide(above, below)
+    value = np.true_divide(np.real(above), np.real(below))
+    return _step(value, (np.imag(above) - value * np.imag(below)) / np.real(below))
+
+
+def _row_function(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return an elementary function; where the real part has no value, nor has a complex step from there."""
+
+    def value(a: Any) -> Any:
+        return _step(function(np.real(a)), np.imag(function(a))) if np.iscomplexobj(a) else function(a)
+
+    return value
+
+
+def _step(value: Any, slope: Any) -> Any:
+    """Return a complex step: a product with 1j would spoil the value where the slope is infinite."""
+    found = np.empty(np.broadcast_shapes(np.shape(value), np.shape(slope)), dtype=np.complex128)
+    found.real, found.imag = value, slope
+    return found
+
+
+def _of_real(rule: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what takes the real parts alone: steps, and conditions, which are 0 or 1 as in CasADi."""
+    return lambda *operands: 1.0 * rule(*map(np.real, operands))
 
 
 # What the operations are of NumPy's numbers and arrays, real or complex steps: of these the imaginary part is
-# a derivative and follows the real part. A condition is 0 or 1, as in CasADi.
+# a derivative and follows the real part.
 ROWS: dict[str, Callable[..., Any]] = {
     **RULES,
-    "div": np.true_divide,
+    "inv": lambda a: _row_quotient(1.0, a),
+    "div": _row_quotient,
     "fabs": lambda a: np.where(np.real(a) < 0, -a, a),
-    "sign": lambda a: np.sign(np.real(a)),
-    "floor": lambda a: np.floor(np.real(a)),
-    "ceil": lambda a: np.ceil(np.real(a)),
-    "not": lambda a: 1.0 * (a == 0),
+    "sign": _of_real(np.sign),
+    "floor": _of_real(np.floor),
+    "ceil": _of_real(np.ceil),
+    "not": _of_real(np.logical_not),
     "fmin": np.fmin,
     "fmax": np.fmax,
-    "lt": lambda a, b: 1.0 * (a < b),
-    "le": lambda a, b: 1.0 * (a <= b),
-    "eq": lambda a, b: 1.0 * (a == b),
-    "ne": lambda a, b: 1.0 * (a != b),
-    "and": lambda a, b: 1.0 * np.logical_and(a, b),
-    "or": lambda a, b: 1.0 * np.logical_or(a, b),
-    "if_else_zero": lambda a, b: np.where(a, b, 0.0),
+    "lt": _of_real(np.less),
+    "le": _of_real(np.less_equal),
+    "eq": _of_real(np.equal),
+    "ne": _of_real(np.not_equal),
+    "and": _of_real(np.logical_and),
+    "or": _of_real(np.logical_or),
+    "if_else_zero": lambda a, b: np.where(np.real(a), b, 0.0),
     "pow": _row_power,
     "constpow": _row_power,
-    **{name: getattr(np, name.replace("a", "arc", 1) if name[0] == "a" else name) for name in ROUNDED},
+    **{
+        name: _row_function(getattr(np, f"arc{name[1:]}" if name.startswith("a") else name))
+        for name in ROUNDED
+    },
 }
 
 
