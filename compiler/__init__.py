@@ -11,8 +11,7 @@ language                    expression, lexer, grammar: text to trees; evaluatio
                             values, tables, recordings: numbers of a scene, and in CSV files
 components                  component, parts, declarations, component_check, definitions, library
 scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
-                            studies: a section each; followers: what a group's settings change inside
-                            parts; scene: all of them
+                            studies: a section each; scene: all of them
 equations                   connections: where connectors meet; flatten
                             reductions: what is heard of the others; clock_inference: what ticks together;
                             clocks

@@ -27,7 +27,7 @@ HOUSE = (
     ("apc.compiler.components", "component parts declarations component_check definitions library"),
     (
         "apc.compiler.scene",
-        "named_numbers timebase instances sections channels graphs links groups followers studies scene",
+        "named_numbers timebase instances sections channels graphs links groups studies scene",
     ),
     (
         "apc.compiler.equations",

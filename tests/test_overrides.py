@@ -77,6 +77,17 @@ def test_a_group_value_can_change_what_everybody_derives_from_it() -> None:
     assert [_value(changed, "coordination.stiffness", group) for group in (0, 1)] == [20.0, 500.0]
 
 
+def test_a_group_takes_over_only_what_its_own_value_reaches() -> None:
+    system = grouped(derived(paper(), coordination__stiffness="2*kt"), ("left", 1, {}), ("right", 2, {}))
+    overrides = [
+        Override("coordination.stiffness", None, Fraction(7)),
+        Override("device.mass", "left", Fraction(1)),
+    ]
+    changed = apply(system, overrides)
+    assert [[value.name for value in group.values] for group in changed.groups] == [["device.mass"], []]
+    assert [_value(changed, "coordination.stiffness", group) for group in (0, 1)] == [7.0, 7.0]
+
+
 def test_setting_a_dependent_parameter_ends_its_dependence() -> None:
     system = derived(paper(), coordination__stiffness="2*kt")
     once = apply(system, [Override("coordination.stiffness", None, Fraction(5))])

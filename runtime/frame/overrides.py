@@ -85,18 +85,19 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         values |= {name: parameters[name] for name in own if name not in values}
         if own:
             _check_times(system, group.name, list(values.values()), own)
-        changed = _changed(scope_of(system, list(values.values())), {**shared, **own})
+        given = {**shared, **own}
+        changed = _changed(scope_of(system, list(values.values())), given)
         if own:
             # What a group leaves to everybody is its own as soon as it depends on a value of its own.
             values |= {
                 name: one
                 for name, one in parameters.items()
-                if name not in values and _renewed(one, changed, own) != _renewed(one, common, everywhere)
+                if name not in values and _renewed(one, changed, given) != _renewed(one, common, everywhere)
             }
         groups.append(
             replace(
                 group,
-                values=tuple(_renewed(one, changed, {**shared, **own}) for one in values.values()),
+                values=tuple(_renewed(one, changed, given) for one in values.values()),
                 # One value for the group, or for everybody, is one for each of its peers.
                 columns=tuple(
                     column for column in group.columns if column.name not in everywhere.keys() | own.keys()
@@ -140,7 +141,7 @@ def _check_times(
     group, values, own
         The group, its own numbers, and what it sets.
     """
-    changed = _changed(scope_of(system, values, system.timings), own)
+    changed = _changed(scope_of(system, [*values, *system.timings]), own)
     for timing in system.timings:
         if timing.name in changed:
             what = f"{timing.name} is one time for all groups, and depends on what is set for {group}"

@@ -75,9 +75,7 @@ class Scope:
 
 
 def scope_of(
-    system: CompiledSystem,
-    *layers: Sequence[Parameter | Timing],
-    fixed: Collection[str] = (),
+    system: CompiledSystem, own: Sequence[Parameter | Timing] = (), *, fixed: Collection[str] = ()
 ) -> Scope:
     """Return the numbers of a scene as they are seen by a group of peers, or by everybody.
 
@@ -85,15 +83,13 @@ def scope_of(
     ----------
     system
         The compiled scene.
-    layers
-        What a group has of its own; of two of a name the later counts.
+    own
+        What the group has of its own; of two of a name the later counts.
     fixed
         Names that follow from nothing here.
     """
-    holder: dict[str, Parameter | Timing] = {one.name: one for one in system.timings}
-    holder.update((one.name, one) for one in system.parameters)
-    for layer in layers:
-        holder.update((one.name, one) for one in layer)
+    numbers: list[Parameter | Timing] = [*system.timings, *system.parameters, *own]
+    holder = {one.name: one for one in numbers}
     formulas = {
         name: formula
         for name in system.followers
