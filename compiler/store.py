@@ -45,9 +45,19 @@ from apc.compiler.cache import (
     read_archive,
     record_of,
 )
-from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind, counts_peers
+from apc.compiler.compiled import (
+    LARGEST_COUNT,
+    CompiledSystem,
+    Formula,
+    Graph,
+    Kind,
+    Parameter,
+    Timing,
+    counts_peers,
+)
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, write_file
+from apc.compiler.formula import EXACT
 from apc.compiler.language.unit_text import is_si
 from apc.compiler.plain import PlainFunction, plain, read_function
 from apc.compiler.seal import seal
@@ -152,6 +162,7 @@ def _is_consistent(system: CompiledSystem) -> bool:
         and parameters.issuperset(column.name for group in system.groups for column in group.columns)
         and parameters.issuperset(value.name for group in system.groups for value in group.values)
         and all(one.exact is None or float(one.exact) == one.value for one in numbers)
+        and _are_formulas(system)
         and all(_is_graph_consistent(link.graph, system.peers) for link in system.links)
         and all(_is_kind_consistent(kind, set(timings), clocks, parameters) for kind in system.kinds)
         and links.issuperset(sending.link for kind in system.kinds for sending in kind.sends)
@@ -184,6 +195,36 @@ def _are_units_consistent(system: CompiledSystem) -> bool:
             for partition in clocks
             for memory, start in zip(partition.memories, partition.starts, strict=True)
         )
+    )
+
+
+def _are_formulas(system: CompiledSystem) -> bool:
+    """Return whether each number that follows from others does so in the order of the followers."""
+    numbers: list[Parameter | Timing] = [*system.parameters, *system.timings]
+    names = {one.name for one in numbers}
+    numbers += [value for group in system.groups for value in group.values]
+    formulas = [(one.name, one.formula) for one in numbers if one.formula is not None]
+    place = {name: k for k, name in enumerate(system.followers)}
+    return (
+        len(place) == len(system.followers)
+        and place.keys() >= {name for name, _ in formulas}
+        and all(names.issuperset(formula.names) for _, formula in formulas)
+        and all(_is_formula(formula) for _, formula in formulas)
+        and all(place.get(one, -1) < place[name] for name, formula in formulas for one in formula.names)
+    )
+
+
+def _is_formula(formula: Formula) -> bool:
+    """Return whether a formula is made of what expressions are made of."""
+    function, given = formula.function, [len(formula.names), len(formula.numbers)]
+    return (
+        function.loops is None
+        and function.sizes == (given, [1])
+        and not function.constants
+        and all(word in EXACT for word, *_ in function.operations)
+        and len(formula.spans) == sum(given) + len(function.operations)
+        and all(0 <= start <= end <= len(formula.text) for start, end in formula.spans)
+        and all(math.isfinite(float(one)) for one in formula.numbers)
     )
 
 

@@ -15,7 +15,7 @@ from tests.topologies import AVERAGE, ROOT
 
 # Folder by folder, and in each its modules, earliest first: each may import only those before it.
 HOUSE = (
-    ("apc.compiler", "errors digits files words multiples weights compiled plain seal cache"),
+    ("apc.compiler", "errors digits files words multiples weights plain compiled formula seal cache"),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
         "apc.compiler.language",
@@ -27,7 +27,7 @@ HOUSE = (
     ("apc.compiler.components", "component parts declarations component_check definitions library"),
     (
         "apc.compiler.scene",
-        "named_numbers timebase instances sections channels graphs links groups followers studies scene",
+        "named_numbers timebase instances sections channels graphs links groups studies scene",
     ),
     (
         "apc.compiler.equations",
@@ -36,14 +36,14 @@ HOUSE = (
         residuals elimination tearing blocks jets aliases index structure
         """,
     ),
-    ("apc.compiler.functions", "casadi_writer reached exchange ports functions"),
+    ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
     ("apc.compiler.view", "schema listing diagram graphviz marks layers picture svg contents"),
     ("apc", "threads trouble distribution suffixes optional given result tables"),
     (
         "apc.frame",
         """
-        exact names row_arithmetic rows bounds overrides parameters
+        exact names parameters overrides
         discretize exchange
         guards site jacobians start linearize
         schedule liveness hearing hyperperiod scheduling
@@ -77,7 +77,7 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch evaluator symbols bends marginal crossings bracket delays search critical
+        wiring batch evaluator bends marginal crossings bracket delays search critical
         margins sensitivity
         """,
     ),

@@ -189,6 +189,7 @@ def test_a_byte_changed_or_an_end_cut_off_is_refused_or_harmless(
 
 EDGES = replaced(
     AVERAGE,
+    ("peers:", "parameters: {half: 250 N/m, full: 2*half, more: full + half}\npeers:"),
     ("type: AveragePosition", "type: SaturatedMesh, limit: 1 N"),
     ("lan: {", "lan: {graph: {edges: [[1, 2], [2, 3]]}, "),
 )
@@ -203,6 +204,16 @@ WRONG = {
     "a graph of another shape": ("links.0.graph.shape", "tree"),
     "a value that its exact one is not": ("parameters.0.exact", "7/3"),
     "a group's value of nothing": ("groups.0.values", [{"name": "no", "unit": "1", "value": 1.0}]),
+    "numbers that follow from one another in a circle": ("parameters.1.formula.names", ["more"]),
+    "numbers in another order": ("followers", ["more", "full"]),
+    "a number that is never followed": ("followers", ["full"]),
+    "a number that follows twice": ("followers", ["full", "more", "full"]),
+    "a number that follows from none": ("parameters.1.formula.names", ["no"]),
+    "a formula of other sizes": ("parameters.1.formula.numbers", []),
+    "a formula of no finite number": ("parameters.1.formula.numbers", ["9" * 400]),
+    "a formula of a loop": ("parameters.1.formula.function.loops", []),
+    "a formula of what no expression holds": ("parameters.1.formula.function.operations.0", ["asin", 0]),
+    "a formula beyond its text": ("parameters.1.formula.spans.0", [0, 99]),
     "an edge of other sizes": ("kinds.0.clocks.0.receives.0.edge", "kinds.0.derivative"),
 }
 

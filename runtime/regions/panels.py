@@ -184,7 +184,7 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
     """
     first = resolve(system)
     value = axis.low + (axis.high - axis.low) * (MOVE - 1)
-    second = resolve(system, [Override(axis.name, axis.group, value)])
+    second = resolve(apply(system, [Override(axis.name, axis.group, value)]))
     exchange = build_exchange(system, first.timings)
     found: set[int] = set()
     for place, group in enumerate(system.groups):

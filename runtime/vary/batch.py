@@ -40,7 +40,7 @@ from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, compose, lift, roundings_of
 from apc.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
-from apc.frame.rows import free_rows
+from apc.frame.parameters import free_rows
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix
 from apc.vary.wiring import (

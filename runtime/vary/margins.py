@@ -124,7 +124,7 @@ def _delays(system: CompiledSystem) -> list[Free]:
     waited = [hold.delay for kind in system.kinds for hold in kind.holds]
     for link in system.links:
         waited += [link.delay, *(pair.delay for pair in link.delays)]
-    free = {timing.name for timing in named_times(system) if timing.expression is None}
+    free = {timing.name for timing in named_times(system) if timing.formula is None}
     return [Free(name) for name in dict.fromkeys(waited) if name in free]
 
 
