@@ -39,7 +39,7 @@ HOUSE = (
     ("apc.compiler.functions", "casadi_writer reached exchange ports functions"),
     ("apc.compiler", "pipeline store"),
     ("apc.compiler.view", "schema listing diagram graphviz marks layers picture svg contents"),
-    ("apc", "threads trouble distribution suffixes optional given"),
+    ("apc", "threads trouble distribution suffixes optional given processes"),
     (
         "apc.frame",
         """
@@ -80,7 +80,7 @@ HOUSE = (
         margins sensitivity
         """,
     ),
-    ("apc.sweeps", "grid quantities table_file work store local cluster sweep"),
+    ("apc.sweeps", "grid quantities table_file work store cluster sweep"),
     (
         "apc.simulation",
         """

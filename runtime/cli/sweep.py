@@ -85,7 +85,8 @@ def sweep_command(
     changes, with its error).
     """
     from apc.inputs import open_scene
-    from apc.sweeps.sweep import Patience, sweep
+    from apc.processes import Patience
+    from apc.sweeps.sweep import sweep
 
     waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))
     values = _values(over)
