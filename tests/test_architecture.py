@@ -50,7 +50,7 @@ HOUSE = (
         lift batch_lift course residues
         """,
     ),
-    ("apc.network", "channel_law nominal packets listener timetable weights gathering"),
+    ("apc.network", "channel nominal timetable"),
     (
         "apc.eigen",
         """
@@ -85,7 +85,7 @@ HOUSE = (
         "apc.simulation",
         """
         methods settings scales stepping integrate propagate flow instants quadrature forcing
-        local_signals pairs program writing native member frame_packets population
+        local_signals pairs program writing native selection frame_packets population
         signals simulation length blocks accuracy summary trajectory formats recording figures still
         ensemble
         """,

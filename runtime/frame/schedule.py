@@ -54,27 +54,25 @@ class Way:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Heard:
-    """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame).
-
-    On a way that loses or delays packets, each tick has a row of its own: tick `tick` of `clock` hears
-    whichever packets of the channel it does, and `sent` and `lag` say nothing more. With `gap` the row is not
-    what it hears but the weight of what it misses.
-    """
+    """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame)."""
 
     way: Way
     sent: Sent
     lag: int
-    clock: str = ""
-    tick: int = -1
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Selected:
+    """What tick `tick` of `clock` hears of a channel on a way that loses or delays packets: one that is kept.
+
+    With `gap` it is not what is heard but the weight of what is missed.
+    """
+
+    way: Way
+    channel: str
+    clock: str
+    tick: int
     gap: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Kept:
-    """An unreliable link: its packets are kept for `frames` frames; with `gaps`, what is missing counts."""
-
-    frames: int
-    gaps: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +116,9 @@ class Schedule:
 
     `acting` is what each hold puts out as the frame begins (None for a hold nobody reads); `carried` are the
     values of earlier frames that this one needs, the remembered part of z after the continuous states;
-    `heard` names r; `sent` names s and `depths` says how many frames each row of s must be kept; `ticks`
-    counts a clock partition's ticks in a frame; `marks` are the instants, in quanta, of the fastest clock's
-    ticks and the end.
+    `heard` names r, and `selected` goes on where packets get lost or come late; `sent` names s and `depths`
+    says how many frames each row of s must be kept; `ticks` counts a clock partition's ticks in a frame;
+    `marks` are the instants, in quanta, of the fastest clock's ticks and the end.
     """
 
     quantum: Fraction
@@ -136,11 +134,17 @@ class Schedule:
     value_names: tuple[str, ...]
     sent_names: tuple[str, ...]
     sent_times: tuple[int, ...]  # in quanta from the frame's start
+    selected: tuple[Selected, ...] = ()
 
     @property
     def frame_s(self) -> Fraction:
         """The length of the frame in seconds."""
         return self.frame * self.quantum
+
+    @property
+    def received(self) -> tuple[Heard | Selected, ...]:
+        """All that is received, by the rows of r."""
+        return self.heard + self.selected
 
     def ways(self, partition: int, receive: int) -> tuple[tuple[Way, str], ...]:
         """Return the ways and channels a receive of a clock partition hears, whatever the tick."""

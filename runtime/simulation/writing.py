@@ -16,7 +16,7 @@ import casadi
 import numpy as np
 
 from apc.frame.jacobians import edge_name
-from apc.frame.schedule import Act, Event, Propagate, Schedule, Send, Sent, Tick, Value
+from apc.frame.schedule import Act, Event, Propagate, Schedule, Selected, Send, Tick, Value
 from apc.simulation.flow import Flow
 from apc.simulation.local_signals import LocalSignal, ticking_partitions
 from apc.simulation.pairs import PairFunction, Pairwise, pair_function
@@ -254,16 +254,16 @@ class _Writer:
     def _sum(self, now: int, rows: Sequence[int]) -> Any:
         total = self.type_(0)
         for row in rows:
-            heard = self.schedule.heard[row]
+            heard = self.schedule.received[row]
             # What a site would itself send at this moment stands in for what it misses.
-            weight = self._own(now, heard.sent) if heard.gap else 1
+            weight = self._own(now, heard) if isinstance(heard, Selected) and heard.gap else 1
             total = total + weight * self.inputs[2][row]
         return total
 
-    def _own(self, now: int, sent: Sent) -> Any:
-        sending = next(one for one in self.kind.sends if one.link == sent.link)
+    def _own(self, now: int, heard: Selected) -> Any:
+        sending = next(one for one in self.kind.sends if one.link == heard.way.link)
         everything = sending.send(self._x(), self._u(), self._p(), self._time(now))
-        return everything[sending.channels.index(sent.channel)]
+        return everything[sending.channels.index(heard.channel)]
 
     def _propagate(self, now: int, place: int) -> None:
         """Move x over one interval, and add up the work that held values do meanwhile."""
