@@ -84,9 +84,9 @@ HOUSE = (
     (
         "apc.simulation",
         """
-        methods settings scales stepping integrate propagate flow instants quadrature forcing
-        local_signals pairs program writing native selection frame_packets population
-        signals simulation length blocks accuracy summary trajectory formats recording figures still
+        settings integrate propagate flow instants quadrature forcing
+        signals pairs program writing native selection frame_packets population
+        simulation blocks accuracy summary trajectory formats recording figures still
         ensemble
         """,
     ),

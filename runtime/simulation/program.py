@@ -26,9 +26,9 @@ from apc.compiler.compiled import Kind
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import Schedule, Value
 from apc.frame.start import start_sends, start_values
-from apc.simulation.local_signals import LocalSignal
 from apc.simulation.pairs import Pairwise
 from apc.simulation.propagate import Rates, Transitions
+from apc.simulation.signals import LocalSignal
 
 Floats = NDArray[np.float64]
 

@@ -1,6 +1,7 @@
 """A scene made ready to be played in time: one function for a stretch of frames of all peers.
 
-Takes: a `CompiledSystem`, its `Settings`, the signals wanted. Gives: `Simulation`, `prepare`.
+Takes: a `CompiledSystem`, its `Settings`, the signals wanted.
+Gives: `Simulation`, `prepare`; `check_length`, `size_note`, what it will come to.
 Guarantees: time is counted in whole quanta; what would not fit the memory is refused before it is built.
 Does not: play it (see `blocks`).
 """
@@ -23,19 +24,16 @@ from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.scheduling import build_schedules
 from apc.network.timetable import Route, routes_of
-from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move
+from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
 from apc.simulation.forcing import SiteForcing, forcing_of
-from apc.simulation.local_signals import LocalSignal, local_signals
-from apc.simulation.methods import CVODES, EXACT, WHERE_NEEDED, Method, check_step
 from apc.simulation.native import native
 from apc.simulation.pairs import count_pairs
 from apc.simulation.population import Population, build_population, exchanges_within, refuse_unheard_of
 from apc.simulation.program import Member, Program, build_member
 from apc.simulation.propagate import Transitions, perturbed, rates, transitions
 from apc.simulation.quadrature import Kernel, kernel_of
-from apc.simulation.scales import state_scales
-from apc.simulation.settings import Settings
-from apc.simulation.signals import Choice, Signal, choose, signals_of
+from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
+from apc.simulation.signals import Choice, LocalSignal, Signal, choose, local_signals, signals_of
 from apc.simulation.writing import build_program
 from apc.trouble import finite_equations
 
@@ -53,6 +51,16 @@ MOST_FRAMES = 2000  # of one chunk: the function of a chunk is built in a time t
 NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
 # Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
 MOST_NUMBERS = 2**26
+
+# Rows of one command, all runs together: at a microsecond a row and peer, which machine code needs, some
+# hours. At 1 kHz it is eleven days of simulated time.
+MOST_ROWS = 10**9
+
+# A file larger than this is told of beforehand: 1 GB.
+LARGE = 10**9
+
+# Bytes of a number: as a float, and in decimal with the comma, mostly.
+BINARY, DECIMAL = 8, 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,6 +159,52 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
         length=length,
         chunk=population.frame.mapaccum("chunk", length, len(population.start)),
     )
+
+
+def check_length(system: CompiledSystem, duration: Fraction, *, runs: int = 1) -> None:
+    """Refuse to play so long that no one will wait for it.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    duration
+        How long, in seconds.
+    runs
+        How often.
+
+    Raises
+    ------
+    ApcError
+        E915 more than `MOST_ROWS` rows.
+    """
+    timings = {timing.name: timing.value for timing in system.timings}
+    row = min((timings[clock.period] for clock in system.clocks), default=ROW)
+    if duration * runs <= MOST_ROWS * row:
+        return
+    longest = float(MOST_ROWS * row / runs)
+    each = f" in each of {runs:,} runs" if runs > 1 else ""
+    expected = f"at most {longest:.6g} s{each}: a row a tick, {MOST_ROWS:,} in all"
+    got, hint = f"{float(duration):.6g} s", f'--duration "{longest:.6g} s"'
+    raise ApcError(Mistake("E915", Place(system.name), "the duration", expected, got, hint))
+
+
+def size_note(simulation: Simulation, *, decimal: bool) -> str:
+    """Return what to tell of a file of all rows, "" if it is small enough not to mention it.
+
+    Parameters
+    ----------
+    simulation
+        The scene, ready.
+    decimal
+        Whether the file is a text.
+    """
+    frames = int(simulation.settings.duration / (simulation.frame * simulation.quantum))
+    rows, columns = frames * len(simulation.marks), len(simulation.signals) + 1
+    size = rows * columns * (DECIMAL if decimal else BINARY)
+    if size < LARGE:
+        return ""
+    return f"will hold {rows:,} rows of {columns} columns, about {size / 1e9:.3g} GB"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,8 +25,7 @@ from apc.optional import need
 from apc.simulation.accuracy import ErrorEstimate, compare_with, error_text
 from apc.simulation.blocks import Block, blocks
 from apc.simulation.flow import Tolerance
-from apc.simulation.methods import DEFAULT, EXACT, Method
-from apc.simulation.settings import Settings
+from apc.simulation.settings import DEFAULT, EXACT, Method, Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.summary import Summary, Watch, summary_text

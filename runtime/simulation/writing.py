@@ -18,10 +18,10 @@ import numpy as np
 from apc.frame.jacobians import edge_name
 from apc.frame.schedule import Act, Event, Propagate, Schedule, Selected, Send, Tick, Value
 from apc.simulation.flow import Flow
-from apc.simulation.local_signals import LocalSignal, ticking_partitions
 from apc.simulation.pairs import PairFunction, Pairwise, pair_function
 from apc.simulation.program import Layout, Program, Segment, seconds_at
 from apc.simulation.propagate import Rates
+from apc.simulation.signals import LocalSignal, ticking_partitions
 
 
 def build_program(
