@@ -1,7 +1,8 @@
 """What one frame of a peer is made of: its events in their order, and what is remembered between frames.
 
 Takes: what `scheduling` found out.
-Gives: `Schedule` and its events, `Event`; the names of what is computed, sent and heard; `ORDER`.
+Gives: `Schedule` and its events, `Event`; the names of what is computed, sent and heard; `shifted`,
+`remembered`; `ORDER`.
 Guarantees: exact time (integers of one quantum).
 Does not: find out what happens when (see `scheduling`).
 
@@ -11,6 +12,7 @@ tick `index`, counted from the frame's first tick of that clock; a negative inde
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -25,6 +27,25 @@ class Value:
     partition: int
     output: int
     index: int
+
+
+def shifted(value: Value, ticks: Sequence[int]) -> Value:
+    """Return the value that is called `value` one frame on; `ticks` are of a frame, by clock partition."""
+    return Value(value.partition, value.output, value.index + ticks[value.partition])
+
+
+def remembered(values: Iterable[Value], ticks: Sequence[int]) -> tuple[Value, ...]:
+    """Return those of some values that are of earlier frames, and what they were called until they came.
+
+    A value read at index −j is, one frame before, the value of index n − j; if that is negative too, it is
+    remembered as well.
+    """
+    found: set[Value] = set()
+    for value in values:
+        while value.index < 0:
+            found.add(value)
+            value = shifted(value, ticks)
+    return tuple(sorted(found))
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -34,6 +34,7 @@ from apc.frame.schedule import (
     Tick,
     Value,
     Way,
+    remembered,
 )
 from apc.frame.site import LinearSite
 
@@ -332,21 +333,17 @@ def _carried(
     acting: Sequence[Value | None],
     ticks: Sequence[int],
 ) -> tuple[Value, ...]:
-    """Return the values of earlier frames that this frame reads, and those still to be read later.
-
-    A value read at index -j is, one frame on, the value of index n - j; if that is negative too, it is
-    carried as well.
-    """
+    """Return the values of earlier frames that this frame reads, and those still to be read later."""
     kind = pattern.kind
     now = list(acting)
     demanded: set[Value] = set()
     felt = np.flatnonzero(pattern.b.any(axis=0)).tolist()
     sent = [[channel.nonzero()[0].tolist() for channel in send.u] for send in pattern.sends]
-    computed, remembered = [], []
+    computed, recalled = [], []
     for partition, tick in enumerate(pattern.ticks):
         outputs = sorted(o for p, o in live if p == partition)
         computed.append(np.flatnonzero(tick.u[outputs].any(axis=0)).tolist())
-        remembered.append(np.flatnonzero(tick.m[outputs].any(axis=0)).tolist())
+        recalled.append(np.flatnonzero(tick.m[outputs].any(axis=0)).tolist())
 
     def read(row: Iterable[int]) -> None:
         demanded.update(value for h in row if (value := now[h]) is not None)
@@ -363,13 +360,8 @@ def _carried(
             case Tick(partition, index, _):
                 read(computed[partition])
                 memories = kind.clocks[partition].memories
-                demanded.update(Value(partition, memories[m], index - 1) for m in remembered[partition])
-    carried: set[Value] = set()
-    for value in demanded:
-        while value.index < 0:
-            carried.add(value)
-            value = Value(value.partition, value.output, value.index + ticks[value.partition])
-    return tuple(sorted(carried))
+                demanded.update(Value(partition, memories[m], index - 1) for m in recalled[partition])
+    return remembered(demanded, ticks)
 
 
 def _value_name(pattern: LinearSite, value: Value, times: Times) -> str:

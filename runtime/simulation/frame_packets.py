@@ -18,7 +18,6 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.weights import sum_weights
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Heard, Selected, Sent, Way
@@ -31,10 +30,8 @@ from apc.simulation.selection import Selection
 class FramePackets:
     """The packets of one frame, as they are sent, remembered and heard."""
 
-    def __init__(
-        self, system: CompiledSystem, exchange: Exchange, members: Sequence[Member], routes: Sequence[Route]
-    ) -> None:
-        self.system, self.exchange, self.members = system, exchange, members
+    def __init__(self, exchange: Exchange, members: Sequence[Member], routes: Sequence[Route]) -> None:
+        self.exchange, self.members = exchange, members
         self.selection = Selection(routes, members, self.packet)
         self.old: dict[tuple[int, Sent, int], Any] = {}  # (group, what, frames ago)
         self.new: dict[tuple[int, Sent], Any] = {}
@@ -42,8 +39,8 @@ class FramePackets:
         self.weights: dict[tuple[int, Way, str, int], Any] = {}
         self.known: dict[Any, tuple[int, Any]] = {}  # what looks at pairs, and at how many packets
         self.sending = {
-            link.name: [any(one.link == link.name for one in m.program.kind.sends) for m in members]
-            for link in system.links
+            link: [any(one.link == link for one in m.program.kind.sends) for m in members]
+            for link in exchange.links
         }
         # Of each peer of the scene: its member, and its place among that member's peers.
         self.member_of = np.empty(exchange.peers, np.int64)
@@ -107,7 +104,7 @@ class FramePackets:
             own = casadi.vertcat(carry[list(one.carry), :], constants[list(one.constants), :])
             t = seconds_at(schedule, number, one.now)
             rows = [schedule.received[row] for row in one.heard]
-            found.append(self._looked(group, rows, own, t, ready[id(one.pair.function)]))
+            found.append(self._looked(group, rows, own, t, ready[id(one.function)]))
         return found
 
     def packet(self, group: int, sent: Sent, ago: int) -> Any:

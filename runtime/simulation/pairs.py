@@ -1,7 +1,7 @@
 """What peers make of those they hear: their weights, and reductions that look at each pair of peers.
 
 Takes: a kind's receives over an edge function, or of a maximum or minimum; who hears whom.
-Gives: `Arcs`; `PairFunction`, `pair_function`, `Pairwise`, `reduction`; `count_pairs`.
+Gives: `Arcs`; `pair_function`, `Pairwise`, `reduction`; `count_pairs`.
 Guarantees: one evaluation a pair of peers that hear each other, by one function for all of them.
 Does not: say when anything is sent or heard (see `scheduling`), or keep packets (see `frame_packets`).
 
@@ -30,26 +30,14 @@ JOINS = {"max": casadi.fmax, "min": casadi.fmin}
 
 
 @dataclass(frozen=True, slots=True)
-class PairFunction:
-    """What one peer makes of another: `function(own, s, missing, t) -> value`.
+class Pairwise:
+    """What one peer makes of each other at one tick of its frame, the first instant of a segment.
 
-    `own` are the rows of (x, u, m, p) that matter, counted through; `s` are the channels that are heard;
-    `missing` is 1 where what the peer would itself send stands in for a packet, else 0.
+    `function` is as `pair_function` gives it; `carry` are the rows of the carry, `constants` those of the
+    site's constants that make up `own`; `heard` are rows of the schedule; `now` is the instant in quanta.
     """
 
     function: Any  # casadi.Function
-    own: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Pairwise:
-    """A pair function at one tick of a peer's frame, the first instant of a segment.
-
-    `carry` are the rows of the carry, `constants` those of the site's constants that make up `own`; `heard`
-    are rows of the schedule; `now` is the instant in quanta.
-    """
-
-    pair: PairFunction
     carry: tuple[int, ...]
     constants: tuple[int, ...]
     heard: tuple[int, ...]
@@ -82,8 +70,15 @@ class Arcs:
         return _sparse(self.weights, self.senders, self.receivers, (self.width, count))
 
 
-def pair_function(kind: Kind, partition: int, receive: int) -> PairFunction:
-    """Build what a receive (of a clock partition of a kind) evaluates for each sender."""
+def pair_function(kind: Kind, partition: int, receive: int) -> tuple[Any, tuple[int, ...]]:
+    """Build what a receive (of a clock partition of a kind) evaluates for each sender.
+
+    Returns
+    -------
+    The casadi.Function (own, s, missing, t) -> value, and which rows of (x, u, m, p), counted through, are
+    `own`: those that matter. `s` are the channels that are heard; `missing` is 1 where what the peer would
+    itself send stands in for a packet, else 0.
+    """
     clock = kind.clocks[partition]
     hearing = clock.receives[receive]
     sending = next((one for one in kind.sends if one.link == hearing.link), None)
@@ -104,7 +99,7 @@ def pair_function(kind: Kind, partition: int, receive: int) -> PairFunction:
     every = casadi.vertcat(x, u, m, p)
     own = _rows_used(value, every)
     arguments = [_rows(every, own), _rows(sent, channels), missing, t]
-    return PairFunction(casadi.Function("pair", arguments, [value]), tuple(own))
+    return casadi.Function("pair", arguments, [value]), tuple(own)
 
 
 def _rows_used(value: Any, symbols: Any) -> list[int]:
@@ -135,7 +130,7 @@ def reduction(pair: Any, operator: str, arcs: Arcs, count: int) -> Any:
     Parameters
     ----------
     pair
-        A `PairFunction.function`, in the form in which it runs.
+        A `pair_function`, in the form in which it runs.
     operator
         "sum", "mean", "max" or "min".
     arcs

@@ -91,7 +91,6 @@ def refuse_unheard_of(system: CompiledSystem) -> None:
 
 
 def build_population(
-    system: CompiledSystem,
     exchange: Exchange,
     members: Sequence[Member],
     kernels: Compile,
@@ -101,8 +100,6 @@ def build_population(
 
     Parameters
     ----------
-    system
-        The compiled scene.
     exchange
         Who hears whom.
     members
@@ -118,10 +115,10 @@ def build_population(
         E801 a mean over nobody, E802 a mean whose weights add up to 0.
     """
     segments = [segment for one in members for segment in one.program.segments]
-    looked = [pairwise.pair.function for segment in segments for pairwise in segment.pairs]
+    looked = [pairwise.function for segment in segments for pairwise in segment.pairs]
     found = _distinct([*(segment.kernel for segment in segments), *looked])
     ready = dict(zip(found, kernels(list(found.values())), strict=True))
-    packets = FramePackets(system, exchange, members, routes)
+    packets = FramePackets(exchange, members, routes)
     carries = [casadi.MX.sym(f"carry{g}", len(one.carry[0]), one.count) for g, one in enumerate(members)]
     histories = [
         casadi.MX.sym(f"history{g}", sum(one.program.schedule.depths), one.count)

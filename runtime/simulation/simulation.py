@@ -137,7 +137,7 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
             compiled.append(any(new is not old for new, old in zip(ready, functions, strict=True)))
             return ready
 
-        population = build_population(system, plan.exchange, members, kernels, plan.routes)
+        population = build_population(plan.exchange, members, kernels, plan.routes)
     schedule = plan.schedules[0]
     marks = schedule.marks[:-1]
     length = _chunk_length(population.frame, settings.duration, schedule.frame_s)
