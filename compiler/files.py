@@ -1,8 +1,8 @@
 """What is read from disk and written to it, whoever named the file.
 
 Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
-`write_file`, `write_text`, `check_target`, `is_special`, `is_stdout`, and for what is written piece by piece
-`begin_file`, `finish_file`, `drop_file`, `partial_name`.
+`write_file`, `write_text`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for what is written
+piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a
 link stays and its file is written; a device or pipe, or what standard output writes to, is written to, never
@@ -187,7 +187,7 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
     except (OSError, ValueError) as error:
         if isinstance(error, ValueError) and temporary is not None:
             raise  # not of the name: of what `write` does
-        raise _unwritable(path, error) from error
+        raise unwritable(path, error) from error
     finally:
         if temporary is not None:
             drop_file(temporary)
@@ -207,10 +207,11 @@ def check_target(path: Path) -> None:
     try:
         drop_file(begin_file(path))
     except (OSError, ValueError) as error:
-        raise _unwritable(path, error) from error
+        raise unwritable(path, error) from error
 
 
-def _unwritable(path: Path, error: OSError | ValueError) -> ApcError:
+def unwritable(path: Path, error: OSError | ValueError) -> ApcError:
+    """Return the message (E601) of a file or folder that can't be written."""
     return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}"))
 
 

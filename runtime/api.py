@@ -380,7 +380,7 @@ def simulate(
         The input is at fault.
     """
     from apc.simulation import trajectory
-    from apc.simulation.methods import DEFAULT, parse_method
+    from apc.simulation.settings import DEFAULT, parse_method
 
     return trajectory.simulate(
         _model(model, set),

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.network.channel_law import ChannelLaw
-from apc.network.packets import PacketSource
+from apc.network.channel import ChannelLaw, PacketSource
 from tests.topologies import AVERAGE, replaced
 
 LINK = "  lan: {clock: network, delay: 8 ms}"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from apc.present.simulation import error_text
-from apc.simulation.methods import parse_method
+from apc.simulation.settings import parse_method
 from apc.simulation.trajectory import simulate
 from tests.test_integrate import CROSSLEY
 from tests.topologies import AVERAGE, compiled, replaced

@@ -39,7 +39,7 @@ HOUSE = (
     ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
     ("apc.compiler.view", "schema listing diagram graphviz marks layers picture svg contents"),
-    ("apc", "threads trouble distribution suffixes optional given result tables"),
+    ("apc", "threads trouble distribution suffixes optional given result tables processes"),
     (
         "apc.frame",
         """
@@ -50,7 +50,7 @@ HOUSE = (
         lift batch_lift course residues
         """,
     ),
-    ("apc.network", "channel_law nominal packets listener timetable weights gathering"),
+    ("apc.network", "channel nominal timetable"),
     (
         "apc.eigen",
         """
@@ -82,13 +82,13 @@ HOUSE = (
         """,
     ),
     ("apc", "answer"),
-    ("apc.sweeps", "grid quantities work store local cluster sweep"),
+    ("apc.sweeps", "grid quantities work store cluster sweep"),
     (
         "apc.simulation",
         """
-        methods settings scales stepping integrate propagate flow instants quadrature forcing
-        local_signals pairs program writing native member frame_packets population
-        signals simulation length blocks accuracy summary trajectory ensemble
+        settings integrate propagate flow instants quadrature forcing
+        signals pairs program writing native selection frame_packets population
+        simulation blocks accuracy summary trajectory ensemble
         """,
     ),
     (

@@ -15,7 +15,7 @@ from apc.simulation.ensemble import PART, Ensemble, Run, play_many, share_interv
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import play
-from tests.test_gathering import apart
+from tests.test_selection import apart
 from tests.topologies import AVERAGE, compiled
 
 SHAKY = apart(AVERAGE, "loss: {p: 10 %, r: 20 %}, jitter: 8 ms")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from apc.simulation.flow import flow_of, rows_to_move
-from apc.simulation.methods import DEFAULT, parse_method
+from apc.simulation.settings import DEFAULT, parse_method
 from tests.sites import alone, paper
 
 CUBIC = alone(lambda x, u: -(x**3)).kinds[0]

@@ -17,9 +17,8 @@ from scipy.optimize import brentq
 from apc.compiler.errors import ApcError
 from apc.simulation.blocks import blocks
 from apc.simulation.integrate import integrated
-from apc.simulation.methods import Method, parse_method
 from apc.simulation.propagate import nonlinear_rows
-from apc.simulation.settings import Settings
+from apc.simulation.settings import Method, Settings, parse_method
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
 from tests.sites import alone

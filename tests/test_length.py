@@ -1,4 +1,4 @@
-"""Claims about `apc.simulation.length`: how much a simulation will be is told before it is played."""
+"""Claims about `apc.simulation.simulation`: how much a simulation will be is told before it is played."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from fractions import Fraction
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.simulation.length import MOST_ROWS, check_length, size_note
 from apc.simulation.settings import Settings
-from apc.simulation.simulation import prepare
+from apc.simulation.simulation import MOST_ROWS, check_length, prepare, size_note
 from tests.topologies import AVERAGE, compiled
 
 SCENE = compiled(AVERAGE)

@@ -1,4 +1,4 @@
-"""Claims about `apc.network.listener`."""
+"""Claims about `apc.network.timetable`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Tick
 from apc.frame.scheduling import build_schedules
-from apc.network.channel_law import ChannelLaw
-from apc.network.listener import START, Listener
-from apc.network.packets import PacketSource
+from apc.network.channel import ChannelLaw, PacketSource
+from apc.network.timetable import START, Listener
 from tests.lossy import BURSTS, JITTER, RELIABLE, delays, recorded
 from tests.sites import MS, paper
 

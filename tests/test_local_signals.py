@@ -1,4 +1,4 @@
-"""Claims about `apc.simulation.local_signals`."""
+"""Claims about `apc.simulation.signals`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import casadi
 
 from apc.compiler.compiled import Kind
-from apc.simulation.local_signals import local_signals, sent_states, ticking_partitions
+from apc.simulation.signals import local_signals, sent_states, ticking_partitions
 from tests.scheduled import schedules
 from tests.sites import MS, paper
 

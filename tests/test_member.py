@@ -1,4 +1,4 @@
-"""Claims about `apc.simulation.member`."""
+"""Claims about `apc.simulation.program`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
-from apc.simulation.member import build_member
+from apc.simulation.program import build_member
 from apc.simulation.propagate import rates, transitions
 from apc.simulation.writing import build_program
 from tests.scheduled import schedules

@@ -1,4 +1,4 @@
-"""Claims about `apc.network.packets`."""
+"""Claims about `apc.network.channel`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from apc.network.packets import PacketSource
+from apc.network.channel import PacketSource
 from tests.lossy import BURSTS, RELIABLE, delays, recorded
 
 

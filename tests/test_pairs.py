@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.network.channel_law import channel_law
-from apc.network.packets import PacketSource
+from apc.network.channel import PacketSource, channel_law
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import simulate
 from tests.eventwise import MS, coast
 from tests.sites import edged, paper
-from tests.test_gathering import effective
+from tests.test_selection import effective
 from tests.topologies import MESH, compiled, replaced
 
 DURATION = Fraction(3, 10)

@@ -1,4 +1,4 @@
-"""`scales`: how large the states of a scene are."""
+"""`flow`: how large the states of a scene are."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
-from apc.simulation.scales import UNKNOWN, state_scales
+from apc.simulation.flow import UNKNOWN, state_scales
 from tests.topologies import ONE_MASS, compiled, replaced
 
 

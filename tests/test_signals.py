@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.simulation.local_signals import LocalSignal
-from apc.simulation.signals import choose, signals_of
+from apc.simulation.signals import LocalSignal, choose, signals_of
 from tests.sites import grouped, paper
 
 SYSTEM = grouped(paper(), ("left", 2, {}), ("right", 1, {}))

@@ -14,8 +14,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.modes import dense
 from apc.simulation.blocks import blocks
-from apc.simulation.methods import Method
-from apc.simulation.settings import Settings
+from apc.simulation.settings import Method, Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
 from tests.eventwise import MS, Play, User, experiment, play

@@ -1,4 +1,4 @@
-"""`stepping`: methods of a fixed step do what their tableau says, to the last, shorter step."""
+"""`flow`: methods of a fixed step do what their tableau says, to the last, shorter step."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.simulation.methods import Method, parse_method
-from apc.simulation.scales import integrals
-from apc.simulation.stepping import stepped
+from apc.simulation.flow import integrals, stepped
+from apc.simulation.settings import Method, parse_method
 from apc.simulation.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
 

@@ -19,9 +19,10 @@ import apc
 from apc.__main__ import run
 from apc.analysis.analysis import Analysis
 from apc.compiler.errors import ApcError
+from apc.processes import model_bytes
 from apc.sweeps import store as sweep_store
 from apc.sweeps.sweep import Sweep, sweep
-from apc.sweeps.work import Work, compute_part, model_bytes
+from apc.sweeps.work import Work, compute_part
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
 from tests.topologies import AVERAGE, ONE_MASS, compiled, told
 

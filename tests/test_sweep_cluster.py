@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from apc import processes
 from apc.compiler.errors import ApcError, Place
+from apc.processes import Patience
 from apc.sweeps import cluster as sweep_cluster
-from apc.sweeps import sweep as sweep_module
 from apc.sweeps import work as sweep_work
-from apc.sweeps.sweep import Patience, sweep
+from apc.sweeps.sweep import sweep
 from tests.sweeping import CHEAP, parts
 from tests.topologies import compiled, told
 
@@ -166,7 +167,7 @@ def test_an_address_that_wants_a_certificate_is_told() -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no process can be frozen here")
 def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweep_module, "SILENCE", 0.1)
+    monkeypatch.setattr(processes, "SILENCE", 0.1)
     heard: list[str] = []
     with distributed.LocalCluster(n_workers=1, processes=True, dashboard_address=":0") as frozen:
         (worker,) = (one.process.process.pid for one in frozen.workers.values())

@@ -11,10 +11,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
-from apc.network.channel_law import channel_law
-from apc.network.listener import Listener
-from apc.network.packets import PacketSource
-from apc.network.timetable import Timetable
+from apc.network.channel import PacketSource, channel_law
+from apc.network.timetable import Listener, Timetable, routes_of
 from tests.sites import MS
 from tests.topologies import AVERAGE, compiled, replaced
 
@@ -28,7 +26,9 @@ def system_of(more: str, *changes: tuple[str, str]) -> CompiledSystem:
 
 def timetable(system: CompiledSystem, *, seed: int = 0, run: int = 0, quantum: Fraction = MS) -> Timetable:
     timings = resolve(system).timings
-    return Timetable(system, timings, build_exchange(system, timings), quantum, seed=seed, run=run)
+    exchange = build_exchange(system, timings)
+    routes = routes_of(system, timings, exchange, 8 * MS)
+    return Timetable(system, timings, exchange, routes, quantum, seed=seed, run=run)
 
 
 def test_a_scene_of_reliable_links_has_no_timetable() -> None:
@@ -89,7 +89,8 @@ def test_clocks_and_graphs_and_delays_between_groups_are_kept() -> None:
         [0.5, 1, 1],
     )
     assert (slow.clock, slow.pairs.tolist()) == ("slow", [[0, 2]])
-    assert (fast.longest, slow.longest) == (0.02, 0.008)
+    assert (fast.longest, slow.longest) == (0.02, 0.02)
+    assert [(one.ticks, one.slots, one.frames) for one in (fast, slow)] == [(8, 1, 4), (4, 1, 4)]
     near, far = timetable(system).take(60)
     ticks = np.arange(60)
     assert near.packets[:, 0].tolist() == np.maximum((ticks - 8) // 8, -1).tolist()

@@ -10,9 +10,9 @@ import pytest
 
 from apc.analysis.analysis import lifted_groups
 from apc.frame.parameters import resolve
-from apc.simulation.local_signals import local_signals
 from apc.simulation.program import Program
 from apc.simulation.propagate import rates, transitions
+from apc.simulation.signals import local_signals
 from apc.simulation.writing import build_program
 from tests.scheduled import schedules
 from tests.sites import MS, paper

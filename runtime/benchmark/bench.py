@@ -37,9 +37,8 @@ from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.result import Result
 from apc.simulation.blocks import blocks
-from apc.simulation.methods import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method
-from apc.simulation.scales import state_scales
-from apc.simulation.settings import Settings
+from apc.simulation.flow import state_scales
+from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.threads import single_threaded
 

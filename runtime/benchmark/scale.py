@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import resource
 import sys
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
+from typing import TypeVar
 
 from apc.analysis.analysis import analyze
 from apc.benchmark.bench import reason_of
@@ -28,8 +27,10 @@ from apc.compiler.pipeline import stages_of
 from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import parse_source, read_source
 from apc.compiler.words import counted
+from apc.processes import Patience, local_processes, results
 from apc.result import Result
-from apc.threads import single_threaded
+
+Found = TypeVar("Found")
 
 REPEATS = 3  # of each analysis; its time is the median
 
@@ -90,14 +91,12 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
         raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, got))
     name, _ = _largest(path)
     rows, refused = [], []
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
-        floor = pool.submit(_memory).result()
-        for count in dict.fromkeys(counts):
-            found = pool.submit(_measure, path, count).result()
-            if isinstance(found, str):
-                refused.append((count, found))
-            else:
-                rows.append(found)
+    floor = _alone(_floor, path, 0)
+    for count in dict.fromkeys(counts):
+        try:
+            rows.append(_alone(_measure, path, count))
+        except ApcError as error:
+            refused.append((count, reason_of(error)))
     if not rows:
         count, reason = refused[0]
         what = f"leaves nothing to measure: {counted(count, 'peer')} of {name}: {reason}"
@@ -139,16 +138,20 @@ def _largest(path: Path) -> tuple[str, Scalar]:
     return name, number
 
 
-def _measure(path: Path, count: int) -> ScaleRow | str:
+def _alone(measure: Callable[[Path, int], Found], path: Path, count: int) -> Found:
+    """Measure in a process of its own."""
+    place = Place("--scale")
+    what = "the process that measured it ended without a word: stopped from outside, or out of memory"
+    with local_processes(measure, path, 1, Mistake("E921", place, what)) as workers:
+        return next(results(workers, [count], Patience(), place))
+
+
+def _measure(path: Path, count: int) -> ScaleRow:
     """Compile and analyse, in this process."""
-    try:
-        with single_threaded():
-            compiled, system = timed(partial(with_count, path, count))
-            analyzed, found = median_time(partial(analyze, system), REPEATS)
-            memory = _memory()
-            truth = spectral_truth(system)
-    except ApcError as error:
-        return reason_of(error)
+    compiled, system = timed(partial(with_count, path, count))
+    analyzed, found = median_time(partial(analyze, system), REPEATS)
+    memory = _memory()
+    truth = spectral_truth(system)
     off = None
     if isinstance(truth, Truth):
         off = float(abs(Fraction(truth.digits) - Fraction(found.spectral_radius)))
@@ -163,6 +166,10 @@ def _measure(path: Path, count: int) -> ScaleRow | str:
         method=found.method,
         verdict=found.verdict,
     )
+
+
+def _floor(_path: Path, _count: int) -> int:
+    return _memory()
 
 
 def _memory() -> int:

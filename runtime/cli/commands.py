@@ -23,7 +23,7 @@ from apc.cli.region import region_command
 from apc.cli.simulate import simulate_command
 from apc.cli.sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import write_text
+from apc.compiler.files import unwritable, write_text
 from apc.compiler.words import counted
 from apc.suffixes import check_suffix
 from apc.threads import start_single_threaded
@@ -112,7 +112,7 @@ def new(name: str) -> None:
             )
         ) from None
     except OSError as error:
-        raise ApcError(Mistake("E601", Place(str(path)), f"can't be written: {error.strerror}")) from None
+        raise unwritable(path, error) from None
     tell(f"{path} is written. Next: apc compile {path}")
 
 

@@ -121,9 +121,8 @@ def simulate_command(
         apc simulate --method semi-implicit:1ms --error
     """
     from apc.inputs import open_scene
-    from apc.simulation.length import check_length
-    from apc.simulation.methods import DEFAULT, parse_method
-    from apc.simulation.settings import Settings
+    from apc.simulation.settings import DEFAULT, Settings, parse_method
+    from apc.simulation.simulation import check_length
     from apc.simulation.trajectory import duration_of, parse_duration
 
     if runs is not None and (signals or out or plot or error):
@@ -231,7 +230,7 @@ def _play_into(
     What was done is in the file even if the run can't go on.
     """
     from apc.present.recording import SUFFIXES, open_recording
-    from apc.simulation.length import size_note
+    from apc.simulation.simulation import size_note
     from apc.simulation.trajectory import play
 
     recording = open_recording(out, simulation) if out is not None else None

@@ -86,7 +86,8 @@ def sweep_command(
     changes, with its error).
     """
     from apc.inputs import open_scene
-    from apc.sweeps.sweep import Patience, sweep
+    from apc.processes import Patience
+    from apc.sweeps.sweep import sweep
     from apc.tables import check_table_path
 
     check_table_path(out, "--out")

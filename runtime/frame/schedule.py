@@ -1,7 +1,8 @@
 """What one frame of a peer is made of: its events in their order, and what is remembered between frames.
 
 Takes: what `scheduling` found out.
-Gives: `Schedule` and its events, `Event`; the names of what is computed, sent and heard; `ORDER`.
+Gives: `Schedule` and its events, `Event`; the names of what is computed, sent and heard; `shifted`,
+`remembered`; `ORDER`.
 Guarantees: exact time (integers of one quantum).
 Does not: find out what happens when (see `scheduling`).
 
@@ -11,6 +12,7 @@ tick `index`, counted from the frame's first tick of that clock; a negative inde
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -25,6 +27,25 @@ class Value:
     partition: int
     output: int
     index: int
+
+
+def shifted(value: Value, ticks: Sequence[int]) -> Value:
+    """Return the value that is called `value` one frame on; `ticks` are of a frame, by clock partition."""
+    return Value(value.partition, value.output, value.index + ticks[value.partition])
+
+
+def remembered(values: Iterable[Value], ticks: Sequence[int]) -> tuple[Value, ...]:
+    """Return those of some values that are of earlier frames, and what they were called until they came.
+
+    A value read at index −j is, one frame before, the value of index n − j; if that is negative too, it is
+    remembered as well.
+    """
+    found: set[Value] = set()
+    for value in values:
+        while value.index < 0:
+            found.add(value)
+            value = shifted(value, ticks)
+    return tuple(sorted(found))
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -54,27 +75,25 @@ class Way:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Heard:
-    """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame).
-
-    On a way that loses or delays packets, each tick has a row of its own: tick `tick` of `clock` hears
-    whichever packets of the channel it does, and `sent` and `lag` say nothing more. With `gap` the row is not
-    what it hears but the weight of what it misses.
-    """
+    """What a site hears on `way`: the other peers' `sent`, of `lag` frames ago (0: this frame)."""
 
     way: Way
     sent: Sent
     lag: int
-    clock: str = ""
-    tick: int = -1
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Selected:
+    """What tick `tick` of `clock` hears of a channel on a way that loses or delays packets: one that is kept.
+
+    With `gap` it is not what is heard but the weight of what is missed.
+    """
+
+    way: Way
+    channel: str
+    clock: str
+    tick: int
     gap: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Kept:
-    """An unreliable link: its packets are kept for `frames` frames; with `gaps`, what is missing counts."""
-
-    frames: int
-    gaps: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +137,9 @@ class Schedule:
 
     `acting` is what each hold puts out as the frame begins (None for a hold nobody reads); `carried` are the
     values of earlier frames that this one needs, the remembered part of z after the continuous states;
-    `heard` names r; `sent` names s and `depths` says how many frames each row of s must be kept; `ticks`
-    counts a clock partition's ticks in a frame; `marks` are the instants, in quanta, of the fastest clock's
-    ticks and the end.
+    `heard` names r, and `selected` goes on where packets get lost or come late; `sent` names s and `depths`
+    says how many frames each row of s must be kept; `ticks` counts a clock partition's ticks in a frame;
+    `marks` are the instants, in quanta, of the fastest clock's ticks and the end.
     """
 
     quantum: Fraction
@@ -136,11 +155,17 @@ class Schedule:
     value_names: tuple[str, ...]
     sent_names: tuple[str, ...]
     sent_times: tuple[int, ...]  # in quanta from the frame's start
+    selected: tuple[Selected, ...] = ()
 
     @property
     def frame_s(self) -> Fraction:
         """The length of the frame in seconds."""
         return self.frame * self.quantum
+
+    @property
+    def received(self) -> tuple[Heard | Selected, ...]:
+        """All that is received, by the rows of r."""
+        return self.heard + self.selected
 
     def ways(self, partition: int, receive: int) -> tuple[tuple[Way, str], ...]:
         """Return the ways and channels a receive of a clock partition hears, whatever the tick."""

@@ -26,14 +26,15 @@ from apc.frame.schedule import (
     Act,
     Event,
     Heard,
-    Kept,
     Propagate,
     Schedule,
+    Selected,
     Send,
     Sent,
     Tick,
     Value,
     Way,
+    remembered,
 )
 from apc.frame.site import LinearSite
 
@@ -45,6 +46,8 @@ MOST_HELD = (
 # What happens when: the instant, the rank of its like among what happens at once, and itself; None only stops
 # the propagation there.
 _Happening = tuple[int, int, Event | None]
+# What each receive of a clock partition hears at each of its ticks, by (partition, tick).
+_Rows = dict[tuple[int, int], tuple[tuple[Heard | Selected, ...], ...]]
 
 
 def build_schedules(
@@ -53,7 +56,7 @@ def build_schedules(
     patterns: Sequence[LinearSite],
     *,
     order: Sequence[str] = ORDER,
-    kept: Mapping[str, Kept] | None = None,
+    kept: Mapping[str, int] | None = None,
 ) -> tuple[Schedule, ...]:
     """Build the schedule of every group, over the frame they share; equal ones are one object.
 
@@ -70,8 +73,8 @@ def build_schedules(
         at once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and
         "tick" before "deliver" for a packet that arrives exactly at a tick.
     kept
-        The links whose packets get lost or come late, by name: all that is sent over them is kept, and each
-        tick hears it in rows of its own. None: every link is as reliable as its delay says.
+        For how many frames the packets are kept of each link that loses or delays them, by name: each tick
+        selects of them, in rows of its own. None: every link is as reliable as its delay says.
 
     Raises
     ------
@@ -88,17 +91,17 @@ def build_schedules(
     times = times_in_use(system, timings, patterns, live, hearing)
 
     _check_held(system, patterns, live, times)
-    known: dict[tuple[int, Hearing], dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]] = {}
+    known: dict[tuple[int, Hearing], _Rows] = {}
     depth: dict[Sent, int] = {}
     for group, own in zip(system.groups, hearing, strict=True):
         if (group.kind, own) not in known:
             heard = _heard_at_ticks(patterns[group.kind], exchange, live[group.kind], own, times, rank, kept)
             known[group.kind, own] = heard
             for one in (one for row in heard.values() for receive in row for one in receive):
-                link = one.sent.link
-                if link in kept:
+                if isinstance(one, Selected):
+                    link = one.way.link
                     slots = times.frame // times.clocks[exchange.links[link].clock].period
-                    depth |= {Sent(link, one.sent.channel, k): kept[link].frames for k in range(slots)}
+                    depth |= {Sent(link, one.channel, k): kept[link] for k in range(slots)}
                 else:
                     depth[one.sent] = max(depth.get(one.sent, 0), one.lag)
     _check_depth(system, depth)
@@ -160,17 +163,19 @@ def _heard_at_ticks(
     hearing: Hearing,
     times: Times,
     rank: Mapping[str, int],
-    kept: Mapping[str, Kept],
-) -> dict[tuple[int, int], tuple[tuple[Heard, ...], ...]]:
+    kept: Mapping[str, int],
+) -> _Rows:
     """Return, for every (partition, tick) of the frame, what each receive of the partition hears."""
-    heard: dict[tuple[int, int], tuple[tuple[Heard, ...], ...]] = {}
+    heard: _Rows = {}
 
-    def rows(way: Way, channel: str, clock: str, index: int) -> tuple[Heard, ...]:
+    def rows(way: Way, channel: str, clock: str, index: int) -> tuple[Heard | Selected, ...]:
         if way.link not in kept:
             instant = times.clocks[clock].at(index)
             return (_newest(way, channel, exchange.links[way.link], instant, times, rank),)
-        row = Heard(way, Sent(way.link, channel, 0), 0, clock, index)
-        return (row, replace(row, gap=True)) if kept[way.link].gaps else (row,)
+        row = Selected(way, channel, clock, index)
+        law = exchange.links[way.link].channel
+        assert law is not None, f"{way.link} is reliable"
+        return (row, replace(row, gap=True)) if law.on_loss == "zero" else (row,)
 
     for p in sorted({partition for partition, _ in live}):
         clock = pattern.kind.clocks[p].clock
@@ -195,7 +200,7 @@ def _build(
     pattern: LinearSite,
     system: CompiledSystem,
     live: frozenset[tuple[int, int]],
-    heard_at: Mapping[tuple[int, int], tuple[tuple[Heard, ...], ...]],
+    heard_at: _Rows,
     depth: Mapping[Sent, int],
     times: Times,
     rank: Mapping[str, int],
@@ -203,14 +208,16 @@ def _build(
     """Build one schedule, once it is known what the whole system hears."""
     kind = pattern.kind
     grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
-    heard = tuple(sorted({one for row in heard_at.values() for receive in row for one in receive}))
+    every = {one for row in heard_at.values() for receive in row for one in receive}
+    heard = tuple(sorted(one for one in every if isinstance(one, Heard)))
+    selected = tuple(sorted(one for one in every if isinstance(one, Selected)))
     channels = {sending.link: sending.channels for sending in kind.sends}
     sent = tuple(sorted(one for one in depth if one.channel in channels.get(one.link, ())))
     acting, switches = _switches(pattern, live, times, rank)
     marks = _marks(times)
     events = _in_order(
         [
-            *_computations(pattern, heard_at, heard, times, rank["tick"]),
+            *_computations(pattern, heard_at, heard + selected, times, rank["tick"]),
             *_sendings(pattern, grid_of, sent, times.frame, rank["send"]),
             *switches,
             *((mark, 0, None) for mark in marks),  # so that propagation stops there
@@ -235,6 +242,7 @@ def _build(
         value_names=tuple(_value_name(pattern, value, times) for value in carried),
         sent_names=tuple(f"{one.channel} sent" for one in sent),
         sent_times=tuple(_slot_time(one, grid_of) for one in sent),
+        selected=selected,
     )
 
 
@@ -260,13 +268,13 @@ def _in_order(happenings: Sequence[_Happening]) -> tuple[Event, ...]:
 
 def _computations(
     pattern: LinearSite,
-    heard_at: Mapping[tuple[int, int], tuple[tuple[Heard, ...], ...]],
-    heard: Sequence[Heard],
+    heard_at: _Rows,
+    received: Sequence[Heard | Selected],
     times: Times,
     rank: int,
 ) -> Iterator[_Happening]:
-    """Yield when a site's clocks tick in a frame, and the rows of `heard` that each receive adds up."""
-    place_of = {one: index for index, one in enumerate(heard)}
+    """Yield when a site's clocks tick in a frame, and the rows of r that each receive adds up."""
+    place_of = {one: index for index, one in enumerate(received)}
     for (p, index), row in heard_at.items():
         places = tuple(tuple(place_of[one] for one in receive) for receive in row)
         yield times.clocks[pattern.kind.clocks[p].clock].at(index), rank, Tick(p, index, places)
@@ -325,21 +333,17 @@ def _carried(
     acting: Sequence[Value | None],
     ticks: Sequence[int],
 ) -> tuple[Value, ...]:
-    """Return the values of earlier frames that this frame reads, and those still to be read later.
-
-    A value read at index -j is, one frame on, the value of index n - j; if that is negative too, it is
-    carried as well.
-    """
+    """Return the values of earlier frames that this frame reads, and those still to be read later."""
     kind = pattern.kind
     now = list(acting)
     demanded: set[Value] = set()
     felt = np.flatnonzero(pattern.b.any(axis=0)).tolist()
     sent = [[channel.nonzero()[0].tolist() for channel in send.u] for send in pattern.sends]
-    computed, remembered = [], []
+    computed, recalled = [], []
     for partition, tick in enumerate(pattern.ticks):
         outputs = sorted(o for p, o in live if p == partition)
         computed.append(np.flatnonzero(tick.u[outputs].any(axis=0)).tolist())
-        remembered.append(np.flatnonzero(tick.m[outputs].any(axis=0)).tolist())
+        recalled.append(np.flatnonzero(tick.m[outputs].any(axis=0)).tolist())
 
     def read(row: Iterable[int]) -> None:
         demanded.update(value for h in row if (value := now[h]) is not None)
@@ -356,13 +360,8 @@ def _carried(
             case Tick(partition, index, _):
                 read(computed[partition])
                 memories = kind.clocks[partition].memories
-                demanded.update(Value(partition, memories[m], index - 1) for m in remembered[partition])
-    carried: set[Value] = set()
-    for value in demanded:
-        while value.index < 0:
-            carried.add(value)
-            value = Value(value.partition, value.output, value.index + ticks[value.partition])
-    return tuple(sorted(carried))
+                demanded.update(Value(partition, memories[m], index - 1) for m in recalled[partition])
+    return remembered(demanded, ticks)
 
 
 def _value_name(pattern: LinearSite, value: Value, times: Times) -> str:

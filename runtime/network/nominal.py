@@ -13,7 +13,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.names import Free, unit_of
 from apc.frame.parameters import scope_of
-from apc.network.channel_law import channel_law
+from apc.network.channel import channel_law
 
 NOT_LINEAR = "left out: the scene is not linear, and this holds near its start values only"
 

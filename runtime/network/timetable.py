@@ -1,26 +1,28 @@
 """Every packet of a scene's unreliable links: which of them each tick sees, on each way from peer to peer.
 
-Takes: a `CompiledSystem` with its numbers, who hears whom, the quantum of its schedules, a seed.
-Gives: `Route`, `routes_of`; `Timetable`.
-Guarantees: a way is heard alike by all clocks of a receiver; what is remembered does not grow with time.
+Takes: a `CompiledSystem` with its numbers, who hears whom, the frame and the quantum of its schedules, a
+seed.
+Gives: `Route`, `routes_of`; `Timetable`, `Listener`, `Seen`, `START`.
+Guarantees: without loss and jitter a tick sees the packet that `scheduling` says; a way is heard alike by all
+clocks of a receiver; it does not matter how time is cut into pieces; what is remembered does not grow with
+time.
 Does not: carry values: reliable links are not in it, and cost nothing here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
+from apc.compiler.compiled import CompiledSystem, Kind, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange
-from apc.network.channel_law import channel_law
-from apc.network.listener import Listener, Seen
-from apc.network.packets import PacketSource
+from apc.network.channel import PacketSource, channel_law
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -29,24 +31,138 @@ Flags = NDArray[np.bool_]
 # Ways from peer to peer: each has a random stream of its own, 2 KiB, and takes 0.1 ms a second at 1 kHz.
 MOST_WAYS = 100_000
 
+START = -1  # the "packet" before the first: the sender's start values
+
+# Arrivals are told apart down to this part of a quantum; everything that happens at ticks happens at whole
+# quanta. A delay of some whole quanta, written as a float of seconds, is then that number exactly.
+FINENESS = 2**20
+# No delay is longer than so many quanta: beyond, a packet counts as lost (and integers would overflow).
+LONGEST = 2**40
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Route:
     """What is heard over one unreliable link at the ticks of one clock.
 
-    The clock's `period` and the `spacing` of packets are in seconds. `pairs` (M, 2) are the peers (sender,
-    receiver), counted from 0, `weights` (M,) the graph's; `longest` is the longest time in seconds from a
-    packet's sample to its arrival; `zero` says that the receiver's own value stands in for a missing one.
+    `pairs` (M, 2) are the peers (sender, receiver), counted from 0, `weights` (M,) the graph's; `longest` is
+    the link's longest time in seconds from a packet's sample to its arrival. A frame has so many `ticks` of
+    the clock and `slots` of the link's; packets are kept for so many `frames`. `zero` says that the
+    receiver's own value stands in for a missing one.
     """
 
     link: str
     clock: str
-    period: Fraction
-    spacing: Fraction
     pairs: Integers
     weights: Floats
     longest: float
+    ticks: int
+    slots: int
+    frames: int
     zero: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What ticks see on M ways.
+
+    `packets` (ticks, M) are the numbers of the packets in effect, counted from 0, `START` for the start
+    values. `missing` (ticks, M) says where a packet is known to be missing: from the tick at which a lost
+    packet should have been there, had it taken its nominal delay, until a packet that was sent after it is in
+    effect.
+    """
+
+    packets: Integers
+    missing: Flags
+
+
+class Listener:
+    """What the receivers of some ways hear, tick by tick; time only goes forward."""
+
+    def __init__(
+        self, source: PacketSource, *, phase: int, period: int, delay: int, quantum: Fraction, newest: bool
+    ) -> None:
+        """Start before the first packet.
+
+        Parameters
+        ----------
+        source
+            The packets.
+        phase, period
+            Packet k of every way is sent at phase + k*period, in quanta.
+        delay
+            The nominal delay in quanta.
+        quantum
+            Seconds a quantum; all ticks are at whole ones.
+        newest
+            Whether the packet sent last is in effect, or else the one that arrived last (of several that
+            arrive at once, the one sent last).
+        """
+        self.source = source
+        self.phase = phase
+        self.period = period
+        self.delay = delay
+        self.quantum = float(quantum)
+        self.newest = newest
+        self._effective = np.full(source.ways, START, np.int64)
+        self._gap = np.full(source.ways, START, np.int64)  # the newest lost packets that should be there
+        # Lost packets that should be there later: their ways and numbers.
+        self._due = np.zeros((2, 0), np.int64)
+        # On their way: ways, numbers, whole quanta from which they are seen, how much before they arrive.
+        self._under_way = np.zeros((4, 0), np.int64)
+
+    @property
+    def remembered(self) -> int:
+        """How many packets may yet come in effect, or be found missing, on all ways."""
+        return self._under_way.shape[1] + self._due.shape[1]
+
+    def hear(self, ticks: Integers) -> Seen:
+        """Return what the ticks (n,) see, in quanta, rising, all after those heard before."""
+        if not len(ticks):
+            nothing = (0, self.source.ways)
+            return Seen(np.zeros(nothing, np.int64), np.zeros(nothing, np.bool_))
+        self._send_until(int(ticks[-1]))
+        ways, numbers, seen, _ = self._under_way
+        arrived = seen <= ticks[-1]
+        packets = self._in_effect(ticks, self._under_way[:, arrived])
+        missing = self._gaps(ticks) > packets
+        self._effective = packets[-1].copy()
+        keep = ~arrived & (numbers > self._effective[ways]) if self.newest else ~arrived
+        self._under_way = self._under_way[:, keep]
+        return Seen(packets, missing)
+
+    def _send_until(self, tick: int) -> None:
+        """Send the packets up to a time; what is sent later can't have arrived."""
+        first = self.source.taken
+        count = max((tick - self.phase) // self.period + 1 - first, 0)
+        delays = self.source.take(count) / self.quantum
+        lost = ~(delays < LONGEST)
+        fine = np.rint(np.where(lost, 0.0, delays) * FINENESS).astype(np.int64)
+        ways, numbers = np.indices(delays.shape)
+        numbers += first
+        seen = self.phase + self.period * numbers - (-fine // FINENESS)
+        before = -fine % FINENESS
+        sent = np.stack([ways, numbers, seen, before])
+        self._due = np.concatenate([self._due, sent[:2, lost]], axis=1)
+        self._under_way = np.concatenate([self._under_way, sent[:, ~lost]], axis=1)
+
+    def _in_effect(self, ticks: Integers, arrived: Integers) -> Integers:
+        """Return the packets (n, M) sent last, or arrived last, of those that have arrived."""
+        ways, numbers, seen, before = arrived
+        if self.newest:
+            return _highest(ticks, ways, seen, numbers, self._effective)
+        order = np.lexsort((numbers, -before, seen))
+        rank = np.arange(len(order))
+        latest = _highest(ticks, ways[order], seen[order], rank, np.full(self.source.ways, -1))
+        return np.where(latest < 0, self._effective, np.append(numbers[order], START)[latest])
+
+    def _gaps(self, ticks: Integers) -> Integers:
+        """Return the newest lost packets (n, M) that should be there."""
+        ways, numbers = self._due
+        when = self.phase + self.period * numbers + self.delay
+        due = when <= ticks[-1]
+        gaps = _highest(ticks, ways[due], when[due], numbers[due], self._gap)
+        self._due, self._gap = self._due[:, ~due], gaps[-1].copy()
+        return gaps
 
 
 class Timetable:
@@ -57,6 +173,7 @@ class Timetable:
         system: CompiledSystem,
         timings: Mapping[str, Fraction],
         exchange: Exchange,
+        routes: Sequence[Route],
         quantum: Fraction,
         *,
         seed: int = 0,
@@ -70,17 +187,12 @@ class Timetable:
             The compiled scene, with the numbers to use (see `overrides.apply`).
         timings
             Seconds by the name of the timing.
-        exchange
-            Who hears whom.
+        exchange, routes
+            Who hears whom, and over which unreliable links (see `routes_of`).
         quantum
             The time in seconds of which every period, phase and delay in use is a whole multiple.
         seed, run
             The experiment's seed, and which run of it this is.
-
-        Raises
-        ------
-        ApcError
-            E891 a group sets a number of a link for itself; E892 too many ways from peer to peer.
         """
         self._system, self._timings, self._exchange = system, timings, exchange
         self._quantum, self._seed, self._run = quantum, seed, run
@@ -91,7 +203,7 @@ class Timetable:
             )
             for clock in system.clocks
         }
-        self.routes = routes_of(system, timings, exchange)
+        self.routes = tuple(routes)
         self._listeners = [self._listen(route) for route in self.routes]
         self._now = 0
 
@@ -143,7 +255,7 @@ class Timetable:
 
 
 def routes_of(
-    system: CompiledSystem, timings: Mapping[str, Fraction], exchange: Exchange
+    system: CompiledSystem, timings: Mapping[str, Fraction], exchange: Exchange, frame_s: Fraction
 ) -> tuple[Route, ...]:
     """Return what is heard over unreliable links: a route for each of them and each clock that hears it.
 
@@ -151,47 +263,63 @@ def routes_of(
     ----------
     system, timings, exchange
         As `Timetable` has them.
+    frame_s
+        The length of a frame in seconds.
 
     Raises
     ------
     ApcError
-        As `Timetable`.
+        E891 a group sets a number of a link for itself; E892 too many ways from peer to peer.
     """
     unreliable = [link for link in system.links if link.channel is not None]
-    found = [_route(system, timings, exchange, link, clock) for link in unreliable for clock in system.clocks]
-    return tuple(route for route in found if len(route.pairs))
+    found = [_routes_over(system, timings, exchange, frame_s, link) for link in unreliable]
+    return tuple(route for routes in found for route in routes)
 
 
-def _route(
-    system: CompiledSystem, timings: Mapping[str, Fraction], exchange: Exchange, link: Link, clock: Clock
-) -> Route:
-    """Return the ways over a link whose receivers hear it at the ticks of a clock."""
-    peers = exchange.peers
+def _routes_over(
+    system: CompiledSystem,
+    timings: Mapping[str, Fraction],
+    exchange: Exchange,
+    frame_s: Fraction,
+    link: Link,
+) -> list[Route]:
+    """Return a link's routes: the ways whose receivers hear it at the ticks of each clock."""
+    peers, channel = exchange.peers, link.channel
+    assert channel is not None, f"{link.name} is reliable"
     if link.graph.shape == "complete" and peers * (peers - 1) > MOST_WAYS:
         what = (
             f"{link.name} is unreliable, and {peers} peers that all hear each other are "
             f"{peers * (peers - 1)} ways with packets of their own; at most {MOST_WAYS} can be followed"
         )
         raise ApcError(Mistake("E892", Place(system.name), what, hint="graph: ring"))
-    sends = np.array([any(one.link == link.name for one in kind.sends) for kind in system.kinds])
-    hears = np.array([_hears(kind, link.name, clock.name) for kind in system.kinds])
     kind_of = np.repeat([group.kind for group in system.groups], np.diff(exchange.starts))
     pairs, weights = exchange.arcs(link.name)
-    used = sends[kind_of[pairs[:, 0]]] & hears[kind_of[pairs[:, 1]]]
-    pairs = pairs[used]
-    delays = {timings[exchange.delay(link.name, *pair)] for pair in set(_groups(exchange, pairs))}
+    sends = np.array([any(one.link == link.name for one in kind.sends) for kind in system.kinds])
+    used = {}
+    for clock in system.clocks:
+        hears = np.array([_hears(kind, link.name, clock.name) for kind in system.kinds])
+        ways = sends[kind_of[pairs[:, 0]]] & hears[kind_of[pairs[:, 1]]]
+        if ways.any():
+            used[clock.name] = pairs[ways], weights[ways]
+    groups = {pair for some, _ in used.values() for pair in _groups(exchange, some)}
+    delays = {timings[exchange.delay(link.name, *pair)] for pair in groups}
+    longest = max((channel_law(system, link, delay).longest for delay in delays), default=0.0)
     periods = {one.name: timings[one.period] for one in system.clocks}
-    assert link.channel is not None
-    return Route(
-        link=link.name,
-        clock=clock.name,
-        period=periods[clock.name],
-        spacing=periods[link.clock],
-        pairs=pairs,
-        weights=weights[used],
-        longest=max((channel_law(system, link, delay).longest for delay in delays), default=0.0),
-        zero=link.channel.on_loss == "zero",
-    )
+    return [
+        Route(
+            link=link.name,
+            clock=clock,
+            pairs=some,
+            weights=own,
+            longest=longest,
+            ticks=int(frame_s / periods[clock]),
+            slots=int(frame_s / periods[link.clock]),
+            # A packet is first heard at most one tick after it arrives, and a clock ticks in every frame.
+            frames=math.ceil(longest / float(frame_s)) + 1,
+            zero=channel.on_loss == "zero",
+        )
+        for clock, (some, own) in used.items()
+    ]
 
 
 def _hears(kind: Kind, link: str, clock: str) -> bool:
@@ -203,3 +331,21 @@ def _groups(exchange: Exchange, pairs: Integers) -> list[tuple[int, int]]:
     """Return the groups of each pair of peers."""
     groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
     return [(int(sender), int(receiver)) for sender, receiver in groups]
+
+
+def _highest(ticks: Integers, ways: Integers, when: Integers, ranks: Integers, first: Integers) -> Integers:
+    """Return, for each tick and way, the highest rank of what has happened by then.
+
+    Parameters
+    ----------
+    ticks
+        The ticks (n,), rising.
+    ways, when, ranks
+        What happened (K,): on which of the M ways, when (no later than the last tick), of what rank.
+    first
+        The ranks (M,) at the beginning.
+    """
+    found = np.full((len(ticks), len(first)), START, np.int64)
+    found[0] = first
+    np.maximum.at(found.reshape(-1), np.searchsorted(ticks, when) * len(first) + ways, ranks)
+    return np.maximum.accumulate(found, axis=0)

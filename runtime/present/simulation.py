@@ -22,7 +22,7 @@ from apc.compiler.words import counted, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text
 from apc.present.pictures import check_format, write_figure
-from apc.simulation.methods import EXACT
+from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate

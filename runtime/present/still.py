@@ -27,7 +27,7 @@ from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.optional import need
 from apc.present.pictures import check_format, write_figure
-from apc.simulation.local_signals import sent_states
+from apc.simulation.signals import sent_states
 
 Floats = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.simulation.blocks import Block, blocks
-from apc.simulation.methods import finer
+from apc.simulation.settings import finer
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, prepare
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
-from apc.network.gathering import Arrivals
 from apc.network.timetable import Timetable
 from apc.simulation.forcing import impulses
+from apc.simulation.selection import Arrivals
 from apc.simulation.simulation import Simulation
 
 Floats = NDArray[np.float64]
@@ -93,13 +93,14 @@ def _unsolved(simulation: Simulation, frame: int) -> ApcError:
 
 def _arrivals(simulation: Simulation, run: int) -> Arrivals | None:
     """Return what chance says of the packets of a run; None if all links are reliable."""
-    if not simulation.gates:
+    if not simulation.routes:
         return None
     system, seed = simulation.system, simulation.seed
     timings = resolve(system).timings
     exchange = build_exchange(system, timings)
-    table = Timetable(system, timings, exchange, simulation.quantum, seed=seed, run=run)
-    return Arrivals(simulation.gates, table, simulation.frame)
+    routes, quantum = simulation.routes, simulation.quantum
+    table = Timetable(system, timings, exchange, routes, quantum, seed=seed, run=run)
+    return Arrivals(table, simulation.population.members, simulation.frame)
 
 
 class _Runner:
@@ -189,8 +190,8 @@ class _Runner:
             rows = found.reshape(len(forces), length, -1).transpose(1, 0, 2)
             self.inputs[len(self.state) + g][:] = rows.reshape(-1)
         if self.arrivals is not None:
-            first_gate = len(self.state) + len(members)
-            for place, rows in enumerate(self.arrivals.take(length), first_gate):
+            first_route = len(self.state) + len(members)
+            for place, rows in enumerate(self.arrivals.take(length), first_route):
                 self.inputs[place][:] = rows
         self.inputs[-1][:] = numbers
 

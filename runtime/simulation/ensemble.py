@@ -10,29 +10,31 @@ Does not: keep rows: to see run k, play it alone.
 from __future__ import annotations
 
 import math
-import multiprocessing
-import signal
-import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
-from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.processes import (
+    Patience,
+    Workers,
+    local_processes,
+    model_bytes,
+    model_of_bytes,
+    results,
+    this_process,
+)
 from apc.result import Result
 from apc.simulation.blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.summary import Watch
-from apc.threads import single_threaded
 
 QUANTILES = (0.05, 0.5, 0.95)
 SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
@@ -137,14 +139,15 @@ def play_many(
     seed = system.experiment.seed if settings.seed is None else settings.seed
     settings = replace(settings, seed=seed)
     parts = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
+    place = Place(system.name)
     done: list[Run] = []
     interrupted = False
-    work = _here(system, settings, parts) if jobs == 1 else _shared(system, settings, parts, jobs)
     try:
-        for found in work:
-            done += found
-            if progress is not None:
-                progress(len(done))
+        with _workers(system, settings, min(jobs, len(parts)), place) as workers:
+            for found in results(workers, parts, Patience(), place):
+                done += found
+                if progress is not None:
+                    progress(len(done))
     except KeyboardInterrupt:
         if not done:
             raise
@@ -153,46 +156,28 @@ def play_many(
     return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted)
 
 
-def _here(system: CompiledSystem, settings: Settings, parts: Sequence[range]) -> Iterator[list[Run]]:
-    simulation = prepare(system, settings)
-    for part in parts:
-        yield [_played(simulation, number) for number in part]
+def _workers(
+    system: CompiledSystem, settings: Settings, jobs: int, place: Place
+) -> AbstractContextManager[Workers[range, list[Run]]]:
+    """Return who plays: this process, or some that are started afresh."""
+    if jobs == 1:
+        return nullcontext(this_process(_runs, prepare(system, settings)))
+    what = "a process that played runs ended without a word: stopped from outside, or out of memory"
+    lost = Mistake("E895", place, what, hint="--jobs 1")
+    return local_processes(_part, (model_bytes(system), settings), jobs, lost)
 
 
-def _shared(
-    system: CompiledSystem, settings: Settings, parts: Sequence[range], jobs: int
-) -> Iterator[list[Run]]:
-    """Yield the runs as processes, each started afresh, get them done."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.apc"
-        store.save(system, path)
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(jobs, len(parts)), context, _ignore_interrupts)
-        try:
-            waiting = [pool.submit(_part, str(path), settings, part) for part in parts]
-            for future in as_completed(waiting):
-                yield future.result()
-        except BrokenProcessPool:
-            what = "a process that played runs ended without a word: stopped from outside, or out of memory"
-            raise ApcError(Mistake("E895", Place(system.name), what, hint="--jobs 1")) from None
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+def _runs(simulation: Simulation, part: range) -> list[Run]:
+    return [_played(simulation, number) for number in part]
 
 
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C to the process that shares out the work."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _part(path: str, settings: Settings, part: range) -> list[Run]:
-    with single_threaded():
-        simulation = _opened(path, settings)
-        return [_played(simulation, number) for number in part]
+def _part(shared: tuple[bytes, Settings], part: range) -> list[Run]:
+    return _runs(_opened(*shared), part)
 
 
 @lru_cache(maxsize=1)
-def _opened(path: str, settings: Settings) -> Simulation:
-    return prepare(store.load(Path(path)), settings)
+def _opened(model: bytes, settings: Settings) -> Simulation:
+    return prepare(model_of_bytes(model), settings)
 
 
 def _played(simulation: Simulation, number: int) -> Run:

@@ -1,14 +1,29 @@
 """The continuous states of a kind that are moved by a numerical method, and the function that moves them.
 
-Takes: a `Kind`, a `Method`, the scales of its states. Gives: `Flow`, `Tolerance`, `flow_of`.
+Takes: a `Kind`, a `Method`; for scales, the scene's numbers.
+Gives: `Flow`, `Tolerance`, `flow_of`, `rows_to_move`; `stepped`, methods of a fixed step; `state_scales`,
+`integrals`.
 Guarantees: only the states that no chain of equations ties to what is not linear keep their exact transition,
-unless the method is for all.
-Does not: move anything by exact transitions (see `propagate`).
+unless the method is for all. Whole steps, then one shorter one to the end, which cost no more code however
+many they are. Scales are positive numbers in SI, the same for all peers of a kind.
+Does not: move anything by exact transitions (see `propagate`), or know how large its error is (see
+`accuracy`).
+
+    rk4             k₁ = f(t, x), k₂ = f(t + h/2, x + h k₁/2), k₃ = f(t + h/2, x + h k₂/2),
+                    k₄ = f(t + h, x + h k₃);  x(t + h) = x + h (k₁ + 2 k₂ + 2 k₃ + k₄)/6
+    semi-implicit   v(t + h) = v + h f_v(t, x, v), then x(t + h) = x + h f_x(v(t + h))
+
+(Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, table II.1.2; Hairer, Lubich and
+Wanner, Geometric Numerical Integration, section I.1.2.)
+
+A state's scale, which its tolerance is a part of, is the largest magnitude of the scene's numbers in its unit
+(start values, widths, places). A state that is another's rate of change is moreover at least √(2 a L), the
+speed reached over that one's scale L at its first rate of change a, and at least L a second.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -17,14 +32,18 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Kind
+from apc.compiler.compiled import CompiledSystem, Kind
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.start import start_values
 from apc.simulation.integrate import integrated
-from apc.simulation.methods import EXACT, WHERE_NEEDED, Method
 from apc.simulation.propagate import nonlinear_rows
-from apc.simulation.scales import integrals
-from apc.simulation.stepping import stepped
+from apc.simulation.settings import EXACT, RK4, WHERE_NEEDED, Method
 
 Floats = NDArray[np.float64]
+Rate = Callable[[Any, Any], Any]  # (x, t) -> dx/dt
+
+# Where the scene has no number in a state's unit: a thousandth of it, as the millimetres of a hand's work.
+UNKNOWN = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,3 +116,124 @@ def flow_of(kind: Kind, method: Method, rows: Sequence[int], scale: Floats) -> F
     speed = casadi.densify(kind.derivative(whole, u, p, t)[list(rows)])
     rate = casadi.Function("rate", [x, u, p, t], [speed])
     return Flow(method, tuple(rows), rate, np.asarray(scale)[list(rows)])
+
+
+def stepped(function: Any, method: Method, duration: Fraction, pairs: Sequence[tuple[int, int]]) -> Any:
+    """Return (x, u, p, t) -> x after `duration`.
+
+    Parameters
+    ----------
+    function
+        The rate of change (x, u, p, t) -> dx/dt, a CasADi function.
+    method
+        One with a step.
+    duration
+        In seconds.
+    pairs
+        Which states are integrals of which, as `integrals` gives them: of these the new value is used.
+    """
+    assert method.step is not None
+    whole = int(duration / method.step)  # rounds down
+    rest = duration - whole * method.step
+    advance = _rk4 if method.name == RK4 else lambda rate, x, t, h: _semi_implicit(rate, x, t, h, pairs)
+    x, u, p = (casadi.MX.sym(name, function.numel_in(i)) for i, name in enumerate(("x", "u", "p")))
+    t = casadi.MX.sym("t")
+    now, count = x, casadi.MX(0)
+    if whole:
+        carry = casadi.vertcat(x, u, p, t, 0)
+        step = _step(function, advance, float(method.step))
+        carry = step.fold(whole)(carry) if whole > 1 else step(carry)
+        now, count = carry[: x.numel()], casadi.MX(whole)
+    if rest:
+        begin = t + count * float(method.step)
+        now = advance(lambda x, t: function(x, u, p, t), now, begin, float(rest))
+    return casadi.Function("move", [x, u, p, t], [now])
+
+
+def _step(function: Any, advance: Callable[..., Any], h: float) -> Any:
+    """Return one whole step; what stays the same travels with what changes, so that steps can be repeated."""
+    type_: Any = casadi.SX if function.is_a("SXFunction") else casadi.MX
+    sizes = [function.numel_in(i) for i in range(3)]
+    carry = type_.sym("carry", sum(sizes) + 2)
+    ends = np.cumsum([0, *sizes, 1, 1]).tolist()
+    x, u, p, t, number = casadi.vertsplit(carry, ends)
+    after = advance(lambda x, t: function(x, u, p, t), x, t + number * h, h)
+    return casadi.Function("step", [carry], [casadi.vertcat(after, u, p, t, number + 1)])
+
+
+def _rk4(rate: Rate, x: Any, t: Any, h: float) -> Any:
+    k1 = rate(x, t)
+    k2 = rate(x + h / 2 * k1, t + h / 2)
+    k3 = rate(x + h / 2 * k2, t + h / 2)
+    k4 = rate(x + h * k3, t + h)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def _semi_implicit(rate: Rate, x: Any, t: Any, h: float, pairs: Sequence[tuple[int, int]]) -> Any:
+    after = x + h * rate(x, t)
+    for i, _ in pairs:  # of new values from here on
+        after = casadi.vertcat(after[:i], x[i] + h * rate(after, t)[i], after[i + 1 :])
+    return after
+
+
+def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
+    """Return (i, j) where the rate of state i is state j itself, j before what builds on it.
+
+    Parameters
+    ----------
+    rate
+        (x, u, p, t) -> dx/dt, a CasADi function.
+    """
+    type_: Any = casadi.SX if rate.is_a("SXFunction") else casadi.MX
+    arguments = [type_.sym(f"a{i}", rate.numel_in(i)) for i in range(4)]
+    speed = rate(*arguments)
+    blocks = [casadi.jacobian(speed, one) for one in arguments]
+    rows, columns = blocks[0].sparsity().get_triplet()
+    others = {row for block in blocks[1:] for row in block.sparsity().get_triplet()[0]}
+    found = {i: j for i, j in zip(rows, columns, strict=True) if rows.count(i) == 1 and i not in others}
+    found = {i: j for i, j in found.items() if blocks[0][i, j].is_constant() and float(blocks[0][i, j]) == 1}
+    ordered: list[tuple[int, int]] = []
+    while found:
+        ready = [i for i, j in found.items() if j not in found]
+        if not ready:  # states that are each other's rates: none comes first
+            break
+        ordered += [(i, found.pop(i)) for i in ready]
+    return tuple(ordered)
+
+
+def state_scales(
+    system: CompiledSystem, kind: Kind, site: SiteJacobians, vectors: Sequence[Floats]
+) -> Floats:
+    """Return the scale of every state (n_x,), in SI.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    kind
+        One of its kinds.
+    site
+        Its Jacobians, which know where it starts.
+    vectors
+        The parameters of its different peers (n_p,).
+    """
+    units = {one.name: one.unit for one in system.parameters}
+    units |= {one.name: one.unit for group in system.groups for one in group.values}
+    largest: dict[str, float] = {}
+    for place, name in enumerate(kind.parameters):
+        size = max((abs(float(vector[place])) for vector in vectors), default=0.0)
+        unit = units.get(name, "1")
+        largest[unit] = max(largest.get(unit, 0.0), size)
+    scale = np.array([largest.get(state.unit, 0.0) for state in kind.states])
+    first = np.zeros(len(scale))
+    for vector in vectors:
+        x, u, _ = start_values(site, [float(one) for one in vector])
+        speed = np.abs(np.asarray(kind.derivative(x, u, vector, 0.0), dtype=np.float64).ravel())
+        first = np.maximum(first, np.nan_to_num(speed, posinf=0.0))
+    rates = integrals(kind.derivative)
+    derived = {j for _, j in rates}
+    scale = np.where((scale == 0) & ~np.isin(np.arange(len(scale)), list(derived)), UNKNOWN, scale)
+    for i, j in reversed(rates):  # from positions to velocities
+        scale[i] = scale[i] or UNKNOWN
+        scale[j] = max(scale[j], np.sqrt(2 * first[j] * scale[i]), scale[i])
+    return scale

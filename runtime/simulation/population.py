@@ -27,9 +27,9 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange
 from apc.frame.schedule import Propagate, Schedule, Tick
-from apc.network.gathering import Gate
+from apc.network.timetable import Route
 from apc.simulation.frame_packets import FramePackets
-from apc.simulation.member import Member
+from apc.simulation.program import Member
 
 Floats = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
     """
     slots = {one.sent for schedule in schedules for one in schedule.heard if one.lag == 0}
     # Over an unreliable link anything may be heard as soon as it is sent.
-    any_time = {one.sent.link for schedule in schedules for one in schedule.heard if one.clock}
+    any_time = {one.way.link for schedule in schedules for one in schedule.selected}
     slots |= {sent for schedule in schedules for sent in schedule.sent if sent.link in any_time}
     instants = {
         schedule.sent_times[place]
@@ -71,7 +71,7 @@ def _looks(schedule: Schedule) -> set[int]:
             now += event.duration
         elif isinstance(event, Tick):
             rows = [row for one in event.heard for row in one]
-            if any(schedule.heard[row].way.edge for row in rows):
+            if any(schedule.received[row].way.edge for row in rows):
                 found.add(now)
     return found
 
@@ -91,25 +91,22 @@ def refuse_unheard_of(system: CompiledSystem) -> None:
 
 
 def build_population(
-    system: CompiledSystem,
     exchange: Exchange,
     members: Sequence[Member],
     kernels: Compile,
-    gates: Sequence[Gate] = (),
+    routes: Sequence[Route] = (),
 ) -> Population:
     """Join the programs of all groups by the packets between them.
 
     Parameters
     ----------
-    system
-        The compiled scene.
     exchange
         Who hears whom.
     members
         What each group brings, in the scene's order.
     kernels
         Turns the segments' functions into the form in which they run.
-    gates
+    routes
         The unreliable links.
 
     Raises
@@ -118,10 +115,10 @@ def build_population(
         E801 a mean over nobody, E802 a mean whose weights add up to 0.
     """
     segments = [segment for one in members for segment in one.program.segments]
-    looked = [pairwise.pair.function for segment in segments for pairwise in segment.pairs]
+    looked = [pairwise.function for segment in segments for pairwise in segment.pairs]
     found = _distinct([*(segment.kernel for segment in segments), *looked])
     ready = dict(zip(found, kernels(list(found.values())), strict=True))
-    packets = FramePackets(system, exchange, members, gates)
+    packets = FramePackets(exchange, members, routes)
     carries = [casadi.MX.sym(f"carry{g}", len(one.carry[0]), one.count) for g, one in enumerate(members)]
     histories = [
         casadi.MX.sym(f"history{g}", sum(one.program.schedule.depths), one.count)
@@ -157,11 +154,11 @@ def build_population(
             packets.send(g, segment, sent)
     frame = casadi.Function(
         "frame",
-        [*carries, *histories, *packets.gathering.held, *impulses, *packets.gathering.inputs, number],
-        [*now, *packets.histories(), *packets.gathering.finish(), *(casadi.vertcat(*one) for one in rows)],
+        [*carries, *histories, *packets.selection.held, *impulses, *packets.selection.inputs, number],
+        [*now, *packets.histories(), *packets.selection.finish(), *(casadi.vertcat(*one) for one in rows)],
     )
     start = [one.each(one.carry) for one in members] + [_first_history(one) for one in members]
-    start += [_first_held(gate, members) for gate in gates]
+    start += packets.selection.start()
     return Population(tuple(members), frame, tuple(start))
 
 
@@ -187,17 +184,3 @@ def _first_history(member: Member) -> Floats:
         for one in member.sends
     ]
     return member.each(np.array(rows).reshape(len(rows), sum(schedule.depths)))
-
-
-def _first_held(gate: Gate, members: Sequence[Member]) -> Floats:
-    """Return what every way of a gate holds at time 0, a row a way: its sender's start values."""
-    link = gate.route.link
-    packet = []
-    for member in members:
-        channels = next((one.channels for one in member.program.kind.sends if one.link == link), ())
-        rows = [
-            [one[link][channels.index(channel)] if channel in channels else 0.0 for channel in gate.channels]
-            for one in member.sends
-        ]
-        packet.append(member.each(np.array(rows).reshape(len(rows), len(gate.channels))))
-    return np.concatenate(packet)[gate.place[gate.route.pairs[:, 0]]]

@@ -1,9 +1,11 @@
-"""One frame of one site as compiled steps.
+"""One frame of one site as compiled steps, and the peers that take them.
 
-Takes: a site's parameters, what each interval does to it (`Transitions`), its start values.
-Gives: `Program`, `Segment`, `Layout`; `seconds_at`.
-Guarantees: the carry at time 0 is what was never computed, as zero, and the states where they start.
-Does not: write the steps (see `writing`).
+Takes: sites' parameters, what each interval does to them (`Transitions`), their start values; which of a
+group's different sites each peer is.
+Gives: `Program`, `Segment`, `Layout`; `Member`, `build_member`; `seconds_at`.
+Guarantees: the carry at time 0 is what was never computed, as zero, and the states where they start; what
+many peers have in common is kept once.
+Does not: write the steps (see `writing`), or know the other members (see `frame_packets`, `population`).
 
 A segment is what happens between two moments at which packets are exchanged within the frame, or peers look
 at each other pair by pair:
@@ -13,7 +15,7 @@ at each other pair by pair:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,10 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
+from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import Schedule, Value
-from apc.simulation.local_signals import LocalSignal
+from apc.frame.start import start_sends, start_values
 from apc.simulation.pairs import Pairwise
 from apc.simulation.propagate import Rates, Transitions
+from apc.simulation.signals import LocalSignal
 
 Floats = NDArray[np.float64]
 
@@ -118,3 +122,67 @@ def seconds_at(schedule: Schedule, frame: Any, now: int) -> Any:
     """Return the time of an instant of a frame, rounded once: counted in quanta, which are whole numbers."""
     quanta = frame * schedule.frame + now
     return quanta * schedule.quantum.numerator / schedule.quantum.denominator
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Member:
+    """Peers of one group of the scene in a population.
+
+    `peers` (count,) are their numbers in the scene. `rows` (count,) says which of the different sites each
+    is; `parameters` are those sites' vectors, `transitions` theirs; `sends` is what each of them sends at the
+    start, by link.
+    """
+
+    group: int
+    peers: NDArray[np.int64]
+    program: Program
+    rows: NDArray[np.int64]
+    parameters: Floats
+    transitions: tuple[Transitions, ...]
+    sends: tuple[Mapping[str, Sequence[float]], ...]
+    carry: Floats  # (sites, rows of the carry)
+
+    @property
+    def count(self) -> int:
+        """The number of peers."""
+        return len(self.rows)
+
+    def each(self, values: Floats) -> Floats:
+        """Return one row a peer of what is one row a site."""
+        return np.ascontiguousarray(values[self.rows])
+
+
+def build_member(
+    group: int,
+    peers: NDArray[np.int64],
+    site: SiteJacobians,
+    rows: NDArray[np.int64],
+    vectors: Floats,
+    program: Program,
+    transitions: Sequence[Transitions],
+) -> Member:
+    """Collect what some peers of a group bring to a population.
+
+    Parameters
+    ----------
+    group
+        The group's place in the scene.
+    peers
+        The peers' numbers in the scene (count,).
+    site
+        The group's kind.
+    rows, vectors, transitions
+        Which of the group's different sites each peer is (count,), their parameters (sites, n_p), and what
+        each does over the program's intervals.
+    program
+        What each peer does in a frame.
+    """
+    used, own = np.unique(rows, return_inverse=True)
+    sends, carries = [], []
+    for vector in vectors[used]:
+        listed = [float(one) for one in vector]
+        x, _, remembered = start_values(site, listed)
+        carries.append(program.start(x, remembered))
+        sends.append(start_sends(site, listed, float))
+    moves = tuple(transitions[place] for place in used)
+    return Member(group, peers, program, own, vectors[used], moves, tuple(sends), np.array(carries))

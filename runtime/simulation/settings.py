@@ -1,16 +1,66 @@
-"""How a scene is played: for how long, by which method, with what luck.
+"""How a scene is played: for how long, with what luck, and by which method between events.
 
-Takes: what a command line or a call says. Gives: `Settings`.
-Guarantees: two runs of one scene with equal settings are the same run.
-Does not: say what is recorded (see `signals`).
+Takes: what a command line or a call says, such as `rk4:0.1ms`.
+Gives: `Settings`; `Method`, `DEFAULT`, `parse_method`, `finer`, `check_step`.
+Guarantees: two runs of one scene with equal settings are the same run; a step is an exact rational of a
+second.
+Does not: compute any motion (see `propagate`, `flow`, `integrate`), or say what is recorded (see `signals`).
+
+    exact              the exact transition; refused where an equation is not linear
+    rk4:STEP           the classical method of Runge and Kutta, of order 4
+    semi-implicit:STEP velocities first, then positions with the new velocities, of order 1: what haptic
+                       engines do
+    cvodes:RTOL        CVODES of SUNDIALS, variable order and step, to a relative tolerance
+
+Steps end at every event, the last one before it shorter if need be. Without any of these words what is linear
+moves exactly, and what is not by CVODES.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from apc.simulation.methods import DEFAULT, Method
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.digits import plain_float
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+
+EXACT, RK4, SEMI_IMPLICIT, CVODES = "exact", "rk4", "semi-implicit", "cvodes"
+WHERE_NEEDED = "exact where linear"
+EXAMPLES = {EXACT: "exact", RK4: "rk4:0.1ms", SEMI_IMPLICIT: "semi-implicit:1ms", CVODES: "cvodes:1e-10"}
+ORDERS = {RK4: 4, SEMI_IMPLICIT: 1}
+
+# Of the default. CVODES holds the error of each step below it; over the restarts of a run, hundreds to
+# thousands of them, errors add up: to 200 times as much in a soft contact, 900 in a stiff one (see
+# tests/bench/work_precision.py).
+TOLERANCE = 1e-10
+TIGHTEST, LOOSEST = 1e-12, 1e-2  # a hundred times tighter than 1e-12 is what double precision still gives
+TIGHTER = 100.0
+MOST_STEPS = 10**6  # between two events
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """`step` in seconds is of the methods with a fixed step, `tolerance` (relative) of CVODES.
+
+    `perturbed` marks a run that shows what roundings do: every coefficient of its transitions is off by one.
+    """
+
+    name: str
+    step: Fraction | None = None
+    tolerance: float | None = None
+    perturbed: bool = False
+
+    def __str__(self) -> str:
+        """Return it as it is written on a command line."""
+        if self.step is not None:
+            return f"{self.name}:{1000 * float(self.step):g} ms"
+        if self.name == CVODES:
+            return f"{self.name}:{self.tolerance:g}"
+        return self.name
+
+
+DEFAULT = Method(WHERE_NEEDED, tolerance=TOLERANCE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,3 +76,114 @@ class Settings:
     method: Method = DEFAULT
     seed: int | None = None
     jit: bool = True
+
+
+def parse_method(text: str) -> Method:
+    """Read a method.
+
+    Parameters
+    ----------
+    text
+        Such as "exact", "rk4:0.1 ms", "semi-implicit:1ms" or "cvodes:1e-8".
+
+    Raises
+    ------
+    ApcError
+        E910 no such method, E911 a step that is none, E912 a tolerance that is none.
+    """
+    name, colon, size = (part.strip() for part in text.partition(":"))
+    place = Place("--method")
+    if name not in EXAMPLES:
+        meant = nearest(name, EXAMPLES) or EXACT
+        expected = f"one of {', '.join(EXAMPLES)}"
+        got = text[:80] or "nothing"
+        raise ApcError(Mistake("E910", place, "the method", expected, got, EXAMPLES[meant]))
+    if name == EXACT:
+        if colon:
+            expected = "exact alone, which has no step"
+            raise ApcError(Mistake("E910", place, "the method", expected, text[:80], EXACT))
+        return Method(EXACT)
+    if name == CVODES:
+        return Method(CVODES, tolerance=_tolerance(size, place))
+    # Imported here: the language of quantities, which most runs do not need.
+    from apc.compiler.language.units import quantity
+
+    if not size:
+        expected = "a step"
+        raise ApcError(Mistake("E911", place, name, expected, "none", EXAMPLES[name]))
+    try:
+        step = Fraction(quantity(size, place, what=f"the step of {name}", unit="s").value)
+    except ApcError as error:
+        raise ApcError([replace(one, hint=EXAMPLES[name]) for one in error.mistakes]) from None
+    if step <= 0:
+        expected, got = "more than 0 s", size[:80]
+        raise ApcError(Mistake("E911", place, f"the step of {name}", expected, got, EXAMPLES[name]))
+    return Method(name, step=step)
+
+
+def _tolerance(text: str, place: Place) -> float:
+    try:
+        found = plain_float(text)
+    except ValueError:
+        found = 0.0
+    if not TIGHTEST <= found <= LOOSEST:
+        expected = f"a number from {TIGHTEST:g} to {LOOSEST:g}"
+        what, got = "the relative tolerance of cvodes", text[:80] or "none"
+        raise ApcError(Mistake("E912", place, what, expected, got, EXAMPLES[CVODES]))
+    return found
+
+
+def check_step(system: CompiledSystem, method: Method, fastest: Fraction, longest: Fraction) -> None:
+    """Refuse a step that the scene has no room for.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    method
+        The method.
+    fastest
+        The period of the fastest clock, in seconds.
+    longest
+        The longest time between two events, in seconds.
+
+    Raises
+    ------
+    ApcError
+        E913 the step is longer than the fastest clock's period, or far too short.
+    """
+    if method.step is None:
+        return
+    place, what = Place(system.name), f"the step of {method.name}"
+    if method.step > fastest:
+        expected = f"at most the period of the fastest clock, {_ms(fastest)}"
+        hint = f"--method {method.name}:{_ms(fastest).replace(' ', '')}"
+        raise ApcError(Mistake("E913", place, what, expected, _ms(method.step), hint))
+    if longest / method.step > MOST_STEPS:
+        expected = f"at least {_ms(longest / MOST_STEPS)}, a millionth of the time between two events"
+        raise ApcError(Mistake("E913", place, what, expected, _ms(method.step)))
+
+
+def _ms(seconds: Fraction) -> str:
+    return f"{1000 * float(seconds):g} ms"
+
+
+def finer(method: Method, *, all_linear: bool) -> tuple[Method, float]:
+    """Return the method to compare with, and what the error is of the difference from it.
+
+    Halving the step of a method of order n leaves 1/2ⁿ of the error, so that the error is 1/(1 − 1/2ⁿ) of the
+    difference (Richardson). A hundredth of the tolerance leaves next to none of it.
+
+    Parameters
+    ----------
+    method
+        The method whose error is wanted.
+    all_linear
+        Whether all equations of the scene are linear between the ticks.
+    """
+    if method.step is not None:
+        return replace(method, step=method.step / 2), 1 / (1 - 0.5 ** ORDERS[method.name])
+    if method.name == EXACT or (method.name == WHERE_NEEDED and all_linear):
+        return replace(method, perturbed=True), 1.0
+    assert method.tolerance is not None
+    return replace(method, tolerance=method.tolerance / TIGHTER), 1.0

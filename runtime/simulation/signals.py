@@ -1,8 +1,11 @@
-"""What is recorded of a simulation: names such as `left[2].cube.x`, and choosing among them.
+"""What is recorded of a simulation: what a site has to record, names such as `left[2].cube.x`, the choice.
 
-Takes: what can be recorded of a site of each group. Gives: `Signal`, `Choice`, `choose`.
-Guarantees: signals stand by group, peer and site, in the scene's order, whatever the order of the patterns; a
-pattern that fits nothing is refused with the nearest name.
+Takes: a `Kind` and its `Schedule`; patterns of names.
+Gives: `LocalSignal`, `local_signals`; `Signal`, `Choice`, `choose`, `signals_of`; `sent_states`,
+`ticking_partitions`.
+Guarantees: a value that acts later than it is computed is two signals, any other is one; signals stand by
+group, peer and site, in the scene's order, whatever the order of the patterns; a pattern that fits nothing is
+refused with the nearest name.
 Does not: hold values.
 """
 
@@ -12,14 +15,89 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.simulation.local_signals import LocalSignal
+from apc.frame.schedule import Act, Propagate, Schedule, Tick
 
 EXAMPLE = "'cube.x', 'left[2].*' or '*.v'"
+
+
+@dataclass(frozen=True, slots=True)
+class LocalSignal:
+    """Something of a site that can be recorded: "state", "output" (as newly computed) or "hold" (acting).
+
+    `place` is the state, the (clock partition, output), or the hold.
+    """
+
+    name: str
+    unit: str
+    role: str
+    place: tuple[int, ...]
+
+
+def local_signals(kind: Kind, schedule: Schedule) -> tuple[LocalSignal, ...]:
+    """Return what can be recorded of a site.
+
+    A value that a hold puts out as soon as it is computed is one signal; one that acts later is two:
+    `contact.f` as newly computed, and `contact.f acting`.
+    """
+    found = [
+        LocalSignal(state.name, state.unit, "state", (place,)) for place, state in enumerate(kind.states)
+    ]
+    ticking = ticking_partitions(schedule)
+    for p in ticking:
+        partition = kind.clocks[p]
+        found += [
+            LocalSignal(name, unit, "output", (p, o))
+            for o, (name, unit) in enumerate(zip(partition.outputs, partition.units, strict=True))
+        ]
+    numbers = {partition.clock: p for p, partition in enumerate(kind.clocks)}
+    late = _late_holds(schedule)
+    for h, hold in enumerate(kind.holds):
+        p = numbers[hold.clock]
+        if h in late:
+            unit = kind.clocks[p].units[hold.output]
+            found.append(LocalSignal(f"{hold.name} acting", unit, "hold", (h,)))
+    return tuple(found)
+
+
+def sent_states(kind: Kind) -> tuple[int, ...]:
+    """Return the states, by their places, that a site sends to others as they are."""
+    found = []
+    for sending in kind.sends:
+        if sending.send.is_a("SXFunction"):
+            inputs = sending.send.sx_in()
+            channels = sending.send(*inputs)
+            found += [
+                place
+                for row in range(channels.numel())
+                for place in range(len(kind.states))
+                if casadi.is_equal(channels[row], inputs[0][place])
+            ]
+    return tuple(dict.fromkeys(found))
+
+
+def ticking_partitions(schedule: Schedule) -> list[int]:
+    """Return the clock partitions that tick in a frame."""
+    return sorted({event.partition for event in schedule.events if isinstance(event, Tick)})
+
+
+def _late_holds(schedule: Schedule) -> set[int]:
+    """Return the holds that put out a value later than it is computed."""
+    computed: set[tuple[int, int]] = set()
+    late = set()
+    for event in schedule.events:
+        if isinstance(event, Propagate):
+            computed = set()
+        elif isinstance(event, Tick):
+            computed.add((event.partition, event.index))
+        elif isinstance(event, Act) and (event.value.partition, event.value.index) not in computed:
+            late.add(event.hold)
+    return late
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,13 +1,14 @@
 """A scene made ready to be played in time: one function for a stretch of frames of all peers.
 
-Takes: a `CompiledSystem`, its `Settings`, the signals wanted. Gives: `Simulation`, `prepare`.
+Takes: a `CompiledSystem`, its `Settings`, the signals wanted.
+Gives: `Simulation`, `prepare`; `check_length`, `size_note`, what it will come to.
 Guarantees: time is counted in whole quanta; what would not fit the memory is refused before it is built.
 Does not: play it (see `blocks`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -20,25 +21,19 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.parameters import Numbers, resolve
-from apc.frame.schedule import Kept, Propagate, Schedule
+from apc.frame.schedule import Propagate, Schedule
 from apc.frame.scheduling import build_schedules
-from apc.frame.site import LinearSite
-from apc.network.gathering import Gate, build_gates, kept_links
 from apc.network.timetable import Route, routes_of
-from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move
+from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
 from apc.simulation.forcing import SiteForcing, forcing_of
-from apc.simulation.local_signals import LocalSignal, local_signals
-from apc.simulation.member import Member, build_member
-from apc.simulation.methods import CVODES, EXACT, WHERE_NEEDED, Method, check_step
 from apc.simulation.native import native
 from apc.simulation.pairs import count_pairs
 from apc.simulation.population import Population, build_population, exchanges_within, refuse_unheard_of
-from apc.simulation.program import Program
+from apc.simulation.program import Member, Program, build_member
 from apc.simulation.propagate import Transitions, perturbed, rates, transitions
 from apc.simulation.quadrature import Kernel, kernel_of
-from apc.simulation.scales import state_scales
-from apc.simulation.settings import Settings
-from apc.simulation.signals import Choice, Signal, choose, signals_of
+from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
+from apc.simulation.signals import Choice, LocalSignal, Signal, choose, local_signals, signals_of
 from apc.simulation.writing import build_program
 from apc.trouble import finite_equations
 
@@ -57,6 +52,16 @@ NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
 # Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
 MOST_NUMBERS = 2**26
 
+# Rows of one command, all runs together: at a microsecond a row and peer, which machine code needs, some
+# hours. At 1 kHz it is eleven days of simulated time.
+MOST_ROWS = 10**9
+
+# A file larger than this is told of beforehand: 1 GB.
+LARGE = 10**9
+
+# Bytes of a number: as a float, and in decimal with the comma, mostly.
+BINARY, DECIMAL = 8, 20
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
@@ -65,7 +70,7 @@ class Simulation:
     `signals` are the columns of what comes out; `marks` the instants of a frame's rows, in quanta, of which
     those not in `ticks` make a row at time 0 only; `forces` are those that change with time, of each group's
     different sites. `chunk` is the frame of all peers, `length` times in a row;
-    `compiled` says that it runs in machine code. `gates` are the unreliable links, `seed` is what their luck
+    `compiled` says that it runs in machine code. `routes` are the unreliable links, `seed` is what their luck
     begins from: that of the settings, or of the experiment. `tolerances` are of the states that CVODES moves.
     """
 
@@ -75,7 +80,7 @@ class Simulation:
     choices: tuple[Choice, ...]
     signals: tuple[Signal, ...]
     forces: tuple[tuple[SiteForcing, ...], ...]
-    gates: tuple[Gate, ...]
+    routes: tuple[Route, ...]
     seed: int
     tolerances: tuple[Tolerance, ...]
     quantum: Fraction
@@ -125,7 +130,6 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
         plan = _plan(system, settings.method)
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method)
-        gates = build_gates(plan.routes, plan.kept, plan.exchange, plan.schedules, members)
         compiled: list[bool] = []
 
         def kernels(functions: Sequence[Any]) -> Sequence[Any]:
@@ -133,7 +137,7 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
             compiled.append(any(new is not old for new, old in zip(ready, functions, strict=True)))
             return ready
 
-        population = build_population(system, plan.exchange, members, kernels, gates)
+        population = build_population(plan.exchange, members, kernels, plan.routes)
     schedule = plan.schedules[0]
     marks = schedule.marks[:-1]
     length = _chunk_length(population.frame, settings.duration, schedule.frame_s)
@@ -144,7 +148,7 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
         choices=choices,
         signals=signals_of(system, choices),
         forces=tuple(_forces(member) for member in members),
-        gates=gates,
+        routes=plan.routes,
         seed=system.experiment.seed if settings.seed is None else settings.seed,
         tolerances=_tolerances(system, plan.flows),
         quantum=schedule.quantum,
@@ -157,12 +161,58 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
     )
 
 
+def check_length(system: CompiledSystem, duration: Fraction, *, runs: int = 1) -> None:
+    """Refuse to play so long that no one will wait for it.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    duration
+        How long, in seconds.
+    runs
+        How often.
+
+    Raises
+    ------
+    ApcError
+        E915 more than `MOST_ROWS` rows.
+    """
+    timings = {timing.name: timing.value for timing in system.timings}
+    row = min((timings[clock.period] for clock in system.clocks), default=ROW)
+    if duration * runs <= MOST_ROWS * row:
+        return
+    longest = float(MOST_ROWS * row / runs)
+    each = f" in each of {runs:,} runs" if runs > 1 else ""
+    expected = f"at most {longest:.6g} s{each}: a row a tick, {MOST_ROWS:,} in all"
+    got, hint = f"{float(duration):.6g} s", f'--duration "{longest:.6g} s"'
+    raise ApcError(Mistake("E915", Place(system.name), "the duration", expected, got, hint))
+
+
+def size_note(simulation: Simulation, *, decimal: bool) -> str:
+    """Return what to tell of a file of all rows, "" if it is small enough not to mention it.
+
+    Parameters
+    ----------
+    simulation
+        The scene, ready.
+    decimal
+        Whether the file is a text.
+    """
+    frames = int(simulation.settings.duration / (simulation.frame * simulation.quantum))
+    rows, columns = frames * len(simulation.marks), len(simulation.signals) + 1
+    size = rows * columns * (DECIMAL if decimal else BINARY)
+    if size < LARGE:
+        return ""
+    return f"will hold {rows:,} rows of {columns} columns, about {size / 1e9:.3g} GB"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plan:
     """What the peers of a scene do in a frame, before a function of it is built.
 
     `sites` are the Jacobians of each kind, `flows` what the method moves of it, `schedules` what happens in a
-    frame of each group; `routes` are what is heard over unreliable links, `kept` what is kept of each.
+    frame of each group; `routes` are what is heard over unreliable links.
     """
 
     system: CompiledSystem
@@ -172,7 +222,6 @@ class _Plan:
     flows: tuple[Flow | None, ...]
     routes: tuple[Route, ...]
     schedules: tuple[Schedule, ...]
-    kept: Mapping[str, Kept]
 
 
 def _plan(system: CompiledSystem, method: Method) -> _Plan:
@@ -181,11 +230,17 @@ def _plan(system: CompiledSystem, method: Method) -> _Plan:
     sites = tuple(jacobians(kind) for kind in system.kinds)
     flows = tuple(_flow(system, numbers, place, site, method) for place, site in enumerate(sites))
     exchange = build_exchange(system, numbers.timings)
-    routes = routes_of(system, numbers.timings, exchange)
-    schedules, kept = _schedules(system, numbers, [site.pattern for site in sites], routes)
+    patterns = [site.pattern for site in sites]
+    schedules = build_schedules(system, numbers.timings, patterns)
+    routes = routes_of(system, numbers.timings, exchange, schedules[0].frame_s)
+    if routes:
+        kept = {route.link: route.frames for route in routes}
+        schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
+    if not system.clocks:  # then there is one interval, of any length
+        schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
     _check_size(system, exchange, schedules)
     _check_step(system, numbers, schedules, method)
-    return _Plan(system, numbers, exchange, sites, flows, routes, schedules, kept)
+    return _Plan(system, numbers, exchange, sites, flows, routes, schedules)
 
 
 def _choices(plan: _Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
@@ -198,19 +253,6 @@ def _choices(plan: _Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
     choices = choose(system, available, signals)
     _check_size(system, plan.exchange, plan.schedules, choices)
     return choices
-
-
-def _schedules(
-    system: CompiledSystem, numbers: Numbers, patterns: Sequence[LinearSite], routes: Sequence[Route]
-) -> tuple[tuple[Schedule, ...], dict[str, Kept]]:
-    """Return what happens in a frame of each group, and what is kept of unreliable links."""
-    schedules = build_schedules(system, numbers.timings, patterns)
-    kept = kept_links(routes, schedules[0].frame_s)
-    if kept:
-        schedules = build_schedules(system, numbers.timings, patterns, kept=kept)
-    if not system.clocks:  # then there is one interval, of any length
-        schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
-    return schedules, kept
 
 
 def _members(plan: _Plan, choices: Sequence[Choice], method: Method) -> list[Member]:

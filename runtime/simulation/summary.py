@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.simulation.blocks import Block
-from apc.simulation.local_signals import sent_states
-from apc.simulation.signals import Signal
+from apc.simulation.signals import Signal, sent_states
 from apc.simulation.simulation import Simulation
 
 Floats = NDArray[np.float64]

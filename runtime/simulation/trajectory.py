@@ -24,8 +24,7 @@ from apc.result import Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
 from apc.simulation.blocks import Block, blocks
 from apc.simulation.flow import Tolerance
-from apc.simulation.methods import DEFAULT, Method
-from apc.simulation.settings import Settings
+from apc.simulation.settings import DEFAULT, Method, Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.summary import Summary, Watch

@@ -16,12 +16,23 @@ import casadi
 import numpy as np
 
 from apc.frame.jacobians import edge_name
-from apc.frame.schedule import Act, Event, Propagate, Schedule, Send, Sent, Tick, Value
+from apc.frame.schedule import (
+    Act,
+    Event,
+    Propagate,
+    Schedule,
+    Selected,
+    Send,
+    Tick,
+    Value,
+    remembered,
+    shifted,
+)
 from apc.simulation.flow import Flow
-from apc.simulation.local_signals import LocalSignal, ticking_partitions
-from apc.simulation.pairs import PairFunction, Pairwise, pair_function
+from apc.simulation.pairs import Pairwise, pair_function
 from apc.simulation.program import Layout, Program, Segment, seconds_at
 from apc.simulation.propagate import Rates
+from apc.simulation.signals import LocalSignal, ticking_partitions
 
 
 def build_program(
@@ -107,7 +118,10 @@ class _Writer:
             (p, o) for p in ticking_partitions(schedule) for o in range(len(kind.clocks[p].outputs))
         )
         parts = tuple(dict.fromkeys(kind.ports.parts)) if kind.ports else ()
-        self.layout = Layout(len(kind.states), outputs, _later(schedule), parts)
+        # What holds put out in this frame; `_between` and `_after` pass on what is of earlier ones.
+        read = [one for one in schedule.acting if one is not None]
+        read += [event.value for event in schedule.events if isinstance(event, Act)]
+        self.layout = Layout(len(kind.states), outputs, remembered(read, schedule.ticks), parts)
         # Keys of the carry: of a segment's first, in its order; of the next, what the last one left.
         self.keys: list[Any] = [
             *(("x", i) for i in range(len(kind.states))),
@@ -115,7 +129,7 @@ class _Writer:
             *self.layout.later,
             *(("work", part) for part in parts),
         ]
-        self.pair_functions: dict[tuple[int, int], PairFunction] = {}
+        self.pair_functions: dict[tuple[int, int], tuple[Any, tuple[int, ...]]] = {}
         self.rest: list[Event] = list(schedule.events)
         self.begun = -1  # the instant of the event before
 
@@ -183,11 +197,11 @@ class _Writer:
             key = (tick.partition, place)
             if key not in self.pair_functions:
                 self.pair_functions[key] = pair_function(self.kind, *key)
-            pair = self.pair_functions[key]
+            function, own = self.pair_functions[key]
             found[tick, place] = Pairwise(
-                pair,
-                tuple(self.keys.index(inside[row]) for row in pair.own if row < len(inside)),
-                tuple(row - len(inside) for row in pair.own if row >= len(inside)),
+                function,
+                tuple(self.keys.index(inside[row]) for row in own if row < len(inside)),
+                tuple(row - len(inside) for row in own if row >= len(inside)),
                 rows,
                 now,
             )
@@ -254,16 +268,16 @@ class _Writer:
     def _sum(self, now: int, rows: Sequence[int]) -> Any:
         total = self.type_(0)
         for row in rows:
-            heard = self.schedule.heard[row]
+            heard = self.schedule.received[row]
             # What a site would itself send at this moment stands in for what it misses.
-            weight = self._own(now, heard.sent) if heard.gap else 1
+            weight = self._own(now, heard) if isinstance(heard, Selected) and heard.gap else 1
             total = total + weight * self.inputs[2][row]
         return total
 
-    def _own(self, now: int, sent: Sent) -> Any:
-        sending = next(one for one in self.kind.sends if one.link == sent.link)
+    def _own(self, now: int, heard: Selected) -> Any:
+        sending = next(one for one in self.kind.sends if one.link == heard.way.link)
         everything = sending.send(self._x(), self._u(), self._p(), self._time(now))
-        return everything[sending.channels.index(sent.channel)]
+        return everything[sending.channels.index(heard.channel)]
 
     def _propagate(self, now: int, place: int) -> None:
         """Move x over one interval, and add up the work that held values do meanwhile."""
@@ -303,7 +317,7 @@ class _Writer:
         """Return what the rest of the frame still needs, as (key, key)."""
         needed = {event.value for event in self.rest if isinstance(event, Act)}
         for one in self.layout.later:
-            needed.add(_shifted(one, self.schedule))
+            needed.add(shifted(one, self.schedule.ticks))
             needed.add(one)
         return [(key, key) for key in self.known if not isinstance(key, Value) or key in needed]
 
@@ -312,26 +326,9 @@ class _Writer:
         return [
             *((("x", i), ("x", i)) for i in range(self.layout.states)),
             *((("newest", one), ("newest", one)) for one in self.layout.outputs),
-            *((_shifted(one, self.schedule), one) for one in self.layout.later),
+            *((shifted(one, self.schedule.ticks), one) for one in self.layout.later),
             *((("work", part), ("work", part)) for part in self.layout.parts),
         ]
-
-
-def _shifted(value: Value, schedule: Schedule) -> Value:
-    """Return the value that is called `value` one frame on."""
-    return Value(value.partition, value.output, value.index + schedule.ticks[value.partition])
-
-
-def _later(schedule: Schedule) -> tuple[Value, ...]:
-    """Return the values of earlier frames that holds put out in this frame or later."""
-    wanted = [one for one in schedule.acting if one is not None]
-    wanted += [event.value for event in schedule.events if isinstance(event, Act)]
-    found: set[Value] = set()
-    for value in wanted:
-        while value.index < 0:
-            found.add(value)
-            value = _shifted(value, schedule)
-    return tuple(sorted(found))
 
 
 def _column(type_: Any, values: Sequence[Any]) -> Any:

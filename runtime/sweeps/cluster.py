@@ -1,8 +1,8 @@
-"""Parts of a sweep computed by a running Dask cluster.
+"""Work shared out to a running Dask cluster.
 
-Takes: `Work`, the address of a scheduler. Gives: `cluster_workers`.
-Guarantees: the workers compute what a process here computes, with the same function; a cluster that isn't
-there, or lost, is told in a sentence.
+Takes: a function of what all tasks share and of a task, the address of a scheduler. Gives: `cluster_workers`.
+Guarantees: the workers compute what a process here computes (see `processes`), with the same function; a
+cluster that isn't there, or lost, is told in a sentence.
 Does not: start a cluster, or install anything on it.
 """
 
@@ -12,14 +12,13 @@ import importlib.util
 import logging
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.distribution import install_line
-from apc.sweeps.local import Workers
-from apc.sweeps.work import Computed, Work, compute_part
+from apc.processes import Result, Shared, Task, Workers
 
 # A scheduler in the same building answers within milliseconds; one across the world within a second.
 PATIENCE_S = 5
@@ -29,13 +28,15 @@ _ADDRESS = re.compile(r"([a-z]+://)?([\w.-]+|\[[0-9a-fA-F:.]+\]):[0-9]{1,5}")
 
 
 @contextmanager
-def cluster_workers(work: Work, address: str) -> Iterator[Workers]:
+def cluster_workers(
+    compute: Callable[[Shared, Task], Result], shared: Shared, address: str
+) -> Iterator[Workers[Task, Result]]:
     """Connect to a Dask scheduler and hand it the work.
 
     Parameters
     ----------
-    work
-        The sweep.
+    compute, shared
+        As of `processes.local_processes`.
     address
         The scheduler's, such as `tcp://host:8786`.
 
@@ -76,10 +77,10 @@ def cluster_workers(work: Work, address: str) -> Iterator[Workers]:
             # A task like the others: to scatter it would wait for every worker, frozen ones included.
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # of a large model, which is sent once
-                sent = client.submit(_taken, work, pure=False)
+                sent = client.submit(_taken, shared, pure=False)
 
-            def submit(part: int) -> Future[Computed]:
-                future: Future[Computed] = executor.submit(compute_part, sent, part)
+            def submit(task: Task) -> Future[Result]:
+                future: Future[Result] = executor.submit(compute, sent, task)
                 return future
 
             yield Workers(submit, 2 * len(client.nthreads()), lambda error: _trouble(error, place))
@@ -88,9 +89,9 @@ def cluster_workers(work: Work, address: str) -> Iterator[Workers]:
             logger.setLevel(level)
 
 
-def _taken(work: Work) -> Work:
-    """Keep the work on a worker, from which the others have it."""
-    return work
+def _taken(shared: Shared) -> Shared:
+    """Keep what is shared on a worker, from which the others have it."""
+    return shared
 
 
 def _trouble(error: BaseException, place: Place) -> ApcError | None:

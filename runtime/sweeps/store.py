@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, read_file, write_file
+from apc.compiler.files import RefusedError, read_file, unwritable, write_file
 from apc.tables import Row
 
 SUFFIX = ".parts"
@@ -121,7 +121,7 @@ def remove_parts(target: Path) -> None:
     try:
         folder.rename(done)
     except OSError as error:
-        raise _unwritable(folder, error) from error
+        raise unwritable(folder, error) from error
     _remove(done)
 
 
@@ -196,7 +196,7 @@ def _locked(folder: Path, manifest: str) -> IO[bytes]:
                 return lock
             lock.close()  # between opening and locking it was removed
     except OSError as error:
-        raise _unwritable(folder, error) from error
+        raise unwritable(folder, error) from error
 
 
 def _make(folder: Path, manifest: str) -> None:
@@ -233,7 +233,3 @@ def _try_lock(lock: IO[bytes]) -> bool:
     except (BlockingIOError, PermissionError):
         return False
     return True
-
-
-def _unwritable(folder: Path, error: OSError) -> ApcError:
-    return ApcError(Mistake("E601", Place(str(folder)), f"can't be written: {error.strerror or error}"))

@@ -4,7 +4,7 @@ Takes: a `CompiledSystem`, the values of each swept parameter, what to compute.
 Gives: `Sweep`, `sweep`.
 Guarantees: the same rows in the same order whoever computes them, interrupted or not; a sweep with a target
 takes up its finished parts; the target is written when all of it is there, and its parts are removed then.
-Does not: start processes itself (see `sweep.local`, `sweep.cluster`), or print.
+Does not: start processes itself (see `processes`, `cluster`), or print.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,12 +26,12 @@ from apc.compiler.files import is_special
 from apc.frame.jacobians import jacobians
 from apc.frame.names import Free
 from apc.network.nominal import left_out, refuse_channel_number
+from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
-from apc.sweeps.local import Workers, cores, local_processes, this_process
 from apc.sweeps.quantities import VERDICT, find_quantity
 from apc.sweeps.store import Parts, open_parts, remove_parts
-from apc.sweeps.work import Computed, Work, model_bytes, program_versions
+from apc.sweeps.work import Computed, Work, compute_part, program_versions
 from apc.tables import Cell, Column, Row, check_table_path, write_table
 
 if TYPE_CHECKING:
@@ -45,18 +44,15 @@ PLACE = Place("sweep")
 PART_POINTS = 64
 MOST_PARTS = 10_000
 
-# Seconds without a part after which that is told, and again after twice as many.
-SILENCE = 60.0
-
 Progress = Callable[[int, int], None]  # points done, points in all
 
-
-@dataclass(frozen=True, slots=True)
-class Patience:
-    """What to do while no part comes: `told` hears of it; after `limit` seconds the sweep ends."""
-
-    limit: float | None = None
-    told: Callable[[str], None] = lambda _: None
+LOST = Mistake(
+    "E889",
+    PLACE,
+    "a process that computed ended without a word: stopped from outside, out of memory, or started by a "
+    "script that sweeps when it is imported",
+    hint="--jobs 1; in a script, if __name__ == '__main__': around the sweep",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,7 +238,7 @@ def _compute_missing(work: Work, kept: _Kept, whose: Whose, progress: Progress |
     if not missing:
         return tuple(notes)
     with _workers(work, min(whose.jobs, len(missing)), whose.cluster) as workers:
-        for computed in _computed(workers, missing, whose.patience):
+        for computed in results(workers, missing, whose.patience, PLACE):
             if computed.versions != program_versions():
                 raise ApcError(_other_versions(computed, whose.cluster))
             kept.write(computed.part, computed.rows)
@@ -252,52 +248,14 @@ def _compute_missing(work: Work, kept: _Kept, whose: Whose, progress: Progress |
     return tuple(notes)
 
 
-def _workers(work: Work, jobs: int, cluster: str | None) -> AbstractContextManager[Workers]:
+def _workers(work: Work, jobs: int, cluster: str | None) -> AbstractContextManager[Workers[int, Computed]]:
     if cluster is not None:
         from apc.sweeps.cluster import cluster_workers
 
-        return cluster_workers(work, cluster)
-    return nullcontext(this_process(work)) if jobs == 1 else local_processes(work, jobs)
-
-
-def _computed(workers: Workers, missing: Sequence[int], patience: Patience) -> Iterator[Computed]:
-    """Yield each part as it comes; never more of them are handed out than keep the workers busy."""
-    silent = 0.0  # seconds since the last part
-    left = iter(missing)
-    running: set[Future[Computed]] = set()
-    try:
-        while True:
-            for part in left:
-                running.add(workers.submit(part))
-                if len(running) >= workers.waiting:
-                    break
-            if not running:
-                return
-            pause = silent or SILENCE
-            if patience.limit is not None:
-                pause = min(pause, patience.limit - silent)
-            finished, running = wait(running, pause, return_when=FIRST_COMPLETED)
-            silent = 0.0 if finished else silent + pause
-            if silent:
-                _tell_silence(silent, patience)
-            for future in finished:
-                yield future.result()
-    except ApcError:
-        raise
-    except Exception as error:
-        told = workers.trouble(error)
-        if told is None:
-            raise
-        raise told from error
-
-
-def _tell_silence(seconds: float, patience: Patience) -> None:
-    """Say that nothing came for a while. Raises ApcError E889 if that is too long."""
-    what = f"nothing has come from those who compute for {seconds:g} s"
-    if patience.limit is not None and seconds >= patience.limit:
-        what += ": they are stuck, or a part takes longer"
-        raise ApcError(Mistake("E889", PLACE, what, hint=f'--patience "{2 * seconds:g} s"'))
-    patience.told(f"{what}; still waiting")
+        return cluster_workers(compute_part, work, cluster)
+    if jobs == 1:
+        return nullcontext(this_process(compute_part, work))
+    return local_processes(compute_part, work, jobs, LOST)
 
 
 def _other_versions(computed: Computed, cluster: str | None) -> Mistake:

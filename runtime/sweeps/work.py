@@ -10,18 +10,17 @@ Does not: start processes, or keep results.
 from __future__ import annotations
 
 import hashlib
-import tempfile
 import threading
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 
-from apc.compiler import store
 from apc.compiler.cache import program_digest
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.distribution import versions
 from apc.frame.overrides import apply
+from apc.processes import model_of_bytes
 from apc.sweeps.grid import Grid
 from apc.sweeps.quantities import Quantity, faulty, find_quantity
 from apc.tables import Row
@@ -65,14 +64,6 @@ class Computed:
     versions: tuple[tuple[str, str], ...]
 
 
-def model_bytes(system: CompiledSystem) -> bytes:
-    """Return a compiled model as the bytes of its file; equal models give equal bytes."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.apc"
-        store.save(system, path)
-        return path.read_bytes()
-
-
 def compute_part(work: Work, part: int) -> Computed:
     """Compute one part of a sweep. A point that can't be computed becomes a row that says why."""
     with _ONE_AT_A_TIME, single_threaded():
@@ -99,8 +90,5 @@ def program_versions() -> tuple[tuple[str, str], ...]:
 
 @lru_cache(maxsize=1)
 def _opened(model: bytes, of: str) -> tuple[CompiledSystem, Quantity]:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.apc"
-        path.write_bytes(model)
-        system = store.load(path)
+    system = model_of_bytes(model)
     return system, find_quantity(system, of)

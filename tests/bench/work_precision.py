@@ -27,8 +27,7 @@ from apc.benchmark.reference import exact_course
 from apc.benchmark.timing import median_time
 from apc.compiler.compiled import CompiledSystem
 from apc.simulation.blocks import blocks
-from apc.simulation.methods import CVODES, EXACT, TOLERANCE, Method
-from apc.simulation.settings import Settings
+from apc.simulation.settings import CVODES, EXACT, TOLERANCE, Method, Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.threads import single_threaded
 from tests.bench.contact_reference import Bounce, reference

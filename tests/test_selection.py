@@ -1,4 +1,4 @@
-"""Claims about `apc.network.gathering`: what unreliable links do to a scene that is played."""
+"""Claims about `apc.simulation.selection`: what unreliable links do to a scene that is played."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.network.channel_law import channel_law
-from apc.network.packets import PacketSource
+from apc.network.channel import PacketSource, channel_law
 from apc.simulation.blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare

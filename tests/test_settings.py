@@ -1,4 +1,4 @@
-"""`methods`: words of a command line become a method, or one message."""
+"""`settings`: words of a command line become a method, or one message."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from apc.simulation.methods import DEFAULT, Method, check_step, finer, parse_method
+from apc.simulation.settings import DEFAULT, Method, check_step, finer, parse_method
 from tests.topologies import AVERAGE, compiled, told
 
 MS = Fraction(1, 1000)

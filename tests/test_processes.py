@@ -1,22 +1,27 @@
-"""Processes that compute parts: they end when they are let go, and a lost one is told."""
+"""Claims about `apc.processes`: processes end when they are let go, and a lost one is told."""
 
 from __future__ import annotations
 
 import os
 import signal
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
+from apc.benchmark.scale import scale
 from apc.compiler.errors import ApcError
+from apc.processes import cores, local_processes, model_bytes, model_of_bytes, this_process
+from apc.simulation.ensemble import play_many
+from apc.simulation.settings import Settings
 from apc.sweeps.grid import build_grid, parse_axis
-from apc.sweeps.local import cores, local_processes, this_process
-from apc.sweeps.sweep import sweep
-from apc.sweeps.work import Work, compute_part, model_bytes
+from apc.sweeps.sweep import LOST, sweep
+from apc.sweeps.work import Work, compute_part
 from tests.sweeping import CHEAP, alive, children, parts
-from tests.topologies import compiled
+from tests.topologies import AVERAGE, compiled, replaced
 
 MODEL = compiled(CHEAP)
+LOSSY = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 10 %}"))
 WORK = Work(
     model_bytes(MODEL), "analyze", build_grid([parse_axis(MODEL, "it.stiffness", "1 N/m:9 kN/m:300")]), 50
 )
@@ -43,8 +48,8 @@ def workers_of_mine() -> list[int]:
 
 
 def test_processes_compute_what_this_one_computes() -> None:
-    here = this_process(WORK)
-    with local_processes(WORK, 2) as workers:
+    here = this_process(compute_part, WORK)
+    with local_processes(compute_part, WORK, 2, LOST) as workers:
         futures = [workers.submit(part) for part in range(WORK.parts)]
         assert [future.result() for future in futures] == [here.submit(p).result() for p in range(WORK.parts)]
     assert [len(WORK.points_of(part)) for part in range(WORK.parts)] == [50] * 6
@@ -52,7 +57,7 @@ def test_processes_compute_what_this_one_computes() -> None:
 
 def test_processes_end_at_once_whatever_they_do() -> None:
     before = set(workers_of_mine())
-    with local_processes(LONG, 2) as workers:
+    with local_processes(compute_part, LONG, 2, LOST) as workers:
         futures = [workers.submit(part) for part in range(LONG.parts)]
     assert all(future.cancelled() or future.exception() is not None for future in futures)
     assert set(workers_of_mine()) <= before
@@ -71,6 +76,55 @@ def test_a_process_stopped_from_outside_is_told_and_finished_parts_are_kept(tmp_
     with pytest.raises(ApcError, match="E889 a process that computed ended without a word"):
         sweep(MODEL, {"it.stiffness": "1 N/m:9 kN/m:1000"}, out=tmp_path / "r.csv", jobs=2, progress=stop)
     assert 1 <= len(parts(tmp_path / "r.csv")) < 16
+
+
+def test_a_process_stopped_from_outside_ends_the_runs_it_played_with_a_sentence() -> None:
+    if not Path("/proc/self/task").is_dir():
+        pytest.skip("this system does not tell which processes one has started")
+    before = set(workers_of_mine())
+
+    def stop(_: int) -> None:
+        for pid in set(workers_of_mine()) - before:
+            os.kill(pid, signal.SIGKILL)
+
+    settings = Settings(Fraction(1, 10), jit=False)
+    with pytest.raises(ApcError, match="E895 a process that played runs ended without a word"):
+        play_many(compiled(LOSSY), settings, runs=400, jobs=2, progress=stop)
+    assert set(workers_of_mine()) <= before
+
+
+def test_an_interrupt_ends_the_processes_at_once_and_keeps_the_runs_that_are_done() -> None:
+    before = set(workers_of_mine())
+
+    def stop(_: int) -> None:
+        raise KeyboardInterrupt
+
+    settings = Settings(Fraction(1, 10), jit=False)
+    found = play_many(compiled(LOSSY), settings, runs=400, jobs=2, progress=stop)
+    assert found.interrupted and 0 < len(found.runs) < 400
+    assert set(workers_of_mine()) <= before
+
+
+def test_a_number_of_peers_whose_process_is_lost_is_refused_and_the_others_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    monkeypatch.setattr("apc.benchmark.scale._measure", _lost_at_four)
+    found = scale(tmp_path / "scene.yaml", [4, 5])
+    assert list(found.rows) == [5]
+    assert found.refused == (
+        (4, "the process that measured it ended without a word: stopped from outside, or out of memory"),
+    )
+
+
+def _lost_at_four(_: Path, count: int) -> int:
+    if count == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return count
+
+
+def test_a_model_sent_to_another_process_is_the_same_model() -> None:
+    assert model_bytes(model_of_bytes(model_bytes(MODEL))) == model_bytes(MODEL)
 
 
 def test_at_least_one_core_is_there() -> None:

@@ -1,4 +1,4 @@
-"""Claims about `apc.network.channel_law`."""
+"""Claims about `apc.network.channel`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.network.channel_law import LATEST, PARETO_MOST, channel_law, deviates
+from apc.network.channel import LATEST, PARETO_MOST, channel_law, deviates
 from tests.lossy import RELIABLE, delays, unreliable
 from tests.topologies import compiled
 

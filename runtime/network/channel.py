@@ -1,0 +1,214 @@
+"""What an unreliable link does to packets: its law in numbers, and which of them get lost or come how late.
+
+Takes: a link's `Channel` and the scene's numbers; the two peers of each way, a seed.
+Gives: `ChannelLaw`, `channel_law`, `LATEST`; `deviates`, the jitter's distributions; `PacketSource`, the
+delays of packets.
+Guarantees: one law for all ways of a link with one delay. Equal seeds give equal packets, in any order of the
+ways, whoever else is there, however time is cut into pieces, with every version of NumPy; every way from peer
+to peer is independent of the others.
+Does not: know what is in a packet, or which of them a tick sees (see `timetable`).
+
+Each packet of a way uses up `WORDS` random words, whatever the channel: the change of state after it, its
+loss, and two for its jitter. So runs of other probabilities meet the same luck: a packet that is lost at some
+probability of independent losses is lost at any larger one.
+
+A way starts in its stationary state: the first packet is as likely to be lost as any other (in netem, a way
+starts good).
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.errors import ApcError, Mistake, Place
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+WORDS = 4  # random words a packet
+
+# netem's Pareto table (iproute2, netem/pareto.c): shape 3, its mean 3/2 taken off, times 4/3, and no more
+# than 4, the largest number that the table can hold (32767/8192).
+PARETO_SHAPE = 3
+
+PARETO_MOST = 4.0
+
+# The largest numbers that `deviates` gives: of 53 random bits, a normal is never beyond √(2·53·ln 2) = 8.57.
+LATEST = {"uniform": 1.0, "normal": math.sqrt(2 * 53 * math.log(2)), "pareto": PARETO_MOST}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelLaw:
+    """The numbers of a channel.
+
+    `p`, `r`, `one_minus_h` and `one_minus_k` are netem's `gemodel` (see `compiled.Loss`); `delay` and
+    `jitter` are in seconds; `trace` (n,) replaces all of them: seconds, infinite for a lost packet.
+    """
+
+    p: float
+    r: float
+    one_minus_h: float
+    one_minus_k: float
+    delay: float
+    jitter: float
+    distribution: str
+    trace: Floats | None
+
+    @property
+    def bad(self) -> float:
+        """The share of time in the bad state: p/(p + r), 0 if the state never changes."""
+        return self.p / (self.p + self.r) if self.p + self.r else 0.0
+
+    @property
+    def mean_loss(self) -> float:
+        """The share of packets that get lost, in the long run."""
+        if self.trace is not None:
+            return float(np.mean(np.isinf(self.trace)))
+        return self.bad * self.one_minus_h + (1 - self.bad) * self.one_minus_k
+
+    @property
+    def longest(self) -> float:
+        """The longest delay that a packet which arrives can have, in seconds."""
+        if self.trace is not None:
+            return float(np.max(self.trace, initial=0.0, where=np.isfinite(self.trace)))
+        return self.delay + self.jitter * LATEST[self.distribution]
+
+
+def channel_law(system: CompiledSystem, link: Link, delay: Fraction) -> ChannelLaw:
+    """Return the numbers of a link's channel.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to use (see `overrides.apply`).
+    link
+        A link of it that has a channel.
+    delay
+        The delay of the way, in seconds.
+
+    Raises
+    ------
+    ApcError
+        E891 a group of peers sets a number of the link for itself.
+    """
+    channel = link.channel
+    assert channel is not None, f"{link.name} is reliable"
+    loss = (
+        ()
+        if channel.loss is None
+        else (channel.loss.p, channel.loss.r, channel.loss.one_minus_h, channel.loss.one_minus_k)
+    )
+    for group in system.groups:
+        for parameter in group.values:
+            if parameter.name in loss:
+                what = f"{parameter.name} is of a link, the same for all peers: {group.name} can't set it"
+                raise ApcError(Mistake("E891", Place(system.name), what))
+    value = {parameter.name: parameter.value for parameter in system.parameters}
+    seconds = {timing.name: float(timing.value) for timing in system.timings}
+    p, r, one_minus_h, one_minus_k = (value[name] for name in loss) if loss else (0.0, 1.0, 1.0, 0.0)
+    jitter = 0.0 if channel.jitter is None else seconds[channel.jitter]
+    return ChannelLaw(
+        p, r, one_minus_h, one_minus_k, float(delay), jitter, channel.distribution, channel.trace
+    )
+
+
+def deviates(distribution: str, one: Floats, two: Floats) -> Floats:
+    """Return what a jitter of 1 adds to a delay, drawn from a distribution.
+
+    Parameters
+    ----------
+    distribution
+        "uniform": evenly from −1 to 1; "normal": of mean 0 and standard deviation 1; "pareto": netem's, from
+        −2/3 to 4, many a little early and few very late, of mean −0.033 and standard deviation 0.84.
+    one, two
+        Independent numbers (n,) from 0 to less than 1.
+    """
+    match distribution:
+        case "uniform":
+            return 2 * one - 1
+        case "normal":  # Box and Muller (1958)
+            normal = np.sqrt(-2 * np.log1p(-one)) * np.cos(2 * np.pi * two)
+            return np.asarray(normal, dtype=np.float64)
+    assert distribution == "pareto", f"no such distribution: {distribution}"
+    tail = (1 - one) ** (-1 / PARETO_SHAPE)
+    late = (tail - PARETO_SHAPE / (PARETO_SHAPE - 1)) * 4 / 3
+    return np.asarray(np.minimum(late, PARETO_MOST), dtype=np.float64)
+
+
+class PacketSource:
+    """The packets of some ways of one link, in the order they are sent; what is taken is gone."""
+
+    def __init__(
+        self, law: ChannelLaw, link: str, pairs: Sequence[tuple[int, int]], *, seed: int = 0, run: int = 0
+    ) -> None:
+        """Start at the first packet.
+
+        Parameters
+        ----------
+        law
+            The channel's numbers, those of all these ways.
+        link
+            The link's name.
+        pairs
+            The peers (sender, receiver) of each of the M ways, by their numbers, from 0.
+        seed, run
+            The experiment's seed, and which run of it this is; 0 or more.
+        """
+        self.law = law
+        self.ways = len(pairs)
+        self.taken = 0  # packets of each way
+        # A name, not a place among the links: another link beside this one changes nothing here.
+        number = zlib.crc32(link.encode())
+        # A bit generator's words are the same in every version of NumPy (NEP 19), a distribution's are not.
+        self._bits = [
+            np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(number, run, sender, receiver)))
+            for sender, receiver in pairs
+        ]
+        self._bad: Flags = self._uniforms(1)[:, 0, 0] < law.bad
+
+    def take(self, count: int) -> Floats:
+        """Return the delays (M, count) in seconds of the next packets, infinite for those that get lost."""
+        law, first = self.law, self.taken
+        self.taken += count
+        if law.trace is not None:
+            recorded = law.trace[np.arange(first, first + count) % law.trace.size]
+            return np.broadcast_to(recorded, (self.ways, count))
+        uniforms = self._uniforms(count)
+        bad = self._states(uniforms[..., 0])
+        lost = uniforms[..., 1] < np.where(bad, law.one_minus_h, law.one_minus_k)
+        late = deviates(law.distribution, uniforms[..., 2], uniforms[..., 3]) if law.jitter else 0.0
+        # Nothing arrives before it was sent: as in netem, a delay that would be negative is none.
+        return np.where(lost, np.inf, np.maximum(law.delay + law.jitter * late, 0.0))
+
+    def _uniforms(self, count: int) -> Floats:
+        """Return numbers (M, count, WORDS) from 0 to less than 1, of 53 bits each."""
+        words = np.empty((self.ways, count * WORDS), np.uint64)
+        for row, bits in zip(words, self._bits, strict=True):
+            row[:] = bits.random_raw(count * WORDS)
+        uniforms = np.asarray((words >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
+        return uniforms.reshape(self.ways, count, WORDS)
+
+    def _states(self, uniforms: Floats) -> Flags:
+        """Return whether each way is bad at each packet (M, count).
+
+        The step after a packet is a map of {good, bad} to itself: one of both constants, the identity, or the
+        exchange. So the state is that of the last constant, exchanged as often as there were exchanges since.
+        """
+        turns_bad, turns_good = uniforms < self.law.p, uniforms >= 1 - self.law.r
+        steps = np.arange(1, uniforms.shape[1] + 1)
+        constant = np.maximum.accumulate(np.where(turns_bad != turns_good, steps, 0), axis=1)
+        none = np.zeros((self.ways, 1), np.int64)
+        exchanges = np.hstack([none, np.cumsum(turns_bad & turns_good, axis=1)])
+        first = np.take_along_axis(np.hstack([self._bad[:, None], turns_bad]), constant, axis=1)
+        since = exchanges[:, 1:] - np.take_along_axis(exchanges, constant, axis=1)
+        bad = np.hstack([self._bad[:, None], first ^ (since % 2 == 1)])
+        self._bad = bad[:, -1]
+        return bad[:, :-1]
