@@ -98,7 +98,7 @@ HOUSE = (
         """,
     ),
     ("apc.answers", "answer report"),
-    ("apc.benchmark", "timing pushes events reference bench hard scale report figure"),
+    ("apc.benchmark", "timing truth bench hard scale report figure"),
     # what a person calls
     (
         "apc",

@@ -13,7 +13,6 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from fractions import Fraction
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -21,8 +20,8 @@ from typing import Any
 
 from apc.analysis.analysis import analyze
 from apc.benchmark.bench import reason_of
-from apc.benchmark.reference import Truth, spectral_truth
 from apc.benchmark.timing import median_time, timed
+from apc.benchmark.truth import Truth, spectral_truth
 from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.pipeline import stages_of
@@ -151,16 +150,13 @@ def _measure(path: Path, count: int) -> ScaleRow | str:
             truth = spectral_truth(system)
     except ApcError as error:
         return reason_of(error)
-    off = None
-    if isinstance(truth, Truth):
-        off = float(abs(Fraction(truth.digits) - Fraction(found.spectral_radius)))
     return ScaleRow(
         count=count,
         peers=system.peers,
         compile_s=compiled,
         analyze_s=analyzed,
         memory=memory,
-        error=off,
+        error=truth.error_of(found.spectral_radius) if isinstance(truth, Truth) else None,
         bound=found.spectral_radius_error,
         method=found.method,
         verdict=found.verdict,
