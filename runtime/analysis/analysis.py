@@ -275,7 +275,7 @@ def _solve_ring(
     system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, certify: bool
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve equal peers on a large ring: those of its loops that decide."""
-    from apc.large.graph import deciding_loops, with_the_rest
+    from apc.large.rings import deciding_loops, with_the_rest
 
     ring = deciding_loops(groups, exchange)
     spectrum = _solve_closed(system, ring.arrangement.loops, certify=certify)

@@ -1,7 +1,7 @@
 """How a system is going to be analysed: by which method, as which systems.
 
 Takes: a `CompiledSystem` with its Jacobians, schedules and numbers, and the exchange between its peers.
-Gives: `Plan`, `make_plan`, `METHODS`; `refuse_varying`.
+Gives: `Plan`, `make_plan`, `METHODS`; `refuse_varying`, `is_large_ring`.
 Guarantees: nothing is solved, and no matrix of a whole system is built.
 Does not: analyse (see `analysis`).
 """
@@ -15,6 +15,7 @@ from apc.analysis.switches import varying_slopes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
+from apc.eigen.graph_loops import common_graph
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
 from apc.eigen.peers import more_differ, peer_groups
@@ -22,7 +23,6 @@ from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.parameters import Numbers
 from apc.frame.schedule import Schedule
-from apc.large.graph import is_large_ring
 
 METHODS = ("auto", "modes", "dense", "determinant", "krylov")
 
@@ -35,6 +35,9 @@ MOST_FULL = 500
 
 # Equal peers on a graph without a closed form: of so many, its eigenvalues are not computed.
 MANY_PEERS = 1500
+
+# Equal peers on a ring of so many eigenvalues: only of those that decide is a system solved.
+MANY_EIGENVALUES = 128
 
 # From so many packets on their way on, leaving them out of the state is quicker.
 LONG_LINES = 60
@@ -140,6 +143,15 @@ def make_plan(
             if loop.states > MOST_STATES:
                 raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
     return Plan(found, groups, loops, False, _sizes(loops, found), notes)
+
+
+def is_large_ring(groups: Sequence[PeerGroup], exchange: Exchange) -> bool:
+    """Say whether all peers are equal, on one ring of many."""
+    ways = used_ways(group.schedule for group in groups)
+    shapes = {exchange.links[way.link].graph.shape for way in ways}
+    if len(groups) > 1 or shapes != {"ring"} or exchange.peers <= 2 * MANY_EIGENVALUES:
+        return False
+    return not common_graph(ways, exchange)
 
 
 def cannot_serve(system: CompiledSystem, method: str, reason: str) -> ApcError:

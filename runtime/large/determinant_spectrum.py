@@ -25,8 +25,7 @@ from apc.frame.site import LinearSite
 from apc.large.characteristic import Characteristic, null_vectors, weights_at
 from apc.large.crowds import Crowd, hear_roughly, lines_of, site_one, some_rows
 from apc.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
-from apc.large.response import differentiate
-from apc.large.transfer import CHUNK
+from apc.large.transfer import CHUNK, differentiate
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]
