@@ -28,9 +28,8 @@ from apc.compiler.language.evaluation import OPERATORS, Operation, compute
 from apc.compiler.language.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peer_group import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios
-from apc.eigen.runs import Runs
 from apc.frame.exact import evaluate_exact
 from apc.frame.linearize import site_of_row
 from apc.frame.names import Free, find

@@ -30,16 +30,19 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.words import counted, with_unit, wrapped
 from apc.eigen.balls import (
     Balls,
-    compose,
+    Dual,
+    closed_frame,
     frame_steps,
+    mapped,
     precision,
     rational_ball,
     reduced_balls,
+    slope_of,
     square,
+    step_duals,
 )
 from apc.eigen.certify import schur_cohn
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.duals import Dual, mapped, slope_of, step_duals
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import relative_places
@@ -260,7 +263,7 @@ def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
         frame_steps(site, group.schedule, step_duals)
         for site, group in zip(sites, question.system.sites, strict=True)
     ]
-    matrix = compose(question.system, sites, steps)
+    matrix = closed_frame(question.system, sites, steps)
     if by is not None:
         matrix = mapped(slope_of, matrix)
     return reduced_balls(matrix, question.vectors, question.held, question.rest)

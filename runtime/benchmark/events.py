@@ -32,7 +32,7 @@ from apc.benchmark.pushes import Push, impulse, in_the_way, push_of, switches
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.eigen.balls import rational_ball
 from apc.frame.exact import evaluate_exact, is_rational
-from apc.frame.guards import guards_of
+from apc.frame.jacobians import guards_of
 from apc.frame.parameters import exact_numbers, resolve
 
 Number = Any  # flint.arb, an exact 0 or 1, or an array of these
