@@ -45,8 +45,8 @@ HOUSE = (
         """
         exact names parameters overrides
         discretize exchange
-        guards site jacobians start linearize
-        schedule liveness hearing hyperperiod scheduling
+        site jacobians start linearize
+        schedule liveness hyperperiod scheduling
         lift batch_lift course residues
         """,
     ),
@@ -54,9 +54,8 @@ HOUSE = (
     (
         "apc.eigen",
         """
-        runs graph_modes peer_group listening peers closing coupling graph_loops twins modes
-        rigid components pseudospectrum relative eigenpairs enclosure balls roots certify ratios duals
-        spectrum
+        graph_modes peer_group listening peers closing graph_loops modes
+        rigid pseudospectrum relative eigenpairs enclosure balls roots certify ratios spectrum
         """,
     ),
     (

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis
 from apc.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import ClosedSystem, Hearing, StateLayout, close
+from apc.eigen.closing import ClosedSystem, Feedback, StateLayout, close
 from apc.eigen.relative import Relative, independent_places, relative_bounded
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
@@ -233,8 +233,8 @@ def _close(lifted: _Lifted) -> Floats:
     """Return A_cl of eq. (20): the loop u_D = F_D y_D closed; what is on its way is in the state."""
     one = FrameMap(*lifted.delayed)
     names = ("",) * len(one.p)
-    hearing = Hearing(lifted.f, np.zeros((len(lifted.f), len(one.p))))
-    return close([one], [hearing], StateLayout((0,), names, {})).matrix
+    feedback = Feedback(lifted.f, np.zeros((len(lifted.f), len(one.p))))
+    return close([one], [feedback], StateLayout((0,), names, {})).matrix
 
 
 def _acting(loop: OpenLoop) -> tuple[Floats, Floats, tuple[Floats, Floats]]:

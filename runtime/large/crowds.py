@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Closed, Hearing, StateLayout, close, closing_errors, lay_out
+from apc.eigen.closing import Closed, Feedback, StateLayout, close, closing_errors, lay_out
 from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import LiftedSite
@@ -133,30 +133,30 @@ def hear_roughly(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return M, B, S and D as `hear_themselves` has them, without their errors."""
-    layout, hearing = _open_loop(lifted, schedule, own, others)
-    return _cut(close([lifted], [hearing], layout))
+    layout, feedback = _open_loop(lifted, schedule, own, others)
+    return _cut(close([lifted], [feedback], layout))
 
 
 def _hear_themselves(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, ...]:
     """Close a chunk of sites, with the errors."""
-    layout, hearing = _open_loop(lifted, schedule, own, others)
+    layout, feedback = _open_loop(lifted, schedule, own, others)
     size = lifted.mapped(np.abs)
     wide = size.mapped(np.add, lifted.error)
-    error = closing_errors([size], [wide], [hearing.size], layout)
-    return (*_cut(close([lifted], [hearing], layout)), *_cut(error))
+    error = closing_errors([size], [wide], [feedback.size], layout)
+    return (*_cut(close([lifted], [feedback], layout)), *_cut(error))
 
 
 def _open_loop(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
-) -> tuple[StateLayout, Hearing]:
+) -> tuple[StateLayout, Feedback]:
     """Return the state of each site by itself, and what it hears of it and, behind it, of the others."""
     now, before, _ = lines_of(schedule)
     nothing = np.zeros((*own.shape, lifted.p.shape[-1]))
     outside = others[:, :, None] * np.eye(own.shape[1])
     heard = np.concatenate([nothing, own[:, :, None] * before, outside], axis=-1)
-    return lay_out([lifted.z_names], [schedule]), Hearing(own[:, :, None] * now, heard)
+    return lay_out([lifted.z_names], [schedule]), Feedback(own[:, :, None] * now, heard)
 
 
 def _cut(closed: Closed) -> tuple[Floats, Floats, Floats, Floats]:

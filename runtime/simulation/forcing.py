@@ -22,7 +22,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.guards import guards_of
+from apc.frame.jacobians import guards_of
 from apc.simulation.instants import at_instants
 from apc.simulation.propagate import Rates
 from apc.simulation.quadrature import AGREE, Kernel, Panels, integrate, magnitude, panels, whole

@@ -31,7 +31,7 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.eigen.balls import rational_ball
 from apc.frame.exact import evaluate_exact, is_rational
-from apc.frame.guards import guards_of
+from apc.frame.jacobians import guards_of
 from apc.frame.parameters import exact_numbers, resolve
 from tests.fifty_digits.pushes import Push, impulse, in_the_way, push_of, switches
 
