@@ -22,5 +22,5 @@ functions                   casadi_writer, reached: what is written; exchange, p
 compiled, plain, store      the compiled model; its functions as data; on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another
-view                        schema, listing; diagram, graphviz, marks, layers, picture, svg; contents
+view                        schema; diagram; svg, layers, picture; listing
 """
