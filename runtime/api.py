@@ -433,7 +433,7 @@ def show(path: str | Path, *, format: Format = "text") -> str:
     ApcError
         The file is at fault, or is a compiled model, which no longer has the equations as written.
     """
-    from apc.compiler.view import contents
+    from apc.compiler.view import listing
 
     path = Path(path)
     if path.suffix == ".apc":
@@ -441,13 +441,13 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         raise ApcError(Mistake("E615", Place(str(path)), what, hint=f"apc show {path.with_suffix('.yaml')}"))
     match format:
         case "text":
-            return contents.show_text(path)
+            return listing.show_text(path)
         case "json":
-            return json.dumps(contents.show_document(path), ensure_ascii=False, allow_nan=False, indent=2)
+            return json.dumps(listing.show_document(path), ensure_ascii=False, allow_nan=False, indent=2)
         case "dot":
-            return contents.show_dot(path)
+            return listing.show_dot(path)
         case "svg":
-            return contents.show_svg(path)
+            return listing.show_svg(path)
 
 
 def schema() -> dict[str, Any]:

@@ -38,7 +38,7 @@ HOUSE = (
     ),
     ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
-    ("apc.compiler.view", "schema listing diagram graphviz marks layers picture svg contents"),
+    ("apc.compiler.view", "schema diagram svg layers picture listing"),
     ("apc", "threads trouble distribution suffixes optional given result tables processes"),
     (
         "apc.frame",

@@ -28,11 +28,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.spectrum import Mode, Spectrum, judge, oscillation
-from apc.frame.course import turns
+from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
-from apc.large.crowds import Crowd, hear_roughly, site_one, some_rows
+from apc.large.crowds import (
+    Crowd,
+    hear_roughly,
+    mode_of,
+    site_one,
+    some_rows,
+    state_names,
+    turned_by,
+)
 from apc.large.sparse_system import (
     RigidSpace,
     SparseSystem,
@@ -253,48 +260,20 @@ def _mode(system: SparseSystem, listed: Sequence[Crowd], rigid: RigidSpace, pair
     own = np.abs(vector * covector)
     shares: dict[str, float] = {}
     for g, crowd in enumerate(listed):
-        waiting = zip(crowd.schedule.sent_names, crowd.schedule.depths, strict=True)
-        names = [*crowd.lifted.z_names, *(name for name, depth in waiting for _ in range(depth))]
         starts = system.starts[:-1][system.crowd_of == g]
-        for place, name in enumerate(names):
+        for place, name in enumerate(state_names(crowd)):
             name = f"{crowd.name}.{name}" if len(listed) > 1 else name
             shares[name] = shares.get(name, 0.0) + float(own[starts + place].sum())
-    total = sum(shares.values()) or 1.0
     peer = int(np.argmax(np.add.reduceat(own, system.starts[:-1])))
-    frequency, damping = _frequency(system, listed, peer, vector, covector, pair.value)
-    return Mode(
-        eigenvalue=pair.value,
-        magnitude=abs(pair.value),
-        multiplicity=1,
-        frequency_hz=frequency,
-        damping_ratio=damping,
-        shape="different peers",
-        participation=tuple((name, share / total) for name, share in shares.items()),
-        error=pair.error,
-    )
-
-
-def _frequency(
-    system: SparseSystem,
-    listed: Sequence[Crowd],
-    peer: int,
-    vector: Complexes,
-    covector: Complexes,
-    value: complex,
-) -> tuple[float, float]:
-    """Return frequency and damping, whole turns counted on the state of a peer that takes most part."""
     crowd, row = listed[system.crowd_of[peer]], int(system.row_of[peer])
-    n_z, count = crowd.lifted.p.shape[-1], len(crowd.jacobians.kind.states)
-    own = slice(int(system.starts[peer]), int(system.starts[peer]) + n_z)
-    if not count:
-        return 0.0, 1.0
-    state = np.array([int(np.argmax(np.abs(vector[own] * covector[own])[:count]))])
+    z, w = (
+        part[system.starts[peer] : system.starts[peer] + crowd.lifted.p.shape[-1]]
+        for part in (vector, covector)
+    )
     # What the peer hears is what its memory of it says: P z + Q r = ζ z.
-    left = value * vector[own] - crowd.lifted.p[row] @ vector[own]
-    heard = np.linalg.lstsq(crowd.lifted.q[row], left, rcond=None)[0]
-    start, one = vector[own, None], np.array([value])
-    angle = turns(site_one(crowd, row), crowd.schedule, start, heard[:, None], state, one)
-    return oscillation(abs(value), float(angle[0]), crowd.lifted.frame_s)
+    heard = np.linalg.lstsq(crowd.lifted.q[row], pair.value * z - crowd.lifted.p[row] @ z, rcond=None)[0]
+    turned = turned_by(site_one(crowd, row), crowd.schedule, pair.value, z, heard, w)
+    return mode_of(pair.value, pair.error, turned, shares, "different peers", 1)
 
 
 # The argument of a function of ζ.
