@@ -159,6 +159,12 @@ def test_the_compiler_never_imports_the_runtime(module: str) -> None:
     assert imports(modules()[module]) <= {name for name in ORDER if name.startswith("apc.compiler.")}
 
 
+@pytest.mark.parametrize("module", [name for name in ORDER if not name.startswith("apc.compiler.")])
+def test_no_expression_is_read_after_compiling(module: str) -> None:
+    read = {f"apc.compiler.language.{name}" for name in ("lexer", "grammar", "expression", "evaluation")}
+    assert not imports(modules()[module]) & read
+
+
 def test_the_compilers_map_names_every_module_of_it() -> None:
     text = ast.get_docstring(ast.parse((ROOT / "compiler" / "__init__.py").read_text(encoding="utf-8"))) or ""
     names = {name.split(".")[-1] for name in ORDER if name.startswith("apc.compiler.")}
