@@ -8,19 +8,19 @@ Does not: install anything.
 
 from __future__ import annotations
 
-from importlib.metadata import version
-
 DISTRIBUTION = "apc-haptics"
 
 
 def program_version() -> str:
     """Return the version of the program that is installed."""
-    return version(DISTRIBUTION)
+    return versions()[0][1]
 
 
 def versions(*libraries: str) -> tuple[tuple[str, str], ...]:
     """Return the versions of the program and of libraries, each with its name."""
-    return (("apc", program_version()), *((name, version(name)) for name in libraries))
+    from importlib.metadata import version  # it reads mail: most commands ask for no version
+
+    return (("apc", version(DISTRIBUTION)), *((name, version(name)) for name in libraries))
 
 
 def install_line(extra: str) -> str:
