@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
     from apc.analysis.contact_modes import ContactModes
     from apc.analysis.conventions import Conventions
+    from apc.analysis.methods import Method
     from apc.analysis.paper import PaperRoute
     from apc.benchmark.bench import Bench
     from apc.regions.region import Region
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
 
-Method = Literal["auto", "modes", "dense", "determinant", "krylov", "paper"]
 Format = Literal["text", "json", "dot", "svg"]
 
 

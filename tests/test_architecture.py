@@ -69,7 +69,7 @@ HOUSE = (
     (
         "apc.analysis",
         """
-        switches plan selfcheck analysis needs ranges box box_proof openloop paper conventions
+        methods switches plan selfcheck analysis needs ranges box box_proof openloop paper conventions
         contact_modes
         """,
     ),
@@ -93,8 +93,7 @@ HOUSE = (
     (
         "apc.regions",
         """
-        passivity overlay eigenpairs surrogate cells curves boundary_points boundary area staircase
-        axes strips region panels
+        passivity overlay eigenpairs surrogate cells curves boundary_points boundary axes strips region panels
         """,
     ),
     ("apc.benchmark", "timing pushes events reference bench hard scale"),
