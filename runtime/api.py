@@ -7,7 +7,6 @@ Does not: print.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -434,6 +433,7 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         The file is at fault, or is a compiled model, which no longer has the equations as written.
     """
     from apc.compiler.view import contents
+    from apc.present.forms import json_text
 
     path = Path(path)
     if path.suffix == ".apc":
@@ -443,7 +443,7 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         case "text":
             return contents.show_text(path)
         case "json":
-            return json.dumps(contents.show_document(path), ensure_ascii=False, allow_nan=False, indent=2)
+            return json_text(contents.show_document(path))
         case "dot":
             return contents.show_dot(path)
         case "svg":

@@ -37,7 +37,7 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
     if isinstance(value, tuple | list):
         return [document(one) for one in value]
     if isinstance(value, complex):
-        return [value.real, value.imag]
+        return document((value.real, value.imag))
     if isinstance(value, Fraction):
         return float(value)
     if is_dataclass(value):
