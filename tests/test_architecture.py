@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
@@ -68,7 +69,7 @@ HOUSE = (
     (
         "apc.analysis",
         """
-        switches plan selfcheck analysis needs ranges box box_proof openloop paper conventions
+        methods switches plan selfcheck analysis needs ranges box box_proof openloop paper conventions
         contact_modes
         """,
     ),
@@ -92,8 +93,7 @@ HOUSE = (
     (
         "apc.regions",
         """
-        passivity overlay eigenpairs surrogate cells curves boundary_points boundary area staircase
-        axes strips region panels
+        passivity overlay eigenpairs surrogate cells curves boundary_points boundary axes strips region panels
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
@@ -152,6 +152,22 @@ def test_every_module_has_its_place_in_the_order() -> None:
 @pytest.mark.parametrize("module", ORDER)
 def test_a_module_imports_only_what_comes_before_it(module: str) -> None:
     assert imports(modules()[module]) <= set(ORDER[: ORDER.index(module)])
+
+
+def test_every_result_is_shown_as_text_and_as_data() -> None:
+    for name, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and "Result" in map(ast.unparse, node.bases):
+                module, _, own = getattr(importlib.import_module(name), node.name).shown_by.partition(":")
+                for form in ("text", "document"):
+                    shown = importlib.import_module(f"apc.present.{module}")
+                    assert callable(getattr(shown, f"{own}_{form}")), f"{name}: {node.name}"
+
+
+def test_what_is_looked_up_by_name_is_a_result_or_somebody_elses_library() -> None:
+    """Or the order would be kept in words only."""
+    calling = {name for name, path in modules().items() if "import_module(" in path.read_text("utf-8")}
+    assert calling == {"apc.result", "apc.optional", "apc.tables", "apc.threads"}
 
 
 @pytest.mark.parametrize("module", [name for name in ORDER if name.startswith("apc.compiler.")])

@@ -1,7 +1,7 @@
 """How a system is going to be analysed: by which method, as which systems.
 
 Takes: a `CompiledSystem` with its Jacobians, schedules and numbers, and the exchange between its peers.
-Gives: `Plan`, `make_plan`, `METHODS`; `refuse_varying`, `is_large_ring`.
+Gives: `Plan`, `make_plan`; `refuse_varying`, `is_large_ring`.
 Guarantees: nothing is solved, and no matrix of a whole system is built.
 Does not: analyse (see `analysis`).
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from apc.analysis.methods import METHODS, PAPER
 from apc.analysis.switches import varying_slopes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -23,8 +24,6 @@ from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.parameters import Numbers
 from apc.frame.schedule import Schedule
-
-METHODS = ("auto", "modes", "dense", "determinant", "krylov")
 
 # Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
 # says more.
@@ -99,7 +98,7 @@ def make_plan(
     jacobians, schedules, numbers, exchange
         One a kind, one a group, and what they are evaluated with.
     method
-        One of `METHODS`.
+        One of `methods.METHODS`, not the paper's.
 
     Raises
     ------
@@ -107,7 +106,7 @@ def make_plan(
         E804 a system of too many states for its matrix, E850 a method that can't serve this scene; and those
         of `refuse_varying` and `peers.peer_groups`.
     """
-    assert method in METHODS, f"no such method: {method}"
+    assert method in METHODS and method != PAPER, f"no such method: {method}"
     refuse_varying(system, jacobians)
     if method in ("auto", "determinant", "krylov"):
         reason = _not_crowds(system, jacobians)

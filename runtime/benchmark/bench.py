@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
+from apc.analysis.methods import AUTO, METHODS, PAPER
 from apc.analysis.needs import needs
 from apc.analysis.paper import analyze_paper
 from apc.benchmark.timing import spread_of, take_turns, timed
@@ -62,8 +63,8 @@ MOST_SPARSE = 2500
 FAILED, WRONG = "FAILED, which is a bug", "WRONG"  # how what must not be is said
 
 # Of `analyze(method=…)`, and the two that are called otherwise.
-CERTIFIED, PAPER = "certified", "paper"
-ANALYSES = ("modes", "dense", "determinant", "krylov", CERTIFIED, PAPER)
+CERTIFIED = "certified"
+ANALYSES = (*(one for one in METHODS if one not in (AUTO, PAPER)), CERTIFIED, PAPER)
 
 
 @dataclass(frozen=True, slots=True)
