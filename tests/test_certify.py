@@ -190,7 +190,7 @@ def test_a_proof_names_where_the_discs_are() -> None:
     [common, difference] = split(*lifted_groups(paper())).systems
     for system in (common, difference):
         free = find_rigid_modes(system, with_drifts=False)
-        proof = prove(system, free, independent_places(free.basis.T).tolist())
+        proof = prove(system, free, independent_places(free.basis.T))
         assert proof.inside is True
         assert len(proof.values) == len(system.names) - len(free.names)
         assert (np.abs(proof.values) + proof.radii).max() < 1

@@ -44,7 +44,7 @@ from apc.eigen.certify import schur_cohn
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.ratios import Ratio
-from apc.eigen.relative import relative_places
+from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, stays_rigid, what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
 from apc.frame.site import LinearSite, entrywise
@@ -90,15 +90,14 @@ class BoxProof(Result):
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Question:
     """One closed system over the box: its sites over the open parameters, its rigid motions and where."""
 
     system: ClosedSystem
     sites: tuple[LinearSite, ...]
     vectors: tuple[tuple[Fraction, ...], ...]
-    held: tuple[int, ...]
-    rest: tuple[int, ...]
+    held: NDArray[np.intp]
 
 
 def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
@@ -175,8 +174,7 @@ def _answer(
 
 
 def _question(system: ClosedSystem, sites: tuple[LinearSite, ...], free: RigidModes) -> _Question:
-    held, rest = relative_places(free.basis)
-    return _Question(system, sites, free.exact, tuple(held.tolist()), tuple(rest.tolist()))
+    return _Question(system, sites, free.exact, independent_places(free.basis.T))
 
 
 def _search(question: _Question, whole: Cell) -> _Found:
@@ -227,7 +225,7 @@ def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
     matrix = closed_frame(question.system, sites, steps)
     if by is not None:
         matrix = mapped(slope_of, matrix)
-    return reduced_balls(matrix, question.vectors, question.held, question.rest)
+    return reduced_balls(matrix, question.vectors, question.held)
 
 
 def _site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSite:

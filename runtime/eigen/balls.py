@@ -200,9 +200,7 @@ def square(balls: Balls) -> Any:
     return flint.arb_mat(len(balls), len(balls), [flint.arb(entry) for entry in balls.ravel()])
 
 
-def reduced_balls(
-    matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: Sequence[int], rest: Sequence[int]
-) -> Balls:
+def reduced_balls(matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: NDArray[np.intp]) -> Balls:
     """Return the matrix without its rigid motions, in relative coordinates (see `relative`), W exact.
 
     Parameters
@@ -211,19 +209,21 @@ def reduced_balls(
         The closed matrix (n, n).
     vectors
         V: the rigid motions, exact, each (n,).
-    held, rest
-        The places p, as many as there are motions, whose coordinates go, and all others.
+    held
+        The places p, as many as there are motions, whose coordinates go.
     """
-    exact = [[flint.fmpq(v[place].numerator, v[place].denominator) for v in vectors] for place in held]
-    others = [[flint.fmpq(v[place].numerator, v[place].denominator) for v in vectors] for place in rest]
+    rest = np.delete(np.arange(len(matrix)), held)
     count = len(held)
-    quotient = flint.fmpq_mat(len(rest), count, [e for row in others for e in row])
-    quotient = quotient * flint.fmpq_mat(count, count, [e for row in exact for e in row]).inv()
+
+    def rows(places: NDArray[np.intp]) -> Any:
+        entries = [flint.fmpq(v[place].numerator, v[place].denominator) for place in places for v in vectors]
+        return flint.fmpq_mat(len(places), count, entries)
+
+    quotient = rows(rest) * rows(held).inv()
     weights: Balls = np.empty(len(rest) * count, dtype=object)
     weights[:] = [rational_ball(Fraction(int(e.p), int(e.q))) for e in quotient.entries()]
     weights = weights.reshape(len(rest), count)
-    places = np.array(held, dtype=np.intp), np.array(rest, dtype=np.intp)
-    return relative(matrix, Relative(*places, weights, np.zeros(weights.shape)), multiply=_multiply)
+    return relative(matrix, Relative(held, rest, weights, np.zeros(weights.shape)), multiply=_multiply)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -88,7 +88,7 @@ class Proof:
     left: Complexes | None
 
 
-def prove(system: ClosedSystem, free: RigidModes, held: Sequence[int]) -> Proof:
+def prove(system: ClosedSystem, free: RigidModes, held: Places) -> Proof:
     """Prove a closed system stable or unstable, in rising precision.
 
     Parameters
@@ -105,13 +105,13 @@ def prove(system: ClosedSystem, free: RigidModes, held: Sequence[int]) -> Proof:
     for bits in PRECISIONS:
         with precision(bits):
             matrix = frame_balls(system)
-            reduced = _relative(matrix, free, held)
+            reduced = reduced_balls(matrix, free.exact, held)
             parts = _parts(reduced)
             if not searched and any(_may_be_one(part.polynomial) for part in parts):
                 free, searched = find_rigid_modes(system), True
                 if free.drifts:
-                    held = independent_places(free.basis.T).tolist()
-                    reduced = _relative(matrix, free, held)
+                    held = independent_places(free.basis.T)
+                    reduced = reduced_balls(matrix, free.exact, held)
                     parts = _parts(reduced)
             roots = [approach_roots(part.polynomial, part.guesses, bits) for part in parts]
             values, radii = _enclosed(parts, roots, bits)
@@ -140,11 +140,6 @@ class _Part:
     block: Any  # flint.arb_mat
     polynomial: Any  # flint.arb_poly
     guesses: Complexes
-
-
-def _relative(matrix: Balls, free: RigidModes, held: Sequence[int]) -> Balls:
-    rest = [place for place in range(len(matrix)) if place not in set(held)]
-    return reduced_balls(matrix, free.exact, held, rest)
 
 
 def _parts(reduced: Balls) -> list[_Part]:

@@ -225,7 +225,7 @@ def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
 
 def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     """Solve one system in balls; what these leave open stays as floats found it."""
-    proof = prove(system, estimate.free, independent_places(estimate.free.basis.T).tolist())
+    proof = prove(system, estimate.free, independent_places(estimate.free.basis.T))
     if proof.free.drifts != estimate.free.drifts:
         estimate = _solve(system, proof.free)
     inside, bits = proof.inside, proof.bits

@@ -14,13 +14,12 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import flint
 import numpy as np
 
-from apc.eigen.balls import frame_balls, precision, reduced_balls, unprovable
+from apc.eigen.balls import frame_balls, precision, reduced_balls, square, unprovable
 from apc.eigen.certify import MOST_PROVED, schur_cohn
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.relative import relative_places
+from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, solve_spectrum
 from apc.vary.crossings import Root
@@ -144,12 +143,11 @@ def _held(root: Root, above: _Above, half: float, low: float, high: float) -> tu
 
 def _inside(system: ClosedSystem, free: RigidModes) -> tuple[bool | None, int]:
     """Say whether all eigenvalues but the rigid ones are proved inside the circle, or one outside."""
-    held, rest = (places.tolist() for places in relative_places(free.basis))
+    held = independent_places(free.basis.T)
     for bits in PRECISIONS:
         with precision(bits):
-            reduced = reduced_balls(frame_balls(system), free.exact, held, rest)
-            square = flint.arb_mat(len(rest), len(rest), [flint.arb(entry) for entry in reduced.ravel()])
-            inside = schur_cohn(square.charpoly().coeffs())
+            reduced = square(reduced_balls(frame_balls(system), free.exact, held))
+            inside = schur_cohn(reduced.charpoly().coeffs())
         if inside is not None:
             return inside, bits
     return None, PRECISIONS[-1]
