@@ -169,7 +169,7 @@ def _beside(blocks: Sequence[Floats | Complexes], listed: Sequence[Crowd]) -> An
             found.append(scipy.sparse.bsr_matrix((own, np.arange(count), np.arange(count + 1)), shape=shape))
         else:
             found.append(scipy.sparse.csr_matrix(shape))
-    whole = scipy.sparse.block_diag(found, format="csr")
+    whole = scipy.sparse.block_diag(found, format="csr") if len(found) > 1 else found[0].tocsr()
     whole.eliminate_zeros()
     return whole
 
