@@ -5,21 +5,22 @@ files                       what is read and written, whoever named it
 multiples                   common multiples and divisors of exact times
 weights                     exact sums of the decimals by which peers weigh one another
 source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
-language                    expression, lexer, grammar: text to trees; evaluation: trees to values
+language                    expression, lexer, grammar: text to trees; evaluation: trees to formulas and
+                            values
                             dimensions, unit_grammar, unit_names, units, unit_text, unit_check
                             values, tables, recordings: numbers of a scene, and in CSV files
 components                  component, parts, declarations, component_check, definitions, library
 scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
-                            studies: a section each; followers: what a group's settings change inside
-                            parts; scene: all of them
+                            studies: a section each; scene: all of them
 equations                   connections: where connectors meet; flatten
                             reductions: what is heard of the others; clock_inference: what ticks together;
                             clocks
                             symbolic, zero_test: SymPy; solution, matching, residuals, elimination, tearing,
                             blocks: solving; jets, aliases, index: derivatives and states; structure
-functions                   casadi_writer, reached: what is written; exchange, ports: what lies beside;
+functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
-compiled, plain, store      the compiled model; its functions as data; on disk
+compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others
+store                       the compiled model on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another
 view                        schema, listing; diagram, graphviz, marks, layers, picture, svg; contents

@@ -21,8 +21,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.util
+import io
 import json
 import lzma
+import os
 import struct
 import zipfile
 import zlib
@@ -31,13 +33,17 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
+from apc.compiler.files import RefusedError, files_below, read_file
 from apc.compiler.seal import is_sealed
 
-FORMAT = 6  # of NAME.apc
+FORMAT = 7  # of NAME.apc
 MEMBER = "model.json"  # of the archive: structure, numbers and the digests of the other members
+FIELDS = {"format", "system", "members"}  # of the document
 SEAL = "seal"  # of the archive: who wrote the document, see `seal`
-LARGEST = 256 * 2**20  # bytes of all members
+LARGEST = 256 * 2**20  # bytes of the file, and of all members
+MOST_LISTED = 2**22  # bytes of the archive's list of members: each takes ten times that of memory
 MOST_VALUES = 2**22  # in the document: each takes up to a hundred bytes of memory
+SUFFIX = ".yaml"  # of the files in a folder of components
 PROGRAM = "apc"
 LIBRARIES = ("casadi", "sympy")  # a newer one may write other functions
 # What zipfile, its decompressors, json and our own reading of the document raise at what isn't theirs.
@@ -73,32 +79,58 @@ def read_archive(path: Path) -> Archive:
 
     Raises
     ------
-    OSError
+    RefusedError
         The file can't be read.
     DamageError
-        It is larger than a model can be, or a member was changed.
+        It unpacks to more than a model can be, or a member was changed.
     ValueError
         Or another of DAMAGE: it is none. A document of another format is returned without members.
     """
-    with zipfile.ZipFile(path) as archive:
+    data = read_file(path, LARGEST)
+    _check_end(data)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
         listed = archive.infolist()
         if any(one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for one in listed):
             raise ValueError("it is packed otherwise")
         if sum(one.file_size for one in listed) > LARGEST:
             raise DamageError(f"it unpacks to more than {LARGEST >> 20} MiB")
-        text = archive.read(MEMBER)
+        text = _member(archive, MEMBER)
         if sum(map(text.count, (b"[", b"{", b","))) > MOST_VALUES:
             raise DamageError(f"it holds more than {MOST_VALUES} values")
         document = json.loads(text)
         if document["format"] != FORMAT:
             return Archive(document, {}, sealed=False)
+        names = sorted(one.filename for one in listed if one.filename != SEAL)
+        if names != sorted((MEMBER, *document["members"])) or document.keys() != FIELDS:
+            raise ValueError("it holds what nothing names")
         members = {}
         for name, digest in document["members"].items():
-            members[name] = archive.read(name)
+            members[name] = _member(archive, name)
             if hashlib.sha256(members[name]).hexdigest() != digest:
                 raise DamageError(f"its member {name} was changed")
-        found = archive.read(SEAL).decode() if SEAL in archive.namelist() else ""
+        found = _member(archive, SEAL).decode() if SEAL in archive.namelist() else ""
         return Archive(document, members, is_sealed(text, found))
+
+
+def _check_end(data: bytes) -> None:
+    """Check that an archive ends where its file does, and that its list of members is no larger than said.
+
+    The last bytes of a ZIP archive: a mark, four numbers of disks and members, how long the list is and where
+    it begins, how long a comment. A longer form of the same may be pointed at before: no model needs it.
+    """
+    end = struct.Struct("<4s4H2LH")
+    mark, *_, size, begin, comment = end.unpack(data[-end.size :])
+    longer = data[-end.size - 20 :].startswith(b"PK\x06\x07")
+    if mark != b"PK\x05\x06" or comment or longer or begin + size + end.size != len(data):
+        raise ValueError("there is something else in it")
+    if size > MOST_LISTED:
+        raise DamageError(f"its list of members is larger than {MOST_LISTED >> 20} MiB")
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Return a member, no more of it than the archive's list says, whatever it would unpack to."""
+    with archive.open(name) as stream:
+        return stream.read(archive.getinfo(name).file_size)
 
 
 def record_of(archive: Archive) -> Record:
@@ -138,7 +170,7 @@ def changed(record: Record, folder: Path) -> str:
             now, shown = _path_digest(folder / name), name.removeprefix("./")
         else:
             now, shown = builtin_digest(name), f"the library's {name}"
-        if now != digest:
+        if now != digest or not now:
             return shown
     return ""
 
@@ -231,16 +263,16 @@ def _relative(name: str) -> str:
 
 
 def _path_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of a folder's YAML files and their names; empty if unreadable."""
+    """Return the SHA-256 of a file, or of a folder's YAML files and their names; empty if it isn't read."""
     try:
-        if not path.is_dir():
-            if not path.is_file():  # a device or a pipe may have no end
-                return ""
-            return hashlib.sha256(path.read_bytes()).hexdigest()
-        whole = hashlib.sha256()
-        for file in sorted(path.rglob("*.yaml")):
-            content = hashlib.sha256(file.read_bytes()).hexdigest()
-            whole.update(f"{file.relative_to(path).as_posix()}\0{content}\n".encode())
+        if not os.path.isdir(path):  # noqa: PTH112 -- of any name, even one that no file can have
+            return hashlib.sha256(read_file(path, LARGEST)).hexdigest()
+        whole, rest = hashlib.sha256(), LARGEST
+        for file in files_below(path, SUFFIX):
+            content = read_file(file, rest)
+            rest -= len(content)
+            digest = hashlib.sha256(content).hexdigest()
+            whole.update(f"{file.relative_to(path).as_posix()}\0{digest}\n".encode())
         return whole.hexdigest()
-    except (OSError, ValueError):  # ValueError: a NUL in the name
+    except (RefusedError, ValueError):  # ValueError: a name that is no text
         return ""

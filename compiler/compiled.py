@@ -123,17 +123,38 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
+class Formula:
+    """What a number follows from: other numbers by their `names` (n,), and `numbers` (m,) of its own text.
+
+    `function` of both, (n,) and (m,) → (1,), is plain data of a CasADi function that keeps a place for each
+    node of the `text`, so that it is computed in exact rationals as well (see `formula`). `spans` say from
+    where to where in the text its values stand: those of the names and numbers, then of the operations.
+    """
+
+    text: str
+    names: tuple[str, ...]
+    numbers: tuple[Fraction, ...]
+    function: Any  # plain.PlainFunction
+    spans: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Timing:
-    """A period, phase or delay: exact value in seconds; `expression` is its text if it depends on names."""
+    """A period, phase or delay: exact value in seconds; `formula` if it follows from other numbers."""
 
     name: str
     value: Fraction
-    expression: str | None = None
+    formula: Formula | None = None
+
+    @property
+    def number(self) -> Fraction:
+        """The value, exact, as a parameter has it."""
+        return self.value
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number of the scene: SI value; `expression` is its text if it depends on other parameters.
+    """A number of the scene: SI value; `formula` if it follows from other numbers.
 
     `minimum` is the least value allowed; `open_minimum` says that the least value itself is excluded.
     `exact` is the rational that `value` is the nearest float to, as 5/3; None where `value` was given as a
@@ -144,7 +165,7 @@ class Parameter:
     name: str
     unit: str  # in SI base or derived units, "1" when dimensionless
     value: float
-    expression: str | None = None
+    formula: Formula | None = None
     minimum: float | None = None
     open_minimum: bool = False
     maximum: float | None = None
@@ -267,7 +288,7 @@ class Column:
 class Group:
     """`count` peers of kind `kind` (an index); `values` overrides parameters, by name, for this group.
 
-    An override is a `Parameter` of the same name, so that it can be an expression too; `columns` override
+    An override is a `Parameter` of the same name, so that it can have a formula too; `columns` override
     parameters peer by peer.
     """
 
@@ -307,6 +328,8 @@ class Axis:
 class CompiledSystem:
     """A compiled scene. `dropped` lists what the scene named but does not need, with the reason.
 
+    `followers` are the names of all parameters and timings with a formula, of any group, in an order in which
+    each stands behind what it follows from.
     `region` are the axes x and y of the study of that name, empty or one if the scene leaves them open.
     """
 
@@ -322,6 +345,7 @@ class CompiledSystem:
     origin: Origin
     experiment: Experiment = Experiment()
     region: tuple[Axis, ...] = ()
+    followers: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Return what the model holds, a line a kind of peer."""

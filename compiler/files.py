@@ -1,11 +1,12 @@
 """What is read from disk and written to it, whoever named the file.
 
-Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `is_bounded`, `same_file`;
-`write_file`, `check_target`, `unwritable`, and for what is written piece by piece `begin_file`,
-`finish_file`, `drop_file`, `partial_name`.
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
+`write_file`, `write_text`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for what is written
+piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a
-link stays and its file is written; a device or pipe is written to, never replaced.
+link stays and its file is written; a device or pipe, or what standard output writes to, is written to, never
+replaced.
 Does not: know a format, or say at which line a file was named.
 """
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +26,9 @@ from apc.compiler.errors import ApcError, Mistake, Place
 # Of a folder of a user's components: the largest library we know of has a hundred files, three deep.
 MOST_ENTRIES = 10_000
 MOST_DEPTH = 8
+STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
+KERNELS_OWN = "is an answer of the system's kernel"
 
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
 
@@ -55,8 +59,11 @@ def read_file(path: Path, most: int) -> bytes:
     try:
         check_file(path, most)  # first, as opening a device can already do something
         with open(path, "rb", opener=_without_waiting) as stream:
-            _check(os.fstat(stream.fileno()), most)  # of what was opened
-            data = stream.read(most + 1)
+            found = os.fstat(stream.fileno())
+            _check(found, most)  # of what was opened
+            data = stream.read(found.st_size + 1)  # as many bytes are set aside
+            if len(data) > found.st_size:
+                data += stream.read(most + 1 - len(data))
     except (OSError, ValueError) as error:
         raise _refusal(error) from None
     if len(data) > most:  # it grew meanwhile
@@ -87,7 +94,7 @@ def _check(found: os.stat_result, most: int) -> None:
     if not stat.S_ISREG(found.st_mode):
         raise RefusedError("special", "is a device, pipe or socket")
     if found.st_dev in _kernels_devices():
-        raise RefusedError("special", "is an answer of the system's kernel")
+        raise RefusedError("special", KERNELS_OWN)
     if found.st_size > most:
         raise _too_large(most)
 
@@ -121,8 +128,10 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
     Raises
     ------
     RefusedError
-        It can't be read, has more than `MOST_ENTRIES` entries, or is more than `MOST_DEPTH` folders deep.
+        It can't be read, is or holds a folder of the kernel's, has more than `MOST_ENTRIES` entries, or is
+        more than `MOST_DEPTH` folders deep.
     """
+    kernels = _kernels_devices()
     found: list[Path] = []
     seen = 0
     waiting = [(folder, 1)]
@@ -131,6 +140,8 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
         if depth > MOST_DEPTH:
             raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
         try:
+            if os.stat(here).st_dev in kernels:  # noqa: PTH116 -- as in os.scandir
+                raise RefusedError("special", KERNELS_OWN)
             with os.scandir(here) as entries:
                 for entry in entries:
                     seen += 1
@@ -143,17 +154,6 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
         except (OSError, ValueError) as error:
             raise _refusal(error) from None
     return tuple(sorted(found))
-
-
-def is_bounded(path: Path, most: int, suffix: str) -> bool:
-    """Return whether a path is a file that `read_file` would read, or a folder that `files_below` would."""
-    try:
-        if path.is_dir():
-            return all(is_bounded(file, most, suffix) for file in files_below(path, suffix))
-        check_file(path, most)
-    except (RefusedError, OSError, ValueError):
-        return False
-    return True
 
 
 def same_file(one: Path, other: Path) -> bool:
@@ -193,6 +193,15 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
             drop_file(temporary)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text and the end of its last line, whole or not at all. Raises ApcError (E601) if it can't."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(f"{text}\n".encode())
+
+    write_file(path, write)
+
+
 def check_target(path: Path) -> None:
     """Refuse a place where nothing can be written, before anything is computed: ApcError E601."""
     try:
@@ -219,7 +228,7 @@ def begin_file(path: Path) -> Path:
     target = _target(path)
     if target.is_dir():
         raise IsADirectoryError(None, "it is a folder")
-    folder = None if _is_special(target) else target.parent
+    folder = None if is_special(path) else target.parent
     # The name of the target need not fit: a temporary's is longer.
     handle, name = tempfile.mkstemp(prefix=f".{target.name[:64]}.", dir=folder)
     os.close(handle)
@@ -234,11 +243,11 @@ def finish_file(temporary: Path, path: Path) -> None:
     OSError
         It can't be put there.
     """
-    target = _target(path)
-    if _is_special(target):
-        with temporary.open("rb") as source, open(target, "wb", buffering=0, opener=_existing) as drain:
+    if is_special(path):
+        with temporary.open("rb") as source, os.fdopen(_drain(path), "wb") as drain:
             shutil.copyfileobj(source, drain)
         return
+    target = _target(path)
     try:
         before = target.stat()
     except FileNotFoundError:
@@ -256,7 +265,8 @@ def finish_file(temporary: Path, path: Path) -> None:
 def partial_name(path: Path) -> Path:
     """Return where a part of what was to be written goes: a file that is there whole is not given for it."""
     target = _target(path)
-    return target.with_name(f"{target.stem}.partial{target.suffix}") if target.is_file() else path
+    new = is_special(path) or not target.is_file()
+    return path if new else target.with_name(f"{target.stem}.partial{target.suffix}")
 
 
 def drop_file(temporary: Path) -> None:
@@ -267,14 +277,26 @@ def drop_file(temporary: Path) -> None:
 def _target(path: Path) -> Path:
     """Return what a path leads to, whether or not it is there."""
     try:
-        return path.resolve() if path.is_symlink() else path
+        return path.resolve() if path.is_symlink() and not is_special(path) else path
     except RuntimeError as error:  # a loop of links
         raise OSError(None, "its links lead to one another") from error
 
 
-def _is_special(target: Path) -> bool:
-    """Return whether something is there that is neither a file nor a folder."""
-    return target.exists() and not (target.is_file() or target.is_dir())
+def is_special(path: Path) -> bool:
+    """Return whether a path leads to what is written to in place: a device, a pipe, our standard output."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or is_stdout(path)
+
+
+def is_stdout(path: Path) -> bool:
+    """Return whether a path leads to where our standard output goes, by whatever name, a file included."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(STDOUT))
+    except (OSError, ValueError):
+        return False
 
 
 def _give(temporary: Path, before: os.stat_result) -> None:
@@ -285,6 +307,9 @@ def _give(temporary: Path, before: os.stat_result) -> None:
         return
 
 
-def _existing(name: str, flags: int) -> int:
-    """Open what is there, and make nothing."""
-    return os.open(name, flags & ~(os.O_CREAT | os.O_TRUNC))
+def _drain(path: Path) -> int:
+    """Open what is there, and make nothing; standard output goes on where it is."""
+    if not is_stdout(path):
+        return os.open(path, os.O_WRONLY | getattr(os, "O_CLOEXEC", 0))
+    sys.stdout.flush()
+    return os.dup(STDOUT)

@@ -1,7 +1,8 @@
 """CasADi functions as plain data, and back: nothing that a file says is given to CasADi's own reader.
 
-Takes: the functions of a kind, or the JSON of one. Gives: `PlainFunction`, `plain`, `read_function`;
-`Loop`, `composed`.
+Takes: the functions of a kind, or the JSON of one. Gives: `PlainFunction`, `plain`, `straight`,
+`read_function`; `walk`, `RULES`, `ROUNDED`, `symbolic`: its operations over any kind of number; `Loop`,
+`composed`.
 Guarantees: a function is arithmetic from a short list of operations on its inputs and constants, and for each
 nonlinear loop Newton's iteration with options of our own; what is read is checked in full before anything is
 built, so that text from anywhere can build no other function, and none larger than the text. What is built
@@ -18,9 +19,13 @@ inputs and what all the loops found.
 
 from __future__ import annotations
 
+import functools
+import math
+import operator
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 import casadi
@@ -40,6 +45,48 @@ _BINARY = {
     )
 }
 _NAMES = {code: name for name, code in (_UNARY | _BINARY).items()}
+
+
+def _quotient(above: Any, below: Any) -> Any:
+    """Return a quotient; that of two conditions, which are whole numbers, is a rational too."""
+    return Fraction(above, below) if isinstance(above, int) and isinstance(below, int) else above / below
+
+
+# What the operations are of Python's numbers, and of all that compute as they do; a power means something
+# else in every kind of number. A condition is 0 or 1.
+RULES: dict[str, Callable[..., Any]] = {
+    "neg": operator.neg,
+    "sq": lambda a: a * a,
+    "twice": lambda a: a + a,
+    "inv": lambda a: 1 / a,
+    "fabs": abs,
+    "sign": lambda a: (a > 0) - (a < 0),
+    "floor": math.floor,
+    "ceil": math.ceil,
+    "not": lambda a: int(a == 0),
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": _quotient,
+    "fmin": min,
+    "fmax": max,
+    "lt": lambda a, b: int(a < b),
+    "le": lambda a, b: int(a <= b),
+    "eq": lambda a, b: int(a == b),
+    "ne": lambda a, b: int(a != b),
+    "and": lambda a, b: int(a != 0 and b != 0),
+    "or": lambda a, b: int(a != 0 or b != 0),
+    # The product with a condition: zero whatever b is, when the condition is false.
+    "if_else_zero": lambda a, b: b if a != 0 else 0 * b,
+}
+
+# Those that have no rational value of a rational number.
+ROUNDED: dict[str, Callable[[float], float]] = {
+    name: getattr(math, name)
+    for name in (
+        *("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+    )
+}
 _WORD = re.compile(r"[a-zA-Z][a-zA-Z0-9]*(_[a-zA-Z0-9]+)*\Z", re.ASCII)  # what CasADi takes as a name
 LONGEST_WORD = 200
 # CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
@@ -95,18 +142,41 @@ class PlainFunction:
 
     def _straight(self, name: str, inputs: _Columns) -> Any:
         columns = [casadi.SX.sym(word, rows) for word, rows in inputs]
-        values = [entry for column in columns if column.numel() for entry in casadi.vertsplit(column)]
-        values += map(casadi.SX, self.constants)
-        unary, binary = casadi.SX.unary, casadi.SX.binary
-        for word, *places in self.operations:
-            if len(places) == 1:
-                values.append(unary(_UNARY[word], values[places[0]]))
-            else:
-                values.append(binary(_BINARY[word], values[places[0]], values[places[1]]))
+        entries = [entry for column in columns if column.numel() for entry in casadi.vertsplit(column)]
+        values = walk(self, [*entries, *map(casadi.SX, self.constants)], symbolic)
         # A structural zero is a zero like another.
         listed = [[values[place] for place in places] for places in self.results]
         results = [casadi.densify(casadi.vertcat(*one)) if one else casadi.SX(0, 1) for one in listed]
         return casadi.Function(name, columns, results, [word for word, _ in inputs], list(self.outputs))
+
+
+def walk(
+    function: PlainFunction, values: Iterable[Any], rule: Callable[[str], Callable[..., Any]]
+) -> list[Any]:
+    """Return a function's values in any kind of number: those of its inputs and constants, then all others.
+
+    Parameters
+    ----------
+    function
+        A function without loops.
+    values
+        The entries of its inputs, then its constants.
+    rule
+        What an operation is in this kind of number.
+    """
+    found = list(values)
+    for word, *places in function.operations:
+        found.append(rule(word)(*(found[place] for place in places)))
+    return found
+
+
+@functools.cache
+def symbolic(word: str) -> Callable[..., Any]:
+    """Return what an operation is of CasADi's expressions."""
+    unary = word in _UNARY
+    return functools.partial(
+        casadi.SX.unary if unary else casadi.SX.binary, (_UNARY if unary else _BINARY)[word]
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +215,9 @@ def composed(name: str, loops: Sequence[Loop], result: Any, words: Sequence[str]
 
 def plain(function: Any) -> PlainFunction:
     """Return a function's plain data: an SX function's, or one's that `composed` made."""
+    assert all(function.nnz_out(i) == function.numel_out(i) for i in range(function.n_out()))
     if function.is_a("SXFunction"):
-        return _straight(function)
+        return straight(function)
     called = [
         function.instruction_MX(k).which_function()
         for k in range(function.n_instructions())
@@ -154,10 +225,10 @@ def plain(function: Any) -> PlainFunction:
     ]
     by_name = {one.name(): one for one in called}
     loops = [
-        (_straight(by_name[f"given{k}"]), _straight(by_name[f"loop{k}"].oracle()))
+        (straight(by_name[f"given{k}"]), straight(by_name[f"loop{k}"].oracle()))
         for k in range(sum(name.startswith("given") for name in by_name))
     ]
-    result = _straight(by_name["result"])
+    result = straight(by_name["result"])
     return PlainFunction(
         function.name(),
         tuple((word, function.numel_in(i)) for i, word in enumerate(function.name_in())),
@@ -169,8 +240,9 @@ def plain(function: Any) -> PlainFunction:
     )
 
 
-def _straight(function: Any) -> PlainFunction:
-    inputs = tuple((word, int(function.numel_in(i))) for i, word in enumerate(function.name_in()))
+def straight(function: Any) -> PlainFunction:
+    """Return an SX function's data, the nonzeros of what is sparse. Raises ValueError if it has none."""
+    inputs = tuple((word, int(function.nnz_in(i))) for i, word in enumerate(function.name_in()))
     first = [sum(rows for _, rows in inputs[:i]) for i in range(len(inputs) + 1)]
     instructions = [
         (function.instruction_id(k), function.instruction_input(k), function.instruction_output(k), k)
@@ -180,7 +252,7 @@ def _straight(function: Any) -> PlainFunction:
     constants = {number: first[-1] + place for place, number in enumerate(dict.fromkeys(map(_key, numbers)))}
     work = [0] * function.sz_w()
     operations: list[tuple[Any, ...]] = []
-    results = [[0] * function.numel_out(i) for i in range(function.n_out())]
+    results = [[0] * function.nnz_out(i) for i in range(function.n_out())]
     for code, taken, given, k in instructions:
         if code == casadi.OP_INPUT:
             work[given[0]] = first[taken[0]] + taken[1]
@@ -188,10 +260,11 @@ def _straight(function: Any) -> PlainFunction:
             results[given[0]][given[1]] = work[taken[0]]
         elif code == casadi.OP_CONST:
             work[given[0]] = constants[_key(function.instruction_constant(k))]
+        elif code not in _NAMES:
+            raise ValueError(f"CasADi's operation {code} of {function.name()} is none of ours")
         else:
             operations.append((_NAMES[code], *(work[place] for place in taken)))
             work[given[0]] = first[-1] + len(constants) + len(operations) - 1
-    assert all(function.nnz_out(i) == function.numel_out(i) for i in range(function.n_out()))
     return PlainFunction(
         function.name(),
         inputs,

@@ -37,7 +37,6 @@ import numpy as np
 from apc.compiler.cache import (
     DAMAGE,
     FORMAT,
-    LARGEST,
     MEMBER,
     SEAL,
     Archive,
@@ -46,9 +45,20 @@ from apc.compiler.cache import (
     read_archive,
     record_of,
 )
-from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem, Graph, Kind, counts_peers
+from apc.compiler.compiled import (
+    LARGEST_COUNT,
+    CompiledSystem,
+    Formula,
+    Graph,
+    Kind,
+    Parameter,
+    Timing,
+    counts_peers,
+)
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, check_file, write_file
+from apc.compiler.files import RefusedError, write_file
+from apc.compiler.formula import EXACT
+from apc.compiler.language.unit_text import is_si
 from apc.compiler.plain import PlainFunction, plain, read_function
 from apc.compiler.seal import seal
 
@@ -66,7 +76,7 @@ def save(system: CompiledSystem, path: Path, *, sealed: bool = False) -> None:
     mark = {SEAL: seal(text).encode()} if sealed else {}
 
     def write(temporary: Path) -> None:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(temporary, "w") as archive:
             for name, content in {MEMBER: text, **members, **mark}.items():
                 # A fixed date: the same model gives the same bytes.
                 archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
@@ -82,17 +92,12 @@ def load(path: Path) -> CompiledSystem:
 def load_with_record(path: Path) -> tuple[CompiledSystem, Record]:
     """Read a compiled model, and what it was made from as far as it may be looked up. Raises as `load`."""
     try:
-        check_file(path, LARGEST)
         archive = read_archive(path)
         return unpacked(archive, path), record_of(archive)
     except RefusedError as refused:
         hint = "apc compile" if refused.why == "missing" else ""
         other = ", not a compiled model" if refused.why in ("folder", "special") else ""
         raise ApcError(Mistake("E602", Place(str(path)), f"{refused.words}{other}", hint=hint)) from None
-    except OSError as error:
-        if error.strerror is None:  # a decompressor's
-            raise _damaged(path, FOREIGN) from error
-        raise ApcError(Mistake("E602", Place(str(path)), f"can't be read: {error.strerror}")) from error
     except DamageError as error:
         raise _damaged(path, str(error)) from error
     except DAMAGE as error:
@@ -157,14 +162,69 @@ def _is_consistent(system: CompiledSystem) -> bool:
         and parameters.issuperset(column.name for group in system.groups for column in group.columns)
         and parameters.issuperset(value.name for group in system.groups for value in group.values)
         and all(one.exact is None or float(one.exact) == one.value for one in numbers)
+        and _are_formulas(system)
         and all(_is_graph_consistent(link.graph, system.peers) for link in system.links)
         and all(_is_kind_consistent(kind, set(timings), clocks, parameters) for kind in system.kinds)
         and links.issuperset(sending.link for kind in system.kinds for sending in kind.sends)
         and all(_is_heard(kind, system) for kind in system.kinds)
+        and _are_units_consistent(system)
         and (duration is None or duration > 0)
         and 0 <= system.experiment.seed < 2**63
         and len(system.region) <= 2
         and all(axis.low < axis.high for axis in system.region)
+    )
+
+
+def _are_units_consistent(system: CompiledSystem) -> bool:
+    """Return whether every unit is of SI, as every number is, and no number has two.
+
+    A unit that is another, but of SI, is a false word of the file's, as a false stiffness is.
+    """
+    units = {parameter.name: parameter.unit for parameter in system.parameters}
+    values = [value for group in system.groups for value in group.values]
+    states = [state for kind in system.kinds for state in kind.states]
+    clocks = [partition for kind in system.kinds for partition in kind.clocks]
+    sent = (unit for kind in system.kinds for sending in kind.sends for unit in sending.units)
+    ticked = (unit for partition in clocks for unit in partition.units)
+    return (
+        all(map(is_si, {*units.values(), *sent, *ticked}))
+        and all(units[value.name] == value.unit for value in values)
+        and all(units[state.start] == state.unit for state in states)
+        and all(
+            units[start] == partition.units[memory]
+            for partition in clocks
+            for memory, start in zip(partition.memories, partition.starts, strict=True)
+        )
+    )
+
+
+def _are_formulas(system: CompiledSystem) -> bool:
+    """Return whether each number that follows from others does so in the order of the followers."""
+    numbers: list[Parameter | Timing] = [*system.parameters, *system.timings]
+    names = {one.name for one in numbers}
+    numbers += [value for group in system.groups for value in group.values]
+    formulas = [(one.name, one.formula) for one in numbers if one.formula is not None]
+    place = {name: k for k, name in enumerate(system.followers)}
+    return (
+        len(place) == len(system.followers)
+        and place.keys() >= {name for name, _ in formulas}
+        and all(names.issuperset(formula.names) for _, formula in formulas)
+        and all(_is_formula(formula) for _, formula in formulas)
+        and all(place.get(one, -1) < place[name] for name, formula in formulas for one in formula.names)
+    )
+
+
+def _is_formula(formula: Formula) -> bool:
+    """Return whether a formula is made of what expressions are made of."""
+    function, given = formula.function, [len(formula.names), len(formula.numbers)]
+    return (
+        function.loops is None
+        and function.sizes == (given, [1])
+        and not function.constants
+        and all(word in EXACT for word, *_ in function.operations)
+        and len(formula.spans) == sum(given) + len(function.operations)
+        and all(0 <= start <= end <= len(formula.text) for start, end in formula.spans)
+        and all(math.isfinite(float(one)) for one in formula.numbers)
     )
 
 

@@ -127,7 +127,7 @@ def analyze(
     ApcError
         The input is at fault, or the method can't serve the scene.
     """
-    from apc.answers.answer import judge
+    from apc.answer import judge
 
     return judge(_model(model, set), method=method, certify=certify)
 
@@ -323,7 +323,7 @@ def sweep(
     if path is not None and not isinstance(model, CompiledSystem):
         from apc.inputs import check_outputs
 
-        check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out": path})
+        check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out=": path})
     return points.sweep(system, over, of=of, out=path, jobs=jobs, cluster=cluster)
 
 

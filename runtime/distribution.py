@@ -8,18 +8,21 @@ Does not: install anything.
 
 from __future__ import annotations
 
-from importlib.metadata import version
-
 DISTRIBUTION = "apc-haptics"
 
 
 def program_version() -> str:
     """Return the version of the program that is installed."""
+    # Imported here: it brings the whole of `email`, for which no command need wait.
+    from importlib.metadata import version
+
     return version(DISTRIBUTION)
 
 
 def versions(*libraries: str) -> tuple[tuple[str, str], ...]:
     """Return the versions of the program and of libraries, each with its name."""
+    from importlib.metadata import version
+
     return (("apc", program_version()), *((name, version(name)) for name in libraries))
 
 

@@ -15,15 +15,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.cache import DAMAGE, LARGEST, Archive, Record, changed, read_archive, record_of
+from apc.compiler.cache import DAMAGE, LARGEST, SUFFIX, Archive, changed, read_archive, record_of
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, check_file, check_target, is_bounded, read_file, same_file
+from apc.compiler.files import RefusedError, check_file, check_target, read_file, same_file
+from apc.suffixes import written
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
 
 YAML_SUFFIXES = (".yaml", ".yml")
-LIBRARY_SUFFIX = ".yaml"  # of the files in a folder of components
 _TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
 
 
@@ -75,7 +75,7 @@ def load_fresh(path: Path) -> CompiledSystem:
     from apc.compiler.store import load_with_record
 
     system, record = load_with_record(path)
-    now = _changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
+    now = changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
     if now:
         what = f"is stale: {now} has changed since it was compiled"
         hint = f"apc compile {path.with_name(record.topology)}"
@@ -141,12 +141,31 @@ def open_scene(
 
 
 def check_model_name(topology: Path) -> None:
-    """Refuse a topology beside another whose compiled model would have the same name: ApcError E617."""
+    """Refuse a topology whose compiled model would take the place of something else.
+
+    Raises
+    ------
+    ApcError
+        E617 another topology's model has the same name; E601 of that name is a device or pipe, which whoever
+        packed the folder put there, or a link to what is no compiled model.
+    """
+    model = topology.with_suffix(".apc")
+    try:
+        check_file(model, LARGEST)
+    except RefusedError as refused:
+        if refused.why == "special":
+            raise _not_written(model, f"it {refused.words}") from None
+    if model.is_symlink() and Path(os.path.realpath(model)).suffix != model.suffix:
+        raise _not_written(model, "it is a link to what is no compiled model")
     for suffix in YAML_SUFFIXES:
         other = topology.parent / f"{topology.stem}{suffix}"
         if other.name != topology.name and not same_file(other, topology) and _is_topology(other):
             what = f"and {other.name} would both be compiled to {topology.stem}.apc"
             raise ApcError(Mistake("E617", Place(str(topology)), what, hint=_renaming(topology)))
+
+
+def _not_written(model: Path, why: str) -> ApcError:
+    return ApcError(Mistake("E601", Place(str(model)), f"can't be written: {why}", hint=f"rm {model}"))
 
 
 def _renaming(topology: Path) -> str:
@@ -179,7 +198,7 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
     texts
         What it names, from its folder: files, and folders of components.
     outputs
-        What will be written, by the option that says so; None is nothing.
+        What will be written, by the option that says so (see `check_suffix`); None is nothing.
 
     Raises
     ------
@@ -190,7 +209,7 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
     given = [(option, output) for option, output in outputs.items() if output is not None]
     for place, (option, output) in enumerate(given):
         check_target(output)
-        hint = f"{option} {output.with_name(f'{output.stem}-result{output.suffix}')}"
+        hint = written(option, output.with_name(f"{output.stem}-result{output.suffix}"))
         for other, before in given[:place]:
             if output.absolute() == before.absolute() or same_file(output, before):
                 what = f"is given to {other} and to {option}: the second would replace the first"
@@ -198,15 +217,13 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
         if not output.is_file():
             continue
         if any(same_file(output, one) or _is_below(output, one) for one in named):
-            what = f"is read by this command: {option} would replace it"
+            what = f"is read by this command: {option.removesuffix('=')} would replace it"
             raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
 
 
 def _is_below(file: Path, folder: Path) -> bool:
     """Return whether a file is one that a folder of components is read for."""
-    return (
-        file.suffix == LIBRARY_SUFFIX and folder.is_dir() and file.resolve().is_relative_to(folder.resolve())
-    )
+    return file.suffix == SUFFIX and folder.is_dir() and file.resolve().is_relative_to(folder.resolve())
 
 
 def compiled_already(topology: Path) -> Archive | None:
@@ -215,22 +232,11 @@ def compiled_already(topology: Path) -> Archive | None:
     That it is, only this user's own seal says: anybody can write what a file says of itself.
     """
     try:
-        check_file(topology, LARGEST)
-        check_file(model := topology.with_suffix(".apc"), LARGEST)
-        archive = read_archive(model)
+        archive = read_archive(topology.with_suffix(".apc"))
         if not archive.sealed:
             return None
         record = record_of(archive)
-        fresh = record.topology == topology.name and not _changed(record, topology.parent)
-    except (RefusedError, OSError, *DAMAGE):
+        fresh = record.topology == topology.name and not changed(record, topology.parent)
+    except (RefusedError, *DAMAGE):
         return None
     return archive if fresh else None
-
-
-def _changed(record: Record, folder: Path) -> str:
-    """Return the name of the first text that is different now, or is no file or folder that would be read."""
-    for name, _ in record.texts:
-        path = folder / name
-        if os.path.lexists(path) and not is_bounded(path, LARGEST, LIBRARY_SUFFIX):
-            return name.removeprefix("./")
-    return changed(record, folder)

@@ -1,6 +1,6 @@
 """Which file names a command can write to.
 
-Takes: the path given to an option, and the suffixes it may have. Gives: `check_suffix`.
+Takes: the path given to an option, and the suffixes it may have. Gives: `check_suffix`, `written`.
 Guarantees: a file of an unknown suffix is never written as something else.
 Does not: write.
 """
@@ -11,12 +11,41 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import is_special
+
+# What goes into a device or pipe whose name has no suffix: text, as whoever reads there expects.
+TEXTS = (".csv", ".txt", ".json", ".svg")
 
 
-def check_suffix(path: Path, known: Iterable[str], option: str) -> None:
-    """Refuse a file whose suffix is not among `known`, the first of which is proposed: ApcError E878."""
+def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
+    """Return the suffix that says the format of what is written to a path.
+
+    Parameters
+    ----------
+    path
+        A file, or a device or pipe: without a suffix, such as /dev/stdout, it takes the first of `TEXTS`.
+    known
+        The suffixes there are, the first of which is proposed.
+    option
+        What says the path: `--out` on the command line, `out=` in Python.
+
+    Raises
+    ------
+    ApcError
+        E878 the suffix is not among `known`.
+    """
     names = tuple(known)
-    if path.suffix.lower() not in names:
-        wanted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
-        what, hint = f"the suffix of {option}", f"{option} {path.with_suffix(names[0])}"
-        raise ApcError(Mistake("E878", Place(str(path)), what, wanted, path.suffix or "none", hint))
+    suffix = path.suffix.lower()
+    if suffix in names:
+        return suffix
+    if not suffix and is_special(path) and (texts := [one for one in TEXTS if one in names]):
+        return texts[0]
+    wanted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
+    what, proposed = f"the suffix of {option.removesuffix('=')}", Path(path.name or "result")
+    hint = written(option, path.parent / proposed.with_suffix(names[0]))
+    raise ApcError(Mistake("E878", Place(str(path)), what, wanted, path.suffix or "none", hint))
+
+
+def written(option: str, path: Path) -> str:
+    """Return an option with its path, as on the command line or in Python: see `check_suffix`."""
+    return f'{option}"{path}"' if option.endswith("=") else f"{option} {path}"

@@ -28,6 +28,10 @@ from apc.compiler.compiled import (
     State,
     Timing,
 )
+from apc.compiler.errors import Place
+from apc.compiler.functions.exchange import followers_of
+from apc.compiler.language.evaluation import formula_of
+from apc.compiler.language.grammar import parse_expression
 
 NAMES = (
     "device.mass",
@@ -282,13 +286,15 @@ def grouped(system: CompiledSystem, *groups: tuple[str, int, dict[str, float]]) 
 
 def derived(system: CompiledSystem, **expressions: str) -> CompiledSystem:
     """Add the parameters kt and wait, and expressions over them for parameters and timings."""
-    names = {key.replace("__", "."): text for key, text in expressions.items()}
-    return replace(
-        system,
-        parameters=(
-            Parameter("kt", "N/m", 500.0),
-            Parameter("wait", "s", 0.008),
-            *(replace(p, expression=names.get(p.name)) for p in system.parameters),
-        ),
-        timings=tuple(replace(t, expression=names.get(t.name)) for t in system.timings),
+    formulas = {
+        key.replace("__", "."): formula_of(parse_expression(text, Place("a.yaml", 1, 1, text)))
+        for key, text in expressions.items()
+    }
+    parameters = (
+        Parameter("kt", "N/m", 500.0),
+        Parameter("wait", "s", 0.008),
+        *(replace(p, formula=formulas.get(p.name)) for p in system.parameters),
     )
+    timings = tuple(replace(t, formula=formulas.get(t.name)) for t in system.timings)
+    followers = followers_of(parameters, timings, system.groups)
+    return replace(system, parameters=parameters, timings=timings, followers=followers)

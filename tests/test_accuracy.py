@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.simulation.accuracy import error_text
+from apc.present.simulation import error_text
 from apc.simulation.settings import parse_method
 from apc.simulation.trajectory import simulate
 from tests.test_integrate import CROSSLEY

@@ -11,7 +11,7 @@ import pytest
 
 from apc.analysis.analysis import analyze, prepare
 from apc.analysis.box import parse_range
-from apc.answers.answer import answer, judge, sensitivities_of
+from apc.answer import answer, judge, sensitivities_of
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
 from apc.frame.overrides import Override, apply, parse_override

@@ -1,7 +1,8 @@
-"""Claims about `apc.vary.batch`, `evaluator` and `eigenvalues`."""
+"""Claims about `apc.vary.batch` and `evaluator`."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -11,10 +12,10 @@ from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import frame_balls, precision
 from apc.eigen.modes import split
+from apc.eigen.relative import relative
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator, matrix_errors
-from apc.vary.eigenvalues import eigenvalues
 from apc.vary.evaluator import evaluator, reaches_time
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
@@ -69,10 +70,7 @@ def test_derivatives_are_those_of_the_exact_matrices() -> None:
                 one, other = (frame_balls(family.exact_at([end])[place]) for end in ends)
                 rate = np.array([[float(e.mid()) if hasattr(e, 'mid') else float(e) for e in row]
                                  for row in other - one]) / (ends[1] - ends[0])  # fmt: skip
-            exact = (
-                rate[np.ix_(wiring.rest, wiring.rest)]
-                - wiring.weights @ rate[np.ix_(wiring.held, wiring.rest)]
-            )
+            exact = relative(rate, wiring.relative)
             slope = pairs[place][1][0]
             assert np.abs(slope - exact).max() <= 1e-9 * np.abs(exact).max()
 
@@ -88,11 +86,8 @@ def test_error_bounds_hold_the_true_matrices() -> None:
         for place, wiring in enumerate(family.wirings):
             with precision(200):
                 balls = frame_balls(family.exact_at(row.tolist())[place])
-                reduced = balls[np.ix_(wiring.rest, wiring.rest)]
-                if len(wiring.held):
-                    reduced = (
-                        reduced - wiring.weights.astype(object) @ balls[np.ix_(wiring.held, wiring.rest)]
-                    )
+                at = wiring.relative
+                reduced = relative(balls, replace(at, weights=at.weights.astype(object)), multiply=np.dot)
                 off = np.array([[abs(float((e - float(f)).mid()) if not isinstance(e, int) else e - f)
                                  for e, f in zip(a, b, strict=True)]
                                 for a, b in zip(reduced, found[place][k], strict=True)])  # fmt: skip
@@ -122,19 +117,6 @@ def test_a_translation_that_is_none_at_a_point_gives_no_number() -> None:
     family = evaluator(scene("star-lecture"), [Free("arm.stiffness")])
     found = family.matrices(np.array([[0.0], [100.0]]))
     assert all(np.isfinite(one).all() for one in found)
-
-
-def test_slopes_of_eigenvalues_survive_a_defective_cluster() -> None:
-    matrix = np.zeros((1, 5, 5))
-    matrix[0, 0, 1] = matrix[0, 1, 2] = 1.0  # a Jordan block at zero
-    matrix[0, 3:, 3:] = [[0.6, -0.8], [0.8, 0.6]]
-    slope = np.zeros_like(matrix)
-    slope[0, 3:, 3:] = np.eye(2)
-    values, rates = eigenvalues(matrix, slope)
-    upper = int(np.argmax(values[0].imag))
-    assert values[0, upper] == pytest.approx(0.6 + 0.8j)
-    assert rates[0, upper] == pytest.approx(1.0)
-    assert np.isfinite(rates).all()
 
 
 def test_what_reaches_a_time_is_told_from_what_does_not() -> None:

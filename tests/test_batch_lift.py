@@ -9,10 +9,10 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.frame.batch_lift import compose_rows, exponential_rows, lift_rows
+from apc.frame.batch_lift import exponential_rows, lift_rows
 from apc.frame.discretize import UNIT, discretize
 from apc.frame.jacobians import jacobians
-from apc.frame.lift import lift
+from apc.frame.lift import FrameMap, compose, lift
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
@@ -45,9 +45,9 @@ def test_many_sites_at_once_are_the_sites_one_by_one(values: dict[str, Fraction]
         alone = lift(site, crowd.schedule, exact=linearize_exact(crowd.jacobians, vector))
         for name in NAMES:
             apart = np.abs(getattr(crowd.lifted, name)[row] - getattr(alone, name))
-            allowed = getattr(crowd.lifted, f"{name}_error")[row] + getattr(alone, f"{name}_error")
+            allowed = getattr(crowd.lifted.error, name)[row] + getattr(alone.error, name)
             assert np.all(apart <= allowed)
-        assert crowd.lifted.p_error[row].max() < 1e-12 * max(1.0, np.abs(alone.p).max())
+        assert crowd.lifted.error.p[row].max() < 1e-12 * max(1.0, np.abs(alone.p).max())
 
 
 @pytest.mark.parametrize("decay", [0.0, 1e-9, 1.0, 50.0, 4000.0])
@@ -56,9 +56,10 @@ def test_exponentials_are_within_their_bound_of_ball_arithmetic(decay: float) ->
     a = np.array([[0.0, 1.0], [-30.0, -decay]])
     b = np.array([[0.0], [2.0]])
     [truth] = discretize(a, b, [Fraction(1, 100)])
-    step, size, charge = exponential_rows(a[None], b[None], 0.01)
-    assert np.all(np.abs(step[0] - truth.matrix) <= charge * UNIT * size[0] + UNIT * truth.size)
-    assert np.all(charge * UNIT * size[0] < 1e-10)
+    step = exponential_rows(a[None], b[None], 0.01)
+    off = step.roundings * UNIT * step.size[0]
+    assert np.all(np.abs(step.matrix[0] - truth.matrix) <= off + UNIT * truth.size)
+    assert np.all(off < 1e-10)
 
 
 def _many_digits(matrix: Any) -> Any:
@@ -68,8 +69,8 @@ def _many_digits(matrix: Any) -> Any:
     return np.array(found, dtype=object).reshape(1, *plain.shape)
 
 
-def _true_frame(crowd: Crowd, vector: Any) -> tuple[Any, Any]:
-    """Return z⁺ and s of one site over (z, r), its events followed in many digits."""
+def _true_frame(crowd: Crowd, vector: Any) -> FrameMap:
+    """Return the map of one site's frame, its events followed in many digits."""
     site = every_matrix(linearize_exact(crowd.jacobians, vector), _many_digits)
     n_x, n_u = site.b.shape[-2:]
     steps = {}
@@ -81,8 +82,7 @@ def _true_frame(crowd: Crowd, vector: Any) -> tuple[Any, Any]:
                 whole[i, j] = entry * seconds.numerator / seconds.denominator
         moved = mpmath.expm(whole, method="taylor")[:n_x, :]
         steps[duration] = np.array(moved.tolist(), dtype=object).reshape(1, n_x, n_x + n_u)
-    z, s = compose_rows(site, crowd.schedule, steps)
-    return z[0], s[0]
+    return compose(site, crowd.schedule, steps)
 
 
 @pytest.mark.parametrize(
@@ -103,11 +103,10 @@ def test_the_estimate_covers_the_error_against_eighty_digits(grams: str, seed: i
     assert lifted.estimated
     with mpmath.workdps(80):
         for row, vector in enumerate(crowd.parameters):
-            z, s = _true_frame(crowd, vector)
-            n_z = len(z)
-            for name, true in zip(NAMES, (z[:, :n_z], z[:, n_z:], s[:, :n_z], s[:, n_z:]), strict=True):
-                error = np.abs(getattr(lifted, name)[row] - true).astype(float)
-                assert np.all(error <= getattr(lifted, f"{name}_error")[row])
+            true = _true_frame(crowd, vector)
+            for name in NAMES:
+                error = np.abs(getattr(lifted, name)[row] - getattr(true, name)[0]).astype(float)
+                assert np.all(error <= getattr(lifted.error, name)[row])
 
 
 def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
@@ -122,7 +121,7 @@ def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
         )  # Arb's exponentials
         for name in NAMES:
             apart = np.abs(getattr(crowd.lifted, name)[row] - getattr(alone, name))
-            estimate = getattr(crowd.lifted, f"{name}_error")[row]
+            estimate = getattr(crowd.lifted.error, name)[row]
             assert np.all(apart <= estimate)
             assert estimate.max() < 1e-8 * max(1.0, np.abs(getattr(alone, name)).max())
 
@@ -139,4 +138,4 @@ def test_an_estimate_covers_the_digits_that_an_exponential_loses(text: str) -> N
     alone = lift(linearize(site, vector), schedule, exact=exact)
     for name in NAMES:
         apart = np.abs(getattr(many, name)[0] - getattr(alone, name))
-        assert (apart <= getattr(many, f"{name}_error")[0] + getattr(alone, f"{name}_error")).all()
+        assert (apart <= getattr(many.error, name)[0] + getattr(alone.error, name)).all()

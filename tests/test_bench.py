@@ -23,11 +23,10 @@ from apc.benchmark.bench import (
     bench_simulation,
     pareto_front,
 )
-from apc.benchmark.figure import draw_bench, save_bench
 from apc.benchmark.reference import MOST_MOVING
-from apc.benchmark.report import bench_report, scale_report
 from apc.benchmark.scale import scale, with_count
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.present.bench import bench_picture, save_bench
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 
@@ -187,15 +186,14 @@ def test_what_is_too_large_to_be_played_is_analysed_all_the_same(
     analysis, simulation = found.comparisons
     assert analysis.measured
     assert simulation.measured == ()
-    text = bench_report(found)
+    text = str(found)
     assert "every method left out: 3 peers hold" in text
     assert "--signals" not in text
     save_bench(found, tmp_path / "bench.png")
 
 
 def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
-    text = bench_report(found)
-    assert str(found) == text
+    text = str(found)
     assert max(map(len, text.splitlines())) <= 80
     assert "analyze chooses modes, which is" in text
     assert "simulate chooses exact, which is" in text
@@ -209,15 +207,15 @@ def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
 def test_a_spread_needs_several_runs_and_a_time_has_no_exponent(found: Bench) -> None:
     [analysis, _] = found.comparisons
     one = replace(analysis.measured[0], seconds=0.9997e-3, spread=0.9996e-3)
-    lines = bench_report(replace(found, comparisons=(replace(analysis, measured=(one,)),))).splitlines()
+    lines = str(replace(found, comparisons=(replace(analysis, measured=(one,)),))).splitlines()
     assert next(line for line in lines if one.name in line).split()[1:4] == ["0.9997", "ms", "–"]
     many = replace(analysis, measured=(replace(one, rounds=3),))
-    assert "0.9996 ms" in bench_report(replace(found, comparisons=(many,)))
+    assert "0.9996 ms" in str(replace(found, comparisons=(many,)))
     json.dumps(found.to_dict(), allow_nan=False)
 
 
 def test_the_picture_has_a_panel_a_task(found: Bench, tmp_path: Path) -> None:
-    axes = draw_bench(found).axes
+    axes = bench_picture(found).axes
     assert [ax.get_title() for ax in axes] == ["apc analyze", "apc simulate"]
     assert "exact (default)" in [text.get_text() for text in axes[1].texts]
     save_bench(found, tmp_path / "bench.svg")
@@ -227,7 +225,7 @@ def test_the_picture_has_a_panel_a_task(found: Bench, tmp_path: Path) -> None:
 def test_no_name_in_the_picture_stands_over_another_or_leaves_its_panel(found: Bench) -> None:
     near = [_one(f"semi-implicit:{k} ms", 1e-3 * (1 + k / 50), 1e-9 * (1 + k / 20)) for k in range(9)]
     for comparison in (*found.comparisons, replace(found.comparisons[1], measured=pareto_front(near))):
-        figure = draw_bench(replace(found, comparisons=(comparison, *found.comparisons[1:])))
+        figure = bench_picture(replace(found, comparisons=(comparison, *found.comparisons[1:])))
         figure.draw_without_rendering()
         ax = figure.axes[0]
         boxes = [text.get_window_extent() for text in ax.texts]
@@ -255,7 +253,7 @@ def test_more_peers_are_measured_each_in_a_process_of_its_own(tmp_path: Path) ->
     assert [row.peers for row in found.rows] == [3, 3000]
     assert all(row.error is not None and row.error <= row.bound for row in found.rows)
     assert all(row.memory > 10 * 2**20 for row in found.rows)
-    text = scale_report(found)
+    text = str(found)
     assert max(map(len, text.splitlines())) <= 80
     assert "3,000" in text
     assert "peers of group user\n" in text
@@ -267,7 +265,7 @@ def test_the_group_that_grows_is_named_and_a_number_is_measured_once(tmp_path: P
     path.write_text(two, encoding="utf-8")
     found = scale(path, [5, 5])
     assert [(row.count, row.peers) for row in found.rows] == [(5, 6)]
-    assert "peers of group many, beside 1 of other groups" in scale_report(found)
+    assert "peers of group many, beside 1 of other groups" in str(found)
 
 
 def test_numbers_none_of_which_can_be_analysed_are_an_error(tmp_path: Path) -> None:
@@ -339,7 +337,7 @@ def test_a_picture_that_could_not_be_written_in_the_end_costs_no_figures(
         raise ApcError(Mistake("E601", Place("bench.png"), "can't be written: no space"))
 
     monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: found)
-    monkeypatch.setattr("apc.benchmark.figure.save_bench", full)
+    monkeypatch.setattr("apc.present.bench.save_bench", full)
     assert run(["bench", str(SCENES / "template.yaml"), "--plot", str(tmp_path / "bench.png")]) == 1
     printed = capsys.readouterr()
     assert "E601 can't be written" in printed.err

@@ -13,7 +13,6 @@ import pytest
 from apc.__main__ import run
 from apc.analysis.analysis import Analysis, analyze
 from apc.benchmark.hard import HardReport, compare, run_hard_cases
-from apc.benchmark.report import hard_report
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
@@ -83,7 +82,7 @@ def test_no_bound_and_no_verdict_fail_and_are_counted(tmp_path: Path) -> None:
     assert case.failed == (
         "the bound says nothing; the verdict is left open: stable up to a common translation"
     )
-    assert "1 of 1 scene failed; 1 left open, 1 without a bound" in hard_report(found)
+    assert "1 of 1 scene failed; 1 left open, 1 without a bound" in str(found)
     assert found.to_dict()["undecided"] == found.to_dict()["unbounded"] == ["tiny-device"]
 
 
@@ -103,7 +102,7 @@ def test_a_number_that_is_none_fails(tmp_path: Path, value: float) -> None:
 def test_the_report_fits_a_terminal(tmp_path: Path) -> None:
     (tmp_path / "other.yaml").write_text("topology: other\n", encoding="utf-8")
     found: HardReport = run_hard_cases(_folder(tmp_path), repeats=1)
-    text = hard_report(found)
+    text = str(found)
     assert max(map(len, text.splitlines())) <= 80 + len(str(tmp_path))
     assert "every bound holds; every verdict is right" in text
     assert "stable*: stable up to a common translation" in text

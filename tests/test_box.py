@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,10 +11,10 @@ import pytest
 from apc.analysis.analysis import analyze
 from apc.analysis.box import parse_range
 from apc.analysis.box_proof import BoxProof, prove_box
-from apc.compiler.compiled import CompiledSystem, Parameter
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.frame.overrides import Override, apply
-from tests.sites import columned, grouped, paper
+from tests.sites import columned, derived, grouped, paper
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, library, replaced
 
 TRANSLATING = "stable up to a common translation"
@@ -160,14 +159,17 @@ def test_a_parameter_opened_twice_or_of_many_values_is_refused() -> None:
 def test_scenes_that_are_no_rational_function_of_the_parameter_are_refused() -> None:
     bent = compiled((SCENES / "experiment-average.yaml").read_text(encoding="utf-8"))
     assert _message(bent, "contact.stiffness=±1%").startswith("E832")
-    system = paper()
-    parameters = tuple(
-        replace(one, expression="sqrt(kt)") if one.name == "coordination.stiffness" else one
-        for one in (Parameter("kt", "N/m", 250000.0), *system.parameters)
+    system = derived(paper(), coordination__stiffness="sqrt(kt)")
+    assert _message(system, "kt=±1%") == (
+        "E832 coordination.stiffness = sqrt(kt) takes sqrt() of a parameter that is left open."
     )
-    assert _message(replace(system, parameters=parameters), "kt=±1%").startswith(
-        "E832 coordination.stiffness"
-    )
+
+
+def test_what_a_box_does_not_ask_for_may_be_no_rational_function() -> None:
+    system = derived(paper(), coordination__stiffness="if peers > 2 then kt else sqrt(kt)/(peers - 3)")
+    assert _proof(system, "kt=±1%").stable is True
+    divided = derived(paper(), coordination__stiffness="kt/(peers - 3)")
+    assert _message(divided, "kt=±1%") == "E832 coordination.stiffness = kt/(peers - 3) divides by zero."
 
 
 def test_a_memory_that_nobody_reads_is_no_translation_of_a_box(tmp_path: Path) -> None:

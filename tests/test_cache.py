@@ -17,7 +17,7 @@ import sympy
 
 from apc.__main__ import run
 from apc.api import load
-from apc.compiler import cache
+from apc.compiler import cache, files
 from apc.compiler.cache import Record, changed, read_archive, record_of
 from apc.inputs import compiled_already
 from tests.topologies import replaced, told
@@ -175,10 +175,68 @@ def test_a_model_with_a_changed_member_stands_for_no_topology(member: str) -> No
     assert not compiled_already(SCENE)
 
 
-def test_a_pipe_beside_a_topology_is_no_model() -> None:
-    MODEL.unlink()
-    os.mkfifo(MODEL)
+def test_a_folder_is_known_by_the_names_and_texts_of_its_definitions() -> None:
+    """The digest of a folder: of a line for each file, its name and the digest of its text."""
+    Path("parts/more").mkdir()
+    Path("parts/more/rest.yaml").write_text("component: Rest\n", encoding="utf-8")
+    Path("parts/note.txt").write_text("not read\n", encoding="utf-8")
+    lines = [
+        f"{name}\0{hashlib.sha256(text.encode()).hexdigest()}\n"
+        for name, text in (("more/rest.yaml", "component: Rest\n"), ("tie.yaml", PART))
+    ]
+    expected = hashlib.sha256("".join(lines).encode()).hexdigest()
+    texts = cache.origin_texts((SCENE.name, ""), (), ("parts",), (), Path())
+    assert dict(texts)["./parts/"] == expected
+
+
+def put_a_pipe(path: Path) -> None:
+    os.mkfifo(path)  # who reads it waits for ever
+
+
+def put_a_device(path: Path) -> None:
+    path.symlink_to("/dev/zero")  # who reads it never ends
+
+
+def put_an_answer_of_the_kernel(path: Path) -> None:
+    path.symlink_to("/proc/self/maps")
+
+
+@pytest.mark.parametrize("put", [put_a_pipe, put_a_device, put_an_answer_of_the_kernel])
+@pytest.mark.parametrize(
+    "name", ["scene.yaml", "users.csv", "parts/tie.yaml", "parts/more.yaml", "scene.apc"]
+)
+def test_what_is_no_file_is_not_read_and_is_a_change(name: str, put: Callable[[Path], None]) -> None:
+    Path(name).unlink(missing_ok=True)
+    put(Path(name))
     assert not compiled_already(SCENE)
+
+
+def test_a_folder_that_grew_is_not_walked_or_read_to_its_end_and_is_a_change(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    record = record_of(read_archive(MODEL))
+    assert changed(record, Path()) == ""
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "MOST_ENTRIES", 0)
+        assert changed(record, Path()) == "parts/"
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "LARGEST", 2 * len(PART))
+        assert cache._path_digest(Path("parts")) == dict(record.texts)["./parts/"]
+        for name in ("one", "two"):  # each of them is small enough
+            Path(f"parts/{name}.yaml").write_text(PART, encoding="utf-8")
+        assert cache._path_digest(Path("parts")) == ""
+
+
+def test_what_could_not_be_read_either_time_is_no_proof() -> None:
+    record = record_of(read_archive(MODEL))
+    without = tuple((name, "" if name == "./users.csv" else digest) for name, digest in record.texts)
+    Path("users.csv").unlink()
+    assert changed(Record(record.topology, without), Path()) == "users.csv"
+
+
+def test_a_pipe_named_as_a_definition_is_none_of_the_scene_s() -> None:
+    os.mkfifo("Mass")
+    assert compiled_already(SCENE)
 
 
 def test_a_record_that_names_no_program_is_of_another_one() -> None:

@@ -15,7 +15,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import precision
 from apc.eigen.certify import prove, schur_cohn
 from apc.eigen.modes import split
-from apc.eigen.rigid import find_rigid_modes, independent_places
+from apc.eigen.relative import independent_places
+from apc.eigen.rigid import find_rigid_modes
 from tests.sites import MS, alone, columned, grouped, linked, paper
 
 TRANSLATING = "stable up to a common translation"

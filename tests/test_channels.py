@@ -88,7 +88,7 @@ def test_its_numbers_are_parameters_and_timings_of_the_model() -> None:
     found = compiled_channel(system)
     assert found.loss == Loss("lan.loss.p", "lan.loss.r", "lan.loss.1-h", "lan.loss.1-k")
     assert found.jitter == "lan.jitter"
-    value = {one.name: (one.value, one.expression) for one in system.parameters}
+    value = {one.name: (one.value, one.formula and one.formula.text) for one in system.parameters}
     assert value["lan.loss.p"] == (0.01, None)
     assert value["lan.loss.r"] == (0.99, "1 - lan.loss.p")
     assert value["lan.loss.1-h"] == (0.5, None)

@@ -12,13 +12,11 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.regions import files as region_files
+from apc.present.region import panel_letter, stable_outlines
 from apc.regions.axes import parse_axes
-from apc.regions.figure import stable_outlines
 from apc.regions.panels import (
     compare_regions,
     gain_factor,
-    panel_letter,
     parse_panel,
     parse_vary,
 )
@@ -148,7 +146,7 @@ def test_the_drawn_outline_encloses_the_stable_area() -> None:
         (["--x", Y, "--y", Y], "E902 coordination.stiffness is on both axes"),
         (
             ["--out", "region.bmp"],
-            "region.bmp: E908 --out wants one of .png, .svg, .pdf,",
+            "region.bmp: E878 the suffix of --out wants one of .png, .svg, .pdf,",
         ),
         (["--out", "nowhere/region.csv"], "E601 can't be written: No such file or directory"),
         (["--vary", "lan.delay"], "--vary: E907 --vary wants NAME=VALUE,VALUE,…"),
@@ -180,7 +178,7 @@ def test_a_full_disk_is_a_message_and_leaves_nothing_behind(
         path.write_text("some of it", encoding="utf-8")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(region_files, "_write_text", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     before = sorted(folder.iterdir())
     assert run(["region", "--out", "region.json"]) == 1
     assert "region.json: E601 can't be written: No space left on device" in capsys.readouterr().err

@@ -9,8 +9,8 @@ import pytest
 
 from apc.analysis.analysis import lifted_groups
 from apc.compiler.errors import ApcError
+from apc.eigen.closing import Coupling
 from apc.eigen.coupling import complete_degrees, couple
-from apc.eigen.loop import Coupling
 from apc.frame.schedule import Way
 from tests.sites import MS, columned, edged, grouped, linked, paper
 

@@ -8,9 +8,11 @@ from typing import Any
 
 import casadi
 import mpmath
+import numpy as np
 import pytest
 
-from apc.frame.exact import evaluate_exact, is_rational
+from apc.compiler import plain
+from apc.frame.exact import ROWS, evaluate_exact, is_rational
 
 
 def _function(build: Any, size: int = 2) -> casadi.Function:
@@ -45,6 +47,32 @@ def test_every_operation_agrees_with_casadi_in_floats(name: str) -> None:
     f = _function(lambda x: operation(x[0], x[1]) if name in ("fmin", "fmax") else operation(x[0]))
     [[value]] = evaluate_exact(f, [[Fraction(7, 4), Fraction(1, 8)]])
     assert float(value) == pytest.approx(float(f([1.75, 0.125])), rel=1e-15)
+
+
+@pytest.mark.parametrize("word", sorted(plain._UNARY | plain._BINARY))
+def test_every_operation_is_the_same_in_every_kind_of_number(word: str) -> None:
+    """In rationals, and in rows with a complex step, what CasADi gives and differentiates."""
+    symbols = casadi.vertsplit(casadi.SX.sym("x", 2 if word in plain._BINARY else 1))
+    value = plain.symbolic(word)(*symbols)
+    slope = casadi.jtimes(value, casadi.vertcat(*symbols), casadi.SX([1.0, -2.0][: len(symbols)]))
+    f = casadi.Function("f", [casadi.vertcat(*symbols)], [value, slope])
+    for point in ([0.75, 0.125], [0.25, 0.5], [0.5, 0.5], [0.0, 0.25]):
+        given = point[: len(symbols)]
+        wanted, derivative = (float(one) for one in f(given))
+        if math.isfinite(wanted):
+            direct = casadi.Function("f", symbols, [value])
+            [[exact]] = evaluate_exact(direct, [[Fraction(one)] for one in given])
+            assert float(exact) == pytest.approx(wanted, rel=1e-15)
+        steps = [np.array([one + 1e-60j * along]) for one, along in zip(given, (1, -2), strict=False)]
+        with np.errstate(all="ignore"):
+            found = ROWS[word](*steps)
+        if math.isfinite(wanted):
+            assert np.real(found)[0] == pytest.approx(wanted, rel=1e-15)
+        else:
+            assert not np.isfinite(found)[0]
+        corner = (word in ("fmin", "fmax") and given[0] == given[1]) or (word == "fabs" and given[0] == 0)
+        if math.isfinite(derivative) and not corner:
+            assert np.imag(found)[0] / 1e-60 == pytest.approx(derivative, rel=1e-14)
 
 
 def test_transcendental_operations_go_to_any_precision() -> None:

@@ -334,8 +334,9 @@ def test_other_functions_give_the_floats_of_the_math_module() -> None:
     assert value("2^(1/2)") == math.sqrt(2)
 
 
-def test_a_condition_is_a_bool() -> None:
-    assert evaluate(Compare("<=", TWO, TWO), lambda parts: 0) is True
+def test_a_condition_that_holds_is_one() -> None:
+    assert evaluate(Compare("<=", TWO, TWO), lambda parts: 0) == 1
+    assert evaluate(Compare("<", TWO, TWO), lambda parts: 0) == 0
 
 
 @pytest.mark.parametrize(

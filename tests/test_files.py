@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import apc
 from apc.__main__ import run
 from apc.compiler import files
 from apc.compiler.files import (
@@ -17,7 +18,6 @@ from apc.compiler.files import (
     begin_file,
     files_below,
     finish_file,
-    is_bounded,
     read_file,
     write_file,
 )
@@ -30,7 +30,6 @@ def refused(path: Path, most: int = 100) -> tuple[str, str]:
     """Return why a file is not read, and the words."""
     with pytest.raises(RefusedError) as caught:
         read_file(path, most)
-    assert not is_bounded(path, most, ".yaml") or caught.value.why == "folder"
     return caught.value.why, caught.value.words
 
 
@@ -159,6 +158,38 @@ def test_a_device_is_written_to_and_stays_a_device(tmp_path: Path) -> None:
     assert link.is_symlink()
 
 
+def test_standard_output_is_written_to_whatever_it_is_and_goes_on(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("kept\n", encoding="utf-8")
+    before = os.dup(1)
+    with log.open("ab") as stream:  # as `>> log.csv` does
+        os.dup2(stream.fileno(), 1)
+    try:
+        for path in (Path("/dev/stdout"), log):
+            write_file(path, fill("rows\n"))
+        assert files.partial_name(log) == log
+        os.write(1, b"more\n")
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
+    assert log.read_text() == "kept\nrows\nrows\nmore\n"
+    assert [one.name for one in tmp_path.iterdir()] == ["log.csv"]
+    assert capfd.readouterr() == ("", "")
+
+
+@FIFO
+def test_a_pipe_that_is_but_a_descriptor_is_written_to(tmp_path: Path) -> None:
+    there, here = os.pipe()
+    link = tmp_path / "link.csv"
+    link.symlink_to(f"/dev/fd/{here}")  # what `--out >(gzip)` leads to
+    write_file(link, fill("through"))
+    os.close(here)
+    with os.fdopen(there, "rb") as stream:
+        assert stream.read() == b"through"
+
+
 # ---- through the command line ----
 
 
@@ -198,6 +229,37 @@ def test_a_pipe_as_a_model_or_as_what_a_model_was_made_of_is_not_waited_for(
             capsys, "analyze", "scene.yaml"
         )
         Path("users.csv").unlink()
+
+
+@FIFO
+def test_a_model_is_never_compiled_into_what_is_none(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whoever packed a folder may have put anything under the model's name."""
+    model, own = Path("scene.apc"), Path("own.txt")
+    own.write_text("mine", encoding="utf-8")
+    os.mkfifo("pipe")
+    link = "scene.apc: E601 can't be written: it is a link to what is no compiled model. Write: rm scene.apc"
+    special = "scene.apc: E601 can't be written: it is a device, pipe or socket. Write: rm scene.apc"
+    for target, message in ((own, link), ("new.txt", link), ("pipe", special), ("/dev/zero", special)):
+        model.symlink_to(target)
+        assert failed(capsys, "compile", "scene.yaml") == message
+        model.unlink()
+    os.mkfifo(model)
+    assert failed(capsys, "compile", "scene.yaml") == special
+    model.unlink()
+    assert own.read_text() == "mine" and not Path("new.txt").exists()
+    model.symlink_to("other.apc")
+    assert run(["compile", "scene.yaml"]) == 0
+    assert model.is_symlink() and Path("other.apc").is_file()
+
+
+def test_a_folder_of_the_kernel_s_is_no_library(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = replaced(AVERAGE, ("topology: three-users-average\n", "topology: a\nlibrary: /proc/self\n"))
+    Path("scene.yaml").write_text(text, encoding="utf-8")
+    assert "E214 the library folder /proc/self is an answer of the system's kernel." in failed(
+        capsys, "check", "scene.yaml"
+    )
 
 
 def test_a_library_that_is_the_whole_disk_is_refused(
@@ -307,3 +369,42 @@ def test_what_a_command_reads_it_never_replaces(
     assert failed(capsys, *words) == message
     assert Path("users.csv").read_text() == table
     assert Path("scene.txt").read_text() == AVERAGE
+
+
+@pytest.mark.parametrize(
+    ("words", "start"),
+    [
+        (
+            ("sweep", "--over", "contact.stiffness=1 N/m:2 N/m:2", "--jobs", "1"),
+            "contact.stiffness [N/m],verdict",
+        ),
+        (("simulate", "--duration", "10 ms", "--no-jit"), "time [s],"),
+        (
+            ("region", "--x", "contact.stiffness=0 N/m:9 N/m", "--y", "coordination.stiffness=0 N/m:9 N/m"),
+            "panel,topology,",
+        ),
+        (("show",), "three-users-average"),
+        (("schema",), "{"),
+    ],
+)
+def test_a_device_takes_the_text_format_of_a_command_and_its_words_stand_beside(
+    folder: Path, capfd: pytest.CaptureFixture[str], words: tuple[str, ...], start: str
+) -> None:
+    assert run([*words, "--out", "/dev/stdout"]) == 0
+    out, err = capfd.readouterr()
+    assert out.startswith(start)
+    assert "/dev/stdout" in err
+    assert "/dev/stdout" not in out
+    assert run([*words, "--out", os.devnull]) == 0
+    assert [one.name for one in folder.iterdir()] == ["scene.yaml"]
+    assert not Path(f"{os.devnull}.parts").exists()
+    assert not Path(f"{os.devnull}.json").exists()
+
+
+def test_from_python_the_line_to_write_is_python(folder: Path) -> None:
+    Path("users.csv").write_text("device.mass [kg]\n0.1\n0.2\n", encoding="utf-8")
+    Path("scene.yaml").write_text(replaced(AVERAGE, ("{count: 3}", "{table: users.csv}")), encoding="utf-8")
+    over = {"contact.stiffness": "1 N/m:2 N/m:2"}
+    assert told(lambda: apc.sweep("scene.yaml", over, out="users.csv")) == [
+        'users.csv: E616 is read by this command: out would replace it. Write: out="users-result.csv"'
+    ]

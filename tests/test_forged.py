@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +22,7 @@ from apc.__main__ import run
 from apc.compiler import cache, seal, store
 from apc.compiler.cache import MEMBER, SEAL
 from apc.inputs import load_fresh
-from tests.fuzz.models import packed, zipped
+from tests.fuzz.models import ask, packed, zipped
 from tests.topologies import AVERAGE, ROOT, compiled, replaced, told
 
 MODEL = Path("scene.apc")
@@ -229,6 +232,29 @@ def test_what_a_model_from_elsewhere_names_is_not_read(capsys: pytest.CaptureFix
     assert "E605 is stale: scene.yaml has changed" in told(load_fresh, MODEL)[0]
 
 
+# ---- numbers ----
+
+
+def constants_in(value: Any) -> list[list[float]]:
+    """Return the constants of every function in a document."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    own = [value["constants"]] if isinstance(value, dict) and "constants" in value else []
+    return own + [found for one in inside for found in constants_in(one)]
+
+
+def test_a_constant_without_a_value_is_told_of_or_of_no_account() -> None:
+    """No topology has one; a file may have it in place of any."""
+    hand = "hands: {hand: {type: SineForce, flange: device, force: 1 N, frequency: 3 Hz}}\n"
+    store.save(compiled(AVERAGE + hand), MODEL)
+    document, members = opened()
+    for found in constants_in(document):
+        for place, own in enumerate(found):
+            found[place] = float("nan")
+            MODEL.write_bytes(packed(document, members))
+            assert ask(MODEL) in ("answered", "refused")
+            found[place] = own
+
+
 # ---- size ----
 
 
@@ -257,6 +283,122 @@ def test_a_function_larger_than_its_model_is_refused_before_it_is_built() -> Non
     store.save(compiled(AVERAGE), MODEL)
     document, members = opened()
     document["system"]["kinds"][0]["derivative"]["inputs"][0][1] = 10**12
+    MODEL.write_bytes(packed(document, members))
+    assert "E604 is damaged" in told(store.load, MODEL)[0]
+
+
+def test_a_member_is_unpacked_as_far_as_the_archive_says_and_no_further() -> None:
+    """The list of members says 2 bytes; what is packed is 64 MiB of zeros."""
+    large = 64 << 20
+    content = bytearray(zipped({MEMBER: bytes(large)}))
+    at = content.index(large.to_bytes(4, "little"))
+    while at >= 0:
+        content[at : at + 4] = (2).to_bytes(4, "little")
+        at = content.find(large.to_bytes(4, "little"))
+    MODEL.write_bytes(content)
+    tracemalloc.start()
+    try:
+        assert "E604 is damaged" in told(store.load, MODEL)[0]
+        assert tracemalloc.get_traced_memory()[1] < large / 16
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_list_of_members_without_end_is_refused_before_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    store.save(compiled(AVERAGE), MODEL)
+    monkeypatch.setattr(cache, "MOST_LISTED", 100)
+    monkeypatch.setattr(zipfile.ZipFile, "__init__", lambda *_: pytest.fail("it is read"))
+    assert "E604 is damaged: its list of members is larger" in told(store.load, MODEL)[0]
+
+
+def before(content: bytes) -> bytes:
+    return b"#!/bin/sh\n" + content
+
+
+def after(content: bytes) -> bytes:
+    return content + b"\0"
+
+
+def as_a_comment(content: bytes) -> bytes:
+    return content[:-2] + b"\x01\x00x"
+
+
+def as_a_longer_end(content: bytes) -> bytes:
+    """Say by the longer form that the list is elsewhere, in a comment of the list's last member."""
+    end = struct.Struct("<4s4H2LH")
+    mark, *numbers, size, begin, _ = end.unpack(content[-end.size :])
+    entry = content.rindex(b"PK\x01\x02")
+    longer = struct.pack("<4sQ2H2L4Q", b"PK\x06\x06", 44, 45, 45, 0, 0, 1, 1, size, begin)
+    longer += struct.pack("<4sLQL", b"PK\x06\x07", 0, begin + size, 1)
+    listed = bytearray(content[: -end.size])
+    listed[entry + 32 : entry + 34] = len(longer).to_bytes(2, "little")
+    return bytes(listed) + longer + end.pack(mark, *numbers, size + len(longer), begin, 0)
+
+
+def as_a_member(content: bytes) -> bytes:
+    document, members = opened()
+    return zipped({MEMBER: json.dumps(document).encode(), **members, "run.sh": b"#!/bin/sh\n"})
+
+
+def as_a_field(content: bytes) -> bytes:
+    document, members = opened()
+    return packed({**document, "more": 1}, members)
+
+
+def as_a_member_twice(content: bytes) -> bytes:
+    buffer = io.BytesIO(content)
+    with zipfile.ZipFile(buffer, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr(MEMBER, archive.read(MEMBER))
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "add", [before, after, as_a_comment, as_a_longer_end, as_a_field, as_a_member, as_a_member_twice]
+)
+def test_a_file_that_holds_something_else_too_is_refused(add: Callable[[bytes], bytes]) -> None:
+    store.save(compiled(AVERAGE), MODEL)
+    MODEL.write_bytes(add(MODEL.read_bytes()))
+    assert told(store.load, MODEL) == [
+        "scene.apc: E604 is damaged: it is not what apc compile writes. Write: apc compile scene.yaml"
+    ]
+
+
+def units_of(document: Any) -> dict[str, list[tuple[Any, Any]]]:
+    """Return where a document has units, by what has them: what holds each, and where in that."""
+    system = document["system"]
+    [kind] = system["kinds"]
+    return {
+        "parameter": [(one, "unit") for one in system["parameters"]],
+        "value": [(one, "unit") for group in system["groups"] for one in group["values"]],
+        "state": [(one, "unit") for one in kind["states"]],
+        "output": [(part["units"], k) for part in kind["clocks"] for k in range(len(part["units"]))],
+        "sent": [(part["units"], k) for part in kind["sends"] for k in range(len(part["units"]))],
+    }
+
+
+@pytest.mark.parametrize("unit", ["mm", "parsec", "", "N N", "m^", "kg*m/s^2*", "\x1b[31m"])
+@pytest.mark.parametrize("of", ["parameter", "value", "state", "output", "sent"])
+def test_a_number_in_a_unit_that_is_not_of_si_is_refused(of: str, unit: str) -> None:
+    """Every number of a model is in SI: beside another unit it would be a wrong one."""
+    groups = ("user: {count: 3}", "user: {count: 3, set: {device.mass: 0.2 kg}}")
+    store.save(compiled(replaced(AVERAGE, groups)), MODEL)
+    document, members = opened()
+    for holder, key in units_of(document)[of]:
+        before, holder[key] = holder[key], unit
+        MODEL.write_bytes(packed(document, members))
+        assert "E604 is damaged" in told(store.load, MODEL)[0]
+        holder[key] = before
+    MODEL.write_bytes(packed(document, members))
+    assert store.load(MODEL).peers == 3
+
+
+@pytest.mark.parametrize("of", ["value", "state"])
+def test_a_number_of_two_units_is_refused(of: str) -> None:
+    groups = ("user: {count: 3}", "user: {count: 3, set: {device.mass: 0.2 kg}}")
+    store.save(compiled(replaced(AVERAGE, groups)), MODEL)
+    document, members = opened()
+    holder, key = units_of(document)[of][0]
+    holder[key] = "A"
     MODEL.write_bytes(packed(document, members))
     assert "E604 is damaged" in told(store.load, MODEL)[0]
 

@@ -8,10 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apc import answer as answering
+from apc.analysis.analysis import lifted_groups
 from apc.analysis.selfcheck import check_frame
+from apc.answer import answer
+from apc.api import simulate
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.language import tables
+from apc.compiler.language.recordings import read_time_table, read_trace
 from apc.compiler.language.tables import read_table
+from apc.compiler.language.units import parse_unit
+from apc.compiler.pipeline import compile_topology
+from apc.eigen import rigid
+from apc.eigen.modes import dense
 from apc.frame import discretize as discretizing
 from apc.frame import scheduling
 from apc.frame.discretize import discretize, moved_together
@@ -53,6 +62,36 @@ def test_a_heading_of_spaces_and_brackets_is_read_in_one_pass(tmp_path: Path) ->
     for heading in (" " * 100_000 + "[", "[" * 100_000, "a" + " " * 100_000 + "] [kg]"):
         (message,) = told(read_table, table(tmp_path, f"b [kg],{heading}\n"), NOWHERE)
         assert ":1:8: E702 a heading wants a name and its unit" in message
+
+
+def test_a_heading_without_end_is_told_in_a_few_words(tmp_path: Path) -> None:
+    """Of every reader of a table: what a heading says is shown cut."""
+    long = "a" * 10_000
+    newton = parse_unit("N", NOWHERE)
+    path = table(tmp_path, f"time [s],{long}\n0,1\n1,2\n")
+    shown = f"{'a' * 57}..."
+    assert told(read_time_table, path, "force", newton, NOWHERE) == [
+        f"{path}:1:10: E702 {shown} wants N, got 1."
+    ]
+    path.write_text(f"from,to,{long}\n1,2,1\n", encoding="utf-8")
+    edges = ("delay: 8 ms}", "delay: 8 ms, graph: {edges: users.csv}}")
+    (tmp_path / "scene.yaml").write_text(replaced(AVERAGE, edges), encoding="utf-8")
+    (message,) = told(compile_topology, tmp_path / "scene.yaml")
+    assert message.endswith(f"wants the headings from, to and weight or none, got from, to, {'a' * 47}...")
+
+
+def test_a_row_is_at_the_line_it_begins_in(tmp_path: Path) -> None:
+    """A cell in quotes may go over lines, to the end of the file if they are never closed."""
+    path = table(tmp_path, 'a,b,c\n\n1,"2\n",3\n4,x,6\n7,8,"9\n\n')
+    assert told(read_table, path, NOWHERE) == [f"{path}:5:3: E703 a cell wants a finite number, got x."]
+    path.write_text('a,b\n1,2\n,"x\n\n', encoding="utf-8")
+    assert told(read_table, path, NOWHERE) == [
+        f"{path}:3:1: E703 a cell wants a finite number, got nothing.",
+        f"{path}:3:2: E703 a cell wants a finite number, got x.",
+    ]
+    path.write_text('delay [ms],b\n"1\n",2\n1,2\nx,"\n\n', encoding="utf-8")
+    (message,) = told(read_trace, path, NOWHERE)
+    assert f"{path}:5:1: E703 a delay wants" in message
 
 
 @pytest.mark.parametrize("cell", ["1_0", "١٠", "nan", "infinity", "0x10"])
@@ -108,3 +147,99 @@ def test_peers_on_a_graph_have_a_limit_and_those_on_a_complete_one_none(graph: s
         "Write: graph: complete"
     )
     assert told(compiled, many) == []
+
+
+def leaf_and_levels(folder: Path, levels: int, width: int) -> str:
+    """Write components, each of so many of the one before; return a topology that has the last."""
+    folder.mkdir()
+    leaf = (
+        "component: L0\nconnectors: {flange: Flange}\nparameters: {k: {unit: N/m, default: 1}}\n"
+        "equations: [flange.f = -k*flange.x]\n"
+    )
+    (folder / "l0.yaml").write_text(leaf, encoding="utf-8")
+    for level in range(1, levels + 1):
+        parts = ", ".join(f"p{i}: {{type: L{level - 1}}}" for i in range(width))
+        text = (
+            f"component: L{level}\nconnectors: {{flange: Flange}}\nparts: {{{parts}}}\n"
+            "connect: {flange: p0.flange}\n"
+        )
+        (folder / f"l{level}.yaml").write_text(text, encoding="utf-8")
+    return f"{AVERAGE}library: ./{folder.name}\nhands: {{h: {{type: L{levels}, flange: device}}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("levels", "width", "message"),
+    [
+        (
+            9,
+            10,
+            ":1:12: E216 L3 holds 1,111 parts, those inside parts included, and 1000 are the most",
+        ),
+        (11, 1, ":1:12: E216 the parts of L10 stand inside one another more than 10 deep"),
+        (500, 1, "E212 components contain or extend one another more than 50 deep"),
+    ],
+)
+def test_parts_in_parts_are_counted_where_they_are_defined(
+    tmp_path: Path, levels: int, width: int, message: str
+) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(leaf_and_levels(tmp_path / "parts", levels, width), encoding="utf-8")
+    assert any(message in one for one in told(compile_topology, scene))
+
+
+@pytest.mark.parametrize(
+    ("limit", "why"),
+    [
+        ("MOST_TICKS", "8 ticks in a frame take too long"),
+        ("MOST_ENTRIES", "{} numbers of 4 states take too long"),
+    ],
+)
+def test_what_is_too_large_is_judged_and_not_varied(
+    monkeypatch: pytest.MonkeyPatch, limit: str, why: str
+) -> None:
+    model = compiled(AVERAGE)
+    (kind,) = model.kinds
+    monkeypatch.setattr(answering, limit, 7)
+    monkeypatch.setattr(answering, "margins", lambda *_, **__: pytest.fail("margins are looked for"))
+    monkeypatch.setattr(answering, "sensitivities", lambda *_, **__: pytest.fail("it is differentiated"))
+    found = answer(model)
+    assert found.analysis.stable
+    told_of = f"not looked for: {why.format(len(kind.parameters))}"
+    assert found.margins.note == told_of
+    assert found.sensitivities.note == f"what moves it most: {told_of}"
+
+
+def test_what_stands_still_is_written_out_once_however_many_ways_there_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = []
+    standing = rigid._standing
+    monkeypatch.setattr(rigid, "_standing", lambda *given: calls.append(1) or standing(*given))
+
+    def counted(free: int) -> int:
+        text = f"  free: {{mass: 1 kg, damping: 1 N*s/m, count: {free}}}\ncouplers:"
+        system = dense(*lifted_groups(compiled(replaced(AVERAGE, ("couplers:", text)))))
+        calls.clear()
+        assert rigid.stays_rigid(system, [group.exact for group in system.sites])
+        return len(calls)
+
+    assert counted(2) == counted(9)
+
+
+def test_a_force_that_has_no_value_from_some_instant_on_ends_the_run_there(tmp_path: Path) -> None:
+    """Where halves of an interval are integrated until they agree, what has no value never would."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts/own.yaml").write_text(
+        "component: Own\nconnectors: {flange: Flange}\n"
+        "parameters: {F: {unit: N, default: 1}, T0: {unit: s, default: 0.0105}}\n"
+        "equations: [flange.f = F*sqrt(1 - time/T0)]\n",
+        encoding="utf-8",
+    )
+    (tmp_path / "scene.yaml").write_text(
+        "topology: scene\nlibrary: parts\nclocks: {haptic: 1 ms}\npeers: {user: {count: 1}}\n"
+        "masses: {device: {mass: 1 kg, damping: 1 N*s/m}}\nhands: {hand: {type: Own, flange: device}}\n",
+        encoding="utf-8",
+    )
+    ran = simulate(compile_topology(tmp_path / "scene.yaml"), duration="20 ms", jit=False)
+    assert ran.time[-1] == pytest.approx(0.01)
+    assert np.isfinite(ran.values).all()

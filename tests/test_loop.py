@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from apc.analysis.analysis import lifted_groups
-from apc.eigen.loop import Packet, lay_out, packet_places
+from apc.eigen.closing import Packet, lay_out_loop
 from apc.eigen.modes import complete_loops, dense_loop
 from tests.sites import MS, paper
 
@@ -24,8 +24,8 @@ def test_the_state_is_each_sites_own_then_its_packets_by_row_and_age() -> None:
 
 def test_several_sites_stand_one_after_the_other_under_their_names() -> None:
     loop = dense_loop(*lifted_groups(paper()))
-    layout = lay_out(loop)
+    layout = lay_out_loop(loop)
     assert layout.offsets == (0, 8, 16)
     assert layout.names[8] == "user[2].device.x"
-    assert packet_places(loop.sites, loop.packets, layout.offsets) == layout.places
+    assert layout.packets == loop.packets
     assert sorted(layout.places.values()) == [6, 7, 14, 15, 22, 23]

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import scipy.io
 
+from apc import tables
 from apc.compiler.errors import ApcError
-from apc.simulation import formats
+from apc.present.recording import SUFFIXES, open_recording
 from apc.simulation.blocks import Block, blocks
-from apc.simulation.recording import SUFFIXES, open_recording
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.trajectory import simulate
@@ -179,13 +179,13 @@ def test_room_is_kept_for_what_comes_last(
     simulation: Simulation, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Once a block is written, nothing more is asked of the disk, whatever the numbers look like.
-    def cut(writer: formats.Writer) -> None:
+    def cut(writer: tables.Writer) -> None:
         assert writer.file.tell() <= writer._kept
         rooms.append(writer._kept)
         whole(writer)
 
-    whole, rooms = formats.Writer.cut, []
-    monkeypatch.setattr(formats.Writer, "cut", cut)
+    whole, rooms = tables.Writer.cut, []
+    monkeypatch.setattr(tables.Writer, "cut", cut)
     random = np.random.default_rng(1)
     wide = len(simulation.signals)
     noise = random.integers(0, 2**62, (1500, wide)).view(np.float64)

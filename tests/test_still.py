@@ -10,7 +10,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
-from apc.simulation.still import Body, Wall, bodies_of, draw_still, save_still
+from apc.present.still import Body, Wall, bodies_of, draw_still, save_still
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
 pytest.importorskip("matplotlib")

@@ -17,6 +17,7 @@ from apc.compiler import cache, store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.files import write_file
+from tests.fuzz.models import zipped
 from tests.topologies import AVERAGE, MESH, compiled, replaced, told
 
 TWO_KINDS = replaced(
@@ -123,7 +124,10 @@ def test_a_field_of_another_type_is_refused(model: Path, key: str, value: object
 
 
 def test_a_file_that_unpacks_too_far_is_refused(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cache, "LARGEST", 10)
+    with zipfile.ZipFile(model) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    model.write_bytes(zipped(members))
+    monkeypatch.setattr(cache, "LARGEST", model.stat().st_size)
     (line,) = told(store.load, model)
     assert "E604 is damaged: it unpacks to more than 0 MiB" in line
 
@@ -185,6 +189,7 @@ def test_a_byte_changed_or_an_end_cut_off_is_refused_or_harmless(
 
 EDGES = replaced(
     AVERAGE,
+    ("peers:", "parameters: {half: 250 N/m, full: 2*half, more: full + half}\npeers:"),
     ("type: AveragePosition", "type: SaturatedMesh, limit: 1 N"),
     ("lan: {", "lan: {graph: {edges: [[1, 2], [2, 3]]}, "),
 )
@@ -199,6 +204,16 @@ WRONG = {
     "a graph of another shape": ("links.0.graph.shape", "tree"),
     "a value that its exact one is not": ("parameters.0.exact", "7/3"),
     "a group's value of nothing": ("groups.0.values", [{"name": "no", "unit": "1", "value": 1.0}]),
+    "numbers that follow from one another in a circle": ("parameters.1.formula.names", ["more"]),
+    "numbers in another order": ("followers", ["more", "full"]),
+    "a number that is never followed": ("followers", ["full"]),
+    "a number that follows twice": ("followers", ["full", "more", "full"]),
+    "a number that follows from none": ("parameters.1.formula.names", ["no"]),
+    "a formula of other sizes": ("parameters.1.formula.numbers", []),
+    "a formula of no finite number": ("parameters.1.formula.numbers", ["9" * 400]),
+    "a formula of a loop": ("parameters.1.formula.function.loops", []),
+    "a formula of what no expression holds": ("parameters.1.formula.function.operations.0", ["asin", 0]),
+    "a formula beyond its text": ("parameters.1.formula.spans.0", [0, 99]),
     "an edge of other sizes": ("kinds.0.clocks.0.receives.0.edge", "kinds.0.derivative"),
 }
 

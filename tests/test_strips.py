@@ -10,8 +10,8 @@ import pytest
 from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.frame.overrides import Override, apply
+from apc.present.region import stable_outlines
 from apc.regions.axes import parse_axes
-from apc.regions.figure import stable_outlines
 from apc.regions.region import Region, region
 from apc.vary.critical import critical
 from tests.topologies import AVERAGE, compiled

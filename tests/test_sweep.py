@@ -155,7 +155,10 @@ def test_a_full_disk_keeps_what_is_finished(tmp_path: Path, monkeypatch: pytest.
             "sweep: E884 it.stiffness is swept: there is nothing to look for",
         ),
         ({"of": "analyse"}, "sweep: E884 analyse is nothing a sweep computes (analyze"),
-        ({"out": Path("r.txt")}, "r.txt: E887 a table wants .csv or .parquet, got .txt."),
+        (
+            {"out": Path("r.txt")},
+            'r.txt: E878 the suffix of out wants one of .csv, .parquet, got .txt. Write: out="r.csv"',
+        ),
         ({"jobs": 0}, "sweep: E889 the number of processes wants 1 or more, got 0."),
     ],
 )

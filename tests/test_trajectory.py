@@ -1,4 +1,4 @@
-"""`trajectory`, `summary`, `signals` and `figures`: what a person gets of a simulation."""
+"""`trajectory`, `summary`, `signals` and their presentation: what a person gets of a simulation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.simulation.figures import draw, save, thinned
+from apc.present.simulation import save_picture, thinned
 from apc.simulation.trajectory import Trajectory, simulate
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, replaced, told
 
@@ -135,15 +135,15 @@ def test_too_much_to_keep_is_told() -> None:
 def test_a_picture_is_written_and_the_same_run_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     pytest.importorskip("matplotlib")
     one, two = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
-    save(AVERAGE_RUN, one)
-    save(AVERAGE_RUN, two)
+    save_picture(AVERAGE_RUN, one)
+    save_picture(AVERAGE_RUN, two)
     assert one.stat().st_size > 10_000
     assert one.read_bytes() == two.read_bytes()
 
 
 def test_a_picture_has_a_panel_a_quantity_and_no_label_over_another() -> None:
     pytest.importorskip("matplotlib")
-    figure = draw(AVERAGE_RUN)
+    figure = AVERAGE_RUN.plot()
     assert [ax.get_ylabel() for ax in figure.axes] == ["position [mm]", "velocity [m/s]", "force [N]"]
     figure.draw_without_rendering()
     boxes = [ax.get_legend().get_window_extent() for ax in figure.axes]
@@ -183,7 +183,7 @@ def test_the_public_function_plays_a_file_with_other_numbers(tmp_path: Path) -> 
     assert isinstance(found, apc.Trajectory)
     assert found.values.shape == (5, 3)
     assert (found.values[0] == 0.002).all()
-    assert found.provenance.to_dict()["parameters"]["user.device.x"] == {"value": 0.002, "unit": "m"}
+    assert found.to_dict()["provenance"]["parameters"]["user.device.x"] == {"value": 0.002, "unit": "m"}
 
 
 def test_playing_a_compiled_model_needs_no_algebra_units_or_pictures(tmp_path: Path) -> None:

@@ -175,6 +175,11 @@ class Component:
         return 1 + max((inner.component.depth for inner in self.inner), default=0)
 
     @property
+    def size(self) -> int:
+        """How many parts it makes, itself and those inside parts included."""
+        return 1 + sum(inner.component.size for inner in self.inner)
+
+    @property
     def hears_others(self) -> bool:
         """Whether an equation, here or in an inner part, reads the other peers."""
         own = any(

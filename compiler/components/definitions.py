@@ -23,7 +23,7 @@ from apc.compiler.components.component import (
 )
 from apc.compiler.components.component_check import ComponentNames, check_balance
 from apc.compiler.components.declarations import read_equations, read_parameters, read_sends, read_variables
-from apc.compiler.components.parts import Scope, read_entry
+from apc.compiler.components.parts import MOST_PARTS, Scope, read_entry
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.values import PEERS
@@ -216,16 +216,21 @@ def _read_inner(
         entry = read_entry(name, body, component, place, scope, mistakes, free_connectors=free)
         inner.append(Inner(name, component, entry, place))
     deepest = max((component.depth for _, component, _ in bodies.values()), default=0)
-    if deepest >= DEEPEST:  # each level may double the parts
+    if deepest >= DEEPEST:
         what = f"the parts of {outer.name} stand inside one another more than {DEEPEST} deep"
         mistakes.add("E216", outer.place, what, hint="fewer components around one another")
+    if (size := outer.size + sum(component.size for _, component, _ in bodies.values())) > MOST_PARTS:
+        what = (
+            f"{outer.name} holds {size:,} parts, those inside parts included, and {MOST_PARTS} are the most"
+        )
+        mistakes.add("E216", outer.place, what, hint="fewer parts, or fewer components around one another")
     passed = [
         (theirs, part.name, own)
         for part in inner
         for own, other, theirs in part.entry.connections
         if not other
     ]
-    passed += _read_connect(root.get("connect"), outer, bodies, mistakes)
+    passed += _read_connect(root.get("connect"), outer, bodies, faulty, mistakes)
     return tuple(inner), tuple(passed)
 
 
@@ -233,6 +238,7 @@ def _read_connect(
     node: Node | None,
     outer: Component,
     bodies: dict[str, tuple[Mapping, Component, Place]],
+    faulty: Collection[str],
     mistakes: Mistakes,
 ) -> list[tuple[str, str, str]]:
     """Read `connect: {flange: tip.flange}`: connectors of the component that are those of an inner part."""
@@ -242,7 +248,7 @@ def _read_connect(
     hint = "connect: {flange: tip.flange}"
     for key, value in entries(read_mapping(node, "connect", mistakes, hint=hint)):
         text = read_text(value, key.text, mistakes, hint=f"{key.text}: tip.flange")
-        if text is None:
+        if text is None or text.partition(".")[0] in faulty:  # which is told of already
             continue
         if key.text not in own:
             what = f"connect names {brief(key.text)}, which is no connector of this component"

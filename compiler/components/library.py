@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from apc.compiler.cache import builtin_files
+from apc.compiler.cache import SUFFIX, builtin_files
 from apc.compiler.components.component import Component, Connector
 from apc.compiler.components.definitions import read_component, read_connector
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -19,7 +19,7 @@ from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.reading import brief
 from apc.compiler.source.source import MAX_BYTES, Source, read_source
 
-SUFFIX = ".yaml"
+LONGEST_CHAIN = 50  # of components that are read for one another, each by several calls of Python's stack
 
 
 class Library:
@@ -78,6 +78,9 @@ class Library:
                 chain = " → ".join([*self._open[self._open.index(name) :], name])
                 what = f"components contain or extend each other: {chain}"
                 raise ApcError(Mistake("E212", source.root.place, what))
+            if len(self._open) == LONGEST_CHAIN:
+                what = f"components contain or extend one another more than {LONGEST_CHAIN} deep"
+                raise ApcError(Mistake("E212", source.root.place, what, hint="fewer of them in one another"))
             if name in self._failed:
                 raise self._failed[name]  # read once, even if a hundred parts are of it
             self._open.append(name)

@@ -32,7 +32,6 @@ from apc.compiler.language.expression import (
     transform,
     walk,
 )
-from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.values import Value
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.scene import Scene, SceneGroup
@@ -147,8 +146,7 @@ def _delay_names(scene: Scene) -> set[str]:
     for part in reversed(scene.parts):  # what an inner part's number depends on is a number of an outer part
         for name, value in part.values:
             if f"{part.name}.{name}" in found and value.expression is not None:
-                tree = parse_expression(value.expression, Place(name, 1, 1, value.expression))
-                found |= {".".join(node.parts) for node in names(tree)}
+                found |= {".".join(node.parts) for node in names(value.expression)}
     return found
 
 

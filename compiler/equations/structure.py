@@ -35,9 +35,8 @@ from apc.compiler.equations.residuals import SCENE, Residual, report_no_number
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
 from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, symbol, to_sympy
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Given, Vanishing
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Mistakes
 from apc.compiler.language.expression import Expr, Name, names
-from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.scene.scene import Scene
 
@@ -128,11 +127,11 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[sympy.Symbol, Given]]
         numbers: dict[str, Given] = {"peers": Fraction(scene.peers)}
         for name, value in (common | dict(group.values)).items():
             numbers[name] = value.number
-            if columns and value.expression is not None and name not in columns:
-                tree = parse_expression(value.expression, Place(name, 1, 1, value.expression))
-                # Inside a part, what depends on a number that differs from peer to peer does so too.
-                if any(".".join(node.parts) in columns for node in names(tree)):
-                    columns[name] = to_sympy(tree, no_derivative)
+            if value.expression is None or name in columns:
+                continue
+            # Inside a part, what depends on a number that differs from peer to peer does so too.
+            if any(".".join(node.parts) in columns for node in names(value.expression)):
+                columns[name] = to_sympy(value.expression, no_derivative)
         found.append({symbol(name): number for name, number in (numbers | columns).items()})
     return found
 

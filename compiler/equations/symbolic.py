@@ -10,12 +10,9 @@ from __future__ import annotations
 import operator
 import sys
 from collections.abc import Callable, Set
-from dataclasses import dataclass
-from fractions import Fraction
 
 import sympy
 
-from apc.compiler.language.evaluation import OPERATORS, Operation, compute
 from apc.compiler.language.expression import (
     Binary,
     Call,
@@ -26,6 +23,8 @@ from apc.compiler.language.expression import (
     Name,
     Negate,
     Not,
+    Number,
+    fold,
 )
 
 # Smooth functions are SymPy's own; the others are opaque heads that only `functions` gives a meaning.
@@ -36,6 +35,13 @@ SMOOTH: dict[str, Callable[[sympy.Expr], sympy.Expr]] = {
     "sin": sympy.sin,
     "cos": sympy.cos,
     "tanh": sympy.tanh,
+}
+ARITHMETIC: dict[str, Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "^": operator.pow,
 }
 COMPARISONS = {
     "<": "less",
@@ -64,49 +70,32 @@ def derivative_symbol(name: str) -> sympy.Symbol:
 
 def to_sympy(expression: Expr, differentiate: Callable[[sympy.Expr], sympy.Expr]) -> sympy.Expr:
     """Build the SymPy expression; `differentiate` gives the time derivative of one, for `der`."""
-    return compute(expression, _Symbols(differentiate))
 
+    def leaf(node: Name | Number) -> sympy.Expr:
+        if isinstance(node, Name):
+            return symbol(".".join(node.parts))
+        return sympy.Rational(node.value.numerator, node.value.denominator)
 
-@dataclass(frozen=True, slots=True)
-class _Symbols:
-    """SymPy's expressions as an arithmetic."""
-
-    differentiate: Callable[[sympy.Expr], sympy.Expr]
-
-    def literal(self, value: Fraction) -> sympy.Expr:
-        return sympy.Rational(value.numerator, value.denominator)
-
-    def named(self, node: Name) -> sympy.Expr:
-        return symbol(".".join(node.parts))
-
-    def operation(self, node: Operation) -> Callable[..., sympy.Expr]:
-        found: Callable[..., sympy.Expr]
+    def operation(node: Expr, *operands: sympy.Expr) -> sympy.Expr:
         match node:
             case Negate():
-                found = operator.neg
+                return -operands[0]
             case Binary():
-                found = operator.pow if node.operator == "^" else OPERATORS[node.operator]
+                return ARITHMETIC[node.operator](*operands)
             case Compare():
-                found = head(COMPARISONS[node.operator])
+                return head(COMPARISONS[node.operator])(*operands)
             case Not():
-                found = head("not")
+                return head("not")(*operands)
+            case Logic():
+                return head(node.operator)(*operands)
+            case Conditional():
+                return head("if")(*operands)
             case Call("der"):
-                found = self.differentiate
-            case Call():
-                found = SMOOTH.get(node.function) or head(node.function)
-        return found
+                return differentiate(*operands)
+        assert isinstance(node, Call)
+        return (SMOOTH.get(node.function) or head(node.function))(*operands)
 
-    def joined(self, node: Logic, left: sympy.Expr, right: Callable[[], sympy.Expr]) -> sympy.Expr:
-        return head(node.operator)(left, right())
-
-    def chosen(
-        self,
-        node: Conditional,
-        condition: sympy.Expr,
-        then: Callable[[], sympy.Expr],
-        otherwise: Callable[[], sympy.Expr],
-    ) -> sympy.Expr:
-        return head("if")(condition, then(), otherwise())
+    return fold(expression, leaf, operation)
 
 
 def is_no_number(expression: sympy.Expr) -> bool:

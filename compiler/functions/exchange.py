@@ -1,7 +1,7 @@
 """The numbers of a scene by name, its groups, and who hears whom: all of a compiled model but its functions.
 
 Takes: `Scene`, and the kinds once they are written. Gives: `Timings`, parameters, groups, links, clocks.
-Guarantees: periods, phases and delays stay exact; what depends on a name keeps its expression.
+Guarantees: periods, phases and delays stay exact; what depends on a name has its formula.
 Does not: write functions.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from graphlib import TopologicalSorter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from apc.compiler.compiled import (
     Channel,
     Clock,
     Column,
+    Formula,
     Group,
     Kind,
     Link,
@@ -32,9 +34,8 @@ from apc.compiler.components.component import Number as NumberParameter
 from apc.compiler.equations.clocks import HoldCrossing
 from apc.compiler.equations.flatten import FlatKind
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
-from apc.compiler.language.evaluation import evaluate
-from apc.compiler.language.expression import Expr, Name, Number, format_expression, transform
-from apc.compiler.language.grammar import parse_expression
+from apc.compiler.language.evaluation import evaluate, formula_of
+from apc.compiler.language.expression import Expr, Name, Number, transform
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
 from apc.compiler.scene.channels import SceneChannel
@@ -67,7 +68,7 @@ class Timings:
 
     def use(self, name: str, value: Value) -> str:
         """Register a timing and return its name."""
-        self._found.setdefault(name, Timing(name, value.number, value.expression))
+        self._found.setdefault(name, Timing(name, value.number, _formula(value.expression)))
         return name
 
     def delay(self, hold: HoldCrossing, kind: FlatKind) -> str:
@@ -88,10 +89,9 @@ class Timings:
             return None
 
         tree = transform(expression, register)
-        text = format_expression(tree)
         number = Fraction(evaluate(tree, self._number, place=Place(self.scene.name)))
         name = f"delay of {hold.variable}" + (f" at {kind.name}" if own else "")
-        self._found.setdefault(name, Timing(name, number, text))
+        self._found.setdefault(name, Timing(name, number, formula_of(tree)))
         return name
 
     def _parameter(self, name: str, own: dict[str, tuple[str, Value]]) -> str:
@@ -108,8 +108,7 @@ class Timings:
             other = ".".join(parts)
             return tuple(self._parameter(other, own).split(".")) if other in own else parts
 
-        tree = renamed(parse_expression(value.expression, Place(name, 1, 1, value.expression)), whole)
-        return self.use(f"{group}.{name}", replace(value, expression=format_expression(tree)))
+        return self.use(f"{group}.{name}", replace(value, expression=renamed(value.expression, whole)))
 
     def _number(self, parts: tuple[str, ...]) -> Fraction:
         return Fraction(self.scene.peers) if parts == (PEERS,) else self._found[".".join(parts)].value
@@ -237,11 +236,11 @@ def compiled_groups(
     found = []
     start = 0
     for group in scene.groups:
-        values = [
-            compiled_parameter(scene, name, replace(value, expression=timing) if timing in exact else value)
-            for name, value in group.values
-            for timing in (f"{group.name}.{name}",)
-        ]
+        values = []
+        for name, value in group.values:
+            timing = (group.name, *name.split("."))
+            own = replace(value, expression=Name(timing)) if ".".join(timing) in exact else value
+            values.append(compiled_parameter(scene, name, own))
         columns = [Column(name, numbers) for name, numbers in group.columns]
         kind = kinds[kind_of[group.name]]
         for link in links:
@@ -333,10 +332,10 @@ def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
         The number, in SI.
     """
     unit = format_dimension(value.dimension)
-    number = float(value.number)
+    number, formula = float(value.number), _formula(value.expression)
     part, _, own = name.rpartition(".")
     if not part:
-        return Parameter(name, unit, number, value.expression, exact=value.number)
+        return Parameter(name, unit, number, formula, exact=value.number)
     component = scene.part(part).component
     declared = component.parameter(own)
     if isinstance(declared, NumberParameter):
@@ -344,7 +343,7 @@ def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
             name,
             unit,
             number,
-            value.expression,
+            formula,
             None if declared.minimum is None else float(declared.minimum),
             declared.open_minimum,
             None if declared.maximum is None else float(declared.maximum),
@@ -354,7 +353,7 @@ def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
     variable = component.variable(own)
     assert variable is not None
     about = f"start value: {variable.about}"
-    return Parameter(name, unit, number, value.expression, about=about, exact=value.number)
+    return Parameter(name, unit, number, formula, about=about, exact=value.number)
 
 
 def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
@@ -386,9 +385,32 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
         if link.channel is not None and any(used.name == link.name for used in links):
             found |= {
                 name: Parameter(
-                    *(name, "1", float(value.number), value.expression, 0.0, False, 1.0, about, value.number)
+                    name,
+                    "1",
+                    float(value.number),
+                    _formula(value.expression),
+                    minimum=0.0,
+                    maximum=1.0,
+                    about=about,
+                    exact=value.number,
                 )
                 for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
             }
     found[PEERS] = Parameter(PEERS, "1", float(scene.peers), about="number of peers")
     return tuple(found.values())
+
+
+def followers_of(
+    parameters: Sequence[Parameter], timings: Sequence[Timing], groups: Sequence[Group]
+) -> tuple[str, ...]:
+    """Return the names of all numbers that follow from others, each behind what it follows from."""
+    found: dict[str, dict[str, None]] = {}
+    numbers: list[Parameter | Timing] = [*parameters, *timings]
+    for one in (*numbers, *(value for group in groups for value in group.values)):
+        if one.formula is not None:
+            found.setdefault(one.name, {}).update(dict.fromkeys(one.formula.names))
+    return tuple(name for name in TopologicalSorter(found).static_order() if name in found)
+
+
+def _formula(expression: Expr | None) -> Formula | None:
+    return None if expression is None else formula_of(expression)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi
+import sympy
 
 from apc.compiler.compiled import (
     ClockPartition,
@@ -28,6 +29,7 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clocks import HoldCrossing, ReceiveCrossing
+from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
 from apc.compiler.equations.symbolic import derivative_symbol, symbol
 from apc.compiler.functions.casadi_writer import Writer
@@ -36,15 +38,19 @@ from apc.compiler.functions.exchange import (
     all_parameters,
     check_channels,
     compiled_groups,
+    followers_of,
     used_clocks,
     used_links,
     with_rounded,
 )
-from apc.compiler.functions.ports import held_ports
 from apc.compiler.functions.reached import Reached
+from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.recordings import TimeTable
 from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.scene.instances import Part
 from apc.compiler.scene.scene import Scene
+
+WORK = Dimension((("kg", 1), ("m", 2), ("s", -2)))  # the joule
 
 
 def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
@@ -59,19 +65,22 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     links, unheard = used_links(scene, kinds, timings)
     clocks, silent = used_clocks(scene, kinds, links, timings)
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
+    parameters = all_parameters(scene, kinds, links)
+    groups = compiled_groups(scene, kinds, numbers, links, timings)
     return CompiledSystem(
         scene.name,
         scene.about,
         tuple(clocks),
         tuple(links),
         timings.found,
-        all_parameters(scene, kinds, links),
+        parameters,
         tuple(with_rounded(scene, kind, links) for kind in kinds),
-        compiled_groups(scene, kinds, numbers, links, timings),
+        groups,
         tuple(dict.fromkeys([*dropped, *unheard, *silent])),
         origin,
         scene.experiment,
         scene.region,
+        followers_of(parameters, timings.found, groups),
     )
 
 
@@ -195,7 +204,7 @@ class _KindBuilder:
     def _ports(self, writer: Writer, inputs: _Inputs) -> Ports | None:
         """Write where held values act, of those that anything reads."""
         written = writer.known.keys()
-        found = [port for port in held_ports(self.scene, self.kind) if port.symbols <= written]
+        found = [port for port in _held_ports(self.scene, self.kind) if port.symbols <= written]
         if not found:
             return None
         rows = [port.potential for port in found] + [port.flow for port in found]
@@ -296,3 +305,69 @@ def _hold_name(hold: HoldCrossing, holds: Sequence[HoldCrossing]) -> str:
     """Return the name of what is held; with its delay, where one value is held twice."""
     same = sum(other.variable == hold.variable for other in holds)
     return hold.variable if same == 1 else hold.symbol
+
+
+@dataclass(frozen=True, slots=True)
+class _Port:
+    """A connector of part `part`: its potential, and the flow into the part, as expressions."""
+
+    part: str
+    potential: sympy.Expr
+    flow: sympy.Expr
+
+    @property
+    def symbols(self) -> set[sympy.Symbol]:
+        """What the port is written in."""
+        return set(self.potential.free_symbols | self.flow.free_symbols)
+
+
+def _held_ports(scene: Scene, kind: SortedKind) -> tuple[_Port, ...]:
+    """Return the ports of a kind: those whose flow follows from what their own part holds.
+
+    The work a part does at a port over an interval in which nothing switches is, exactly, minus the flow
+    into it times the change of the potential.
+    """
+    known = {
+        symbol(step[0]): step[1]
+        for step in kind.partitions[0].assignments
+        if not isinstance(step, ImplicitBlock)
+    }
+    known |= {symbol(name): expression for name, expression in kind.aliases}
+    held = {symbol(hold.symbol): hold.variable.rpartition(".")[0] for hold in kind.holds}
+    moving = {symbol(name) for name in kind.states} | {symbol("time")}
+    found = []
+    for part in scene.parts:
+        if part.name not in kind.clocked.flat.parts or part.name not in held.values():
+            continue
+        for potential, flow in _connector_pairs(part):
+            through, at = _whole(symbol(flow), known), _whole(symbol(potential), known)
+            if through is None or at is None:
+                continue
+            own = {s for s in through.free_symbols if held.get(s) == part.name}
+            others = {s for s in through.free_symbols if s in moving or held.get(s, part.name) != part.name}
+            if own and not others and not at.free_symbols & held.keys():
+                found.append(_Port(part.name, at, through))
+    return tuple(found)
+
+
+def _connector_pairs(part: Part) -> list[tuple[str, str]]:
+    """Return the names of potential and flow of a part's own connectors, where they make work."""
+    passed = {outer for outer, _, _ in part.component.passed}
+    return [
+        (f"{part.name}.{name}.{potential.name}", f"{part.name}.{name}.{flow.name}")
+        for name, connector in part.component.connectors
+        if name not in passed
+        for potential, flow in zip(connector.potentials, connector.flows, strict=False)
+        if potential.unit.dimension.multiply(flow.unit.dimension) == WORK
+    ]
+
+
+def _whole(wanted: sympy.Symbol, known: dict[sympy.Symbol, sympy.Expr]) -> sympy.Expr | None:
+    """Return a symbol in terms of states, holds and parameters; None if a loop decides it."""
+    expression = wanted
+    for _ in range(len(known) + 1):
+        replaceable = expression.free_symbols & known.keys()
+        if not replaceable:
+            return expression
+        expression = expression.xreplace({s: known[s] for s in replaceable})
+    return None

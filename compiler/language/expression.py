@@ -1,7 +1,8 @@
 """The nodes of an expression's tree, walking and changing them, and their text.
 
 Takes: `Expr` trees.
-Gives: the node types, `Equation`, `format_expression`, `children`, `rebuild`, `walk`, `names`, `transform`.
+Gives: the node types, `Equation`, `format_expression`, `children`, `rebuild`, `walk`, `names`, `transform`,
+`fold`.
 Guarantees: plain frozen data; the text has no more parentheses than the tree needs.
 Does not: read text (see `grammar`), or know what a name means, or its unit.
 """
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from fractions import Fraction
+from typing import TypeVar
 
 from apc.compiler.errors import Place
 
@@ -105,6 +107,8 @@ class Conditional:
     start: int = field(default=0, compare=False, repr=False)
     end: int = field(default=0, compare=False, repr=False)
 
+
+V = TypeVar("V")
 
 Expr = Number | Name | Negate | Binary | Compare | Logic | Not | Call | Conditional
 """One node of a tree; `start` and `end` are offsets into the parsed text and count in no comparison."""
@@ -303,3 +307,20 @@ def transform(expr: Expr, function: Callable[[Expr], Expr | None]) -> Expr:
     changed = tuple(transform(part, function) for part in parts)
     same = all(new is old for new, old in zip(changed, parts, strict=True))
     return expr if same else rebuild(expr, changed)
+
+
+def fold(expr: Expr, leaf: Callable[[Name | Number], V], operation: Callable[..., V]) -> V:
+    """Return what a tree comes to.
+
+    Parameters
+    ----------
+    expr
+        The tree.
+    leaf
+        Gives what a name or a number comes to.
+    operation
+        Gives what any other node comes to, from the node and what its sub-expressions come to.
+    """
+    if isinstance(expr, Name | Number):
+        return leaf(expr)
+    return operation(expr, *(fold(part, leaf, operation) for part in children(expr)))

@@ -64,7 +64,7 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeT
         raise ApcError(Mistake("E702", first.place, "a table over time", expected))
     times, numbers = table.columns
     if numbers.unit.dimension != unit.dimension:
-        raise ApcError(Mistake("E702", numbers.place, numbers.name, unit.text, numbers.unit.text))
+        raise ApcError(Mistake("E702", numbers.place, brief(numbers.name), unit.text, numbers.unit.text))
     if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
         expected = "two or more rows of rising time"
         raise ApcError(Mistake("E703", times.place, "a table over time", expected))
@@ -105,11 +105,10 @@ def read_trace(path: Path, named_at: Place) -> Trace:
     with open_table(path, named_at, known=(DELAY,)) as opened:
         own = _delay_column(opened.headings)
         faults = 0
-        for cells in opened.rows:
+        for line, cells in opened.numbered():
             if not cells or (len(cells) == 1 and cells[0].isspace()):
                 continue
-            at = Place(opened.file, opened.rows.line_num)
-            delay = _delay(cells, own, opened.headings, at, mistakes)
+            delay = _delay(cells, own, opened.headings, Place(opened.file, line), mistakes)
             delays.append(delay)
             faults += math.isnan(delay)
             if faults >= MOST_MISTAKES:

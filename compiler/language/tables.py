@@ -105,12 +105,19 @@ def read_table(path: Path, named_at: Place) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """A CSV file whose headings are read, each a name, a unit and a place; `rows` reads the rest."""
+    """A CSV file whose headings are read, each a name, a unit and a place; `rows` are the rest."""
 
     file: str
     digest: str
     headings: Headings
     rows: Reader
+
+    def numbered(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield each row with the line it begins in: a cell in quotes may go over several."""
+        begin = self.rows.line_num + 1
+        for cells in self.rows:
+            yield begin, cells
+            begin = self.rows.line_num + 1
 
 
 @contextmanager
@@ -214,10 +221,9 @@ def _rows(opened: Opened, mistakes: Mistakes) -> tuple[array[float], array[int]]
     width = len(opened.headings)
     numbers, lines = array("d"), array("q")
     found = 0
-    for cells in opened.rows:
+    for line, cells in opened.numbered():
         if not any(cell.strip() for cell in cells):
             continue
-        line = opened.rows.line_num
         if len(cells) != width:
             what = f"the row has {len(cells)} cells and there are {width} headings"
             mistakes.add("E703", Place(opened.file, line, 1), what)

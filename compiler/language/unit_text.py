@@ -1,12 +1,14 @@
 """Dimensions and SI values as text.
 
-Takes: a `Dimension`, and a number in SI. Gives: `format_dimension`, `format_si`.
+Takes: a `Dimension`, and a number in SI. Gives: `format_dimension`, `format_si`;
+`is_si`, whether a text is that of an SI unit.
 Guarantees: `parse_unit` reads what `format_dimension` writes; no registry of units is loaded.
 Does not: choose prefixes: values are shown in SI.
 """
 
 from __future__ import annotations
 
+import re
 from fractions import Fraction
 from functools import lru_cache
 
@@ -20,6 +22,8 @@ _FORMS = (
     *("N", "N/m", "N*s/m", "N*s", "N*m", "N/m^2", "N*s^2/m^2", "N*s/m^2", "N*m*s", "N/s", "m/N"),
     *("m/s", "m/s^2", "m/s^3", "m^2", "m^3", "1/s", "1/s^2", "1/m", "W", "V", "N*m/A", "kg*m^2"),
 )
+_POWER = r"(?:A|K|cd|kg|m|mol|s)(?:\^(?:[0-9]{1,9}|\([0-9]{1,9}/[0-9]{1,9}\)))?"
+_PRODUCT = re.compile(rf"(?:1|{_POWER}(?:\*{_POWER})*)(?:/(?:{_POWER}|\({_POWER}(?:\*{_POWER})+\)))?")
 
 
 def format_dimension(dimension: Dimension) -> str:
@@ -32,6 +36,11 @@ def format_dimension(dimension: Dimension) -> str:
 def _forms() -> dict[Dimension, str]:
     """Return the usual form of each dimension of `_FORMS`, read without a registry."""
     return {parse_factor(text, _derived)[1]: text for text in reversed(_FORMS)}
+
+
+def is_si(text: str) -> bool:
+    """Return whether a text is a unit in the form that `format_dimension` writes: a value in it is in SI."""
+    return text in _FORMS or _PRODUCT.fullmatch(text) is not None
 
 
 def _product(dimension: Dimension) -> str:

@@ -48,11 +48,11 @@ class Binding:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A number, in SI; `expression` is its text when it depends on other parameters."""
+    """A number, in SI; `expression` is its tree when it depends on other parameters."""
 
     number: Fraction
     dimension: Dimension
-    expression: str | None
+    expression: Expr | None
     place: Place
 
     def __str__(self) -> str:
@@ -237,7 +237,7 @@ def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -
         assert binding.number is not None
         return Value(binding.number, binding.dimension, None, binding.place)
     number = Fraction(evaluate(binding.expression, number_of, place=binding.place))
-    return Value(number, binding.dimension, format_expression(binding.expression), binding.place)
+    return Value(number, binding.dimension, binding.expression, binding.place)
 
 
 def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | None:

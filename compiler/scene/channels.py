@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistakes
 from apc.compiler.language.dimensions import DIMENSIONLESS
+from apc.compiler.language.expression import Binary, Name, Number
 from apc.compiler.language.recordings import read_trace
 from apc.compiler.language.values import Value
 from apc.compiler.source.nodes import Mapping as MappingNode
@@ -151,13 +152,14 @@ def _loss(
 def _completed(name: str, name_p: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], ...]:
     """Return all four probabilities with their names, those not given as netem has them."""
     p = given["p"]
+    rest = Binary("-", Number(Fraction(1)), Name(tuple(name_p.split("."))))
     defaults = {
-        "r": Value(1 - p.number, DIMENSIONLESS, f"1 - {name_p}", p.place),
+        "r": Value(1 - p.number, DIMENSIONLESS, rest, p.place),
         "1-h": Value(Fraction(1), DIMENSIONLESS, None, p.place),
         "1-k": Value(Fraction(0), DIMENSIONLESS, None, p.place),
     }
-    rest = ((f"{name}.{key}", given.get(key, default)) for key, default in defaults.items())
-    return ((name_p, p), *rest)
+    others = ((f"{name}.{key}", given.get(key, default)) for key, default in defaults.items())
+    return ((name_p, p), *others)
 
 
 def _probability(

@@ -189,7 +189,7 @@ class _ArcReader:
         self.texts[node.text] = table.digest
         names = [column.name for column in table.columns]
         if names not in (["from", "to"], ["from", "to", "weight"]):
-            got = ", ".join(names)
+            got = brief(", ".join(names))
             self.mistakes.add(
                 "E702",
                 table.columns[0].place,

@@ -5,7 +5,7 @@ Guarantees: parts, clocks, links, parameters and connections that are named exis
 their parameter wants and lie within its bounds; parts inside parts and arrays are written out; all mistakes
 of the file are reported together.
 Does not: look into a component's equations, or read a section itself: each has a module of its own
-(`groups`, `followers`, `named_numbers`, `timebase`, `sections`, `instances`, `links`, `studies`).
+(`groups`, `named_numbers`, `timebase`, `sections`, `instances`, `links`, `studies`).
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from collections.abc import Mapping as MappingType
 from dataclasses import dataclass
 from pathlib import Path
 
+from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Settable
-from apc.compiler.components.library import SUFFIX, Library
+from apc.compiler.components.library import Library
 from apc.compiler.errors import Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.values import (
     Value,
 )
-from apc.compiler.scene.followers import with_followers
-from apc.compiler.scene.groups import Columns, GroupBody, read_counts, read_settings
+from apc.compiler.scene.groups import Columns, GroupBody, read_counts, read_settings, with_followers
 from apc.compiler.scene.instances import Part, PartReader, settable_names
 from apc.compiler.scene.links import SceneLink, read_link
 from apc.compiler.scene.named_numbers import NamedNumbers, read_named_numbers

@@ -14,6 +14,7 @@ from fractions import Fraction
 from apc.compiler.components.component import Number, Reference
 from apc.compiler.components.parts import GROUND
 from apc.compiler.language.dimensions import SECOND, Dimension
+from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_si
 from apc.compiler.language.values import Value
 from apc.compiler.scene.instances import Part
@@ -184,7 +185,7 @@ def _numbers(scene: Scene, part: Part) -> Iterator[str]:
 
 
 def _expression(value: Value) -> str:
-    text = value.expression
+    text = format_expression(value.expression) if value.expression else ""
     return f" = {text}" if text and len(text) <= LONGEST_EXPRESSION else ""
 
 

@@ -83,7 +83,7 @@ def _(scene: Scene) -> str:
 
 
 def _quantity(value: Value) -> str:
-    return f"{value.expression} = {value}" if value.expression else str(value)
+    return f"{format_expression(value.expression)} = {value}" if value.expression else str(value)
 
 
 @describe.register

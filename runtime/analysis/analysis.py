@@ -12,15 +12,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
 from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import close_loop
-from apc.eigen.loop import Loop
+from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peer_group import PeerGroup, states_of, used_ways
 from apc.eigen.peers import group_of_row, peer_groups
 from apc.eigen.rigid import LENGTHS, what_stands
@@ -30,7 +28,6 @@ from apc.eigen.spectrum import (
     TO_DRIFT,
     Mode,
     Spectrum,
-    finite,
     judge,
     solve_spectrum,
 )
@@ -42,6 +39,7 @@ from apc.frame.schedule import ORDER, Schedule
 from apc.frame.scheduling import build_schedules
 from apc.frame.start import at_start
 from apc.network.nominal import left_out
+from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 
@@ -61,7 +59,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, slots=True)
-class Analysis:
+class Analysis(Result):
     """The answer of an analysis; `spectral_radius` is per frame, rigid modes removed.
 
     `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `plan.METHODS`.
@@ -70,6 +68,8 @@ class Analysis:
     `left_out` says what of the scene the answer does not look at. Of the rigid modes `translations` move
     something; the others are of what `unfelt` names, memories that nothing reads at these values.
     """
+
+    shown_by = "analysis:analysis"
 
     topology: str
     peers: int
@@ -86,48 +86,8 @@ class Analysis:
     notes: tuple[str, ...]
     proof: str = ""
     left_out: tuple[str, ...] = ()
-    unfelt: tuple[str, ...] = ()
     translations: int = 0
-
-    def __str__(self) -> str:
-        """Return the verdict in words, the numbers, and the modes as a table."""
-        from apc.answers.report import analysis_report  # it needs this module
-
-        return analysis_report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the analysis as plain data, ready for JSON."""
-        return {
-            "topology": self.topology,
-            "peers": self.peers,
-            "frame_s": self.frame_s,
-            "states_per_peer": self.states_per_peer,
-            "method": self.method,
-            "verdict": self.verdict,
-            "stable": self.stable,
-            "spectral_radius": self.spectral_radius,
-            "spectral_radius_error": self.spectral_radius_error,
-            "rigid_modes": self.rigid_modes,
-            "modes": [
-                {
-                    "eigenvalue": [mode.eigenvalue.real, mode.eigenvalue.imag],
-                    "magnitude": mode.magnitude,
-                    "multiplicity": mode.multiplicity,
-                    "frequency_hz": finite(mode.frequency_hz),
-                    "damping_ratio": finite(mode.damping_ratio),
-                    "shape": mode.shape,
-                    "participation": dict(mode.participation),
-                    "error": mode.error,
-                }
-                for mode in self.modes
-            ],
-            "linearized": self.linearized,
-            "notes": list(self.notes),
-            "proof": self.proof,
-            "left_out": list(self.left_out),
-            "translations": self.translations,
-            "unfelt": list(self.unfelt),
-        }
+    unfelt: tuple[str, ...] = ()
 
 
 def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared:

@@ -10,7 +10,6 @@ Does not: prove anything (see `box_proof`).
 from __future__ import annotations
 
 import itertools
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -21,11 +20,11 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups, prepare
 from apc.analysis.ranges import Range
-from apc.compiler.compiled import CompiledSystem, Group, Parameter
+from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.language.evaluation import OPERATORS, Operation, compute
-from apc.compiler.language.expression import Binary, Call, Compare, Conditional, Logic, Name, Negate, Not
+from apc.compiler.formula import FaultError, carrying, exactly
+from apc.compiler.plain import RULES
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
@@ -35,7 +34,7 @@ from apc.frame.exact import evaluate_exact
 from apc.frame.linearize import site_of_row
 from apc.frame.names import Free, find
 from apc.frame.overrides import Override, apply
-from apc.frame.parameters import exact_numbers
+from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
 from apc.network.nominal import refuse_channel_number
 
@@ -208,86 +207,30 @@ def _reach(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
 
 def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field: Ratios) -> dict[str, Ratio]:
     """Return those parameters of a group's kind that the open ones reach."""
-    holder = {parameter.name: parameter for parameter in system.parameters}
-    holder |= {value.name: value for value in group.values}
-    timings = {timing.name: timing.value for timing in system.timings}
-    varying = {column.name for column in group.columns}
-    known: dict[str, Any] = {
+    columns = {column.name for column in group.columns}
+    scope = scope_of(system, group.values, fixed=columns)
+    varying = scope.follow(dict.fromkeys(columns, True), lambda *_: True, lambda _: False)
+    given = {
         one.name: field.parameter(place)
         for place, one in enumerate(ranges)
         if one.group in (None, group.name)
     }
 
-    def value_of(name: str) -> Any:
-        if name not in known:
-            known[name] = timings[name] if name not in holder else evaluated(holder[name])
-        return known[name]
-
-    def evaluated(parameter: Parameter) -> Any:
-        from apc.compiler.language.expression import names
-        from apc.compiler.language.grammar import parse_expression
-
-        if parameter.name in varying or parameter.expression is None:
-            return Fraction(parameter.value)
-        tree = parse_expression(parameter.expression, Place(parameter.name, 1, 1, parameter.expression))
-        parts = [".".join(node.parts) for node in names(tree)]
-        values = [value_of(part) for part in parts]  # all of them: only then it is known who varies
-        is_open = any(isinstance(value, Ratio) for value in values)
-        own = [part for part in parts if part in varying]
-        if own and is_open:
-            what = f"{parameter.name} depends on {own[0]}, which differs from peer to peer of {group.name}"
-            raise ApcError(Mistake("E832", _PLACE, what))
+    def compute(name: str, formula: Formula, values: list[Any]) -> Any:
+        own = [one for one in formula.names if one in varying]
         if own:
-            varying.add(parameter.name)
-        if not is_open:
-            return Fraction(parameter.value)
+            what = f"{name} depends on {own[0]}, which differs from peer to peer of {group.name}"
+            raise ApcError(Mistake("E832", _PLACE, what))
         try:
-            return compute(tree, _Quotients(value_of))
-        except NotRational as reason:
-            what = f"{parameter.name} = {parameter.expression[:60]} {reason}"
+            return exactly(formula.function, [*values, *formula.numbers], _quotients)
+        except FaultError as fault:
+            reason = fault.cause if isinstance(fault.cause, NotRational) else fault.words
+            what = f"{name} = {formula.text[:60]} {reason}"
             raise ApcError(Mistake("E832", _PLACE, what)) from None
 
-    found = {name: value_of(name) for name in system.kinds[group.kind].parameters}
-    return {name: value for name, value in found.items() if isinstance(value, Ratio)}
-
-
-@dataclass(frozen=True, slots=True)
-class _Quotients:
-    """Rationals and quotients of polynomials in the open parameters as an arithmetic."""
-
-    value_of: Callable[[str], Any]
-
-    def literal(self, value: Fraction) -> Any:
-        return value
-
-    def named(self, node: Name) -> Any:
-        return self.value_of(".".join(node.parts))
-
-    def operation(self, node: Operation) -> Callable[..., Any]:
-        match node:
-            case Negate():
-                return operator.neg
-            case Not():
-                return operator.not_
-            case Binary("^"):
-                return _power
-            case Binary() | Compare():
-                return OPERATORS[node.operator]
-            case Call() if node.function in _FUNCTIONS:
-                return _FUNCTIONS[node.function]
-            case Call():
-                raise NotRational(f"takes {node.function}() of a parameter that is left open")
-
-    def joined(self, node: Logic, left: Any, right: Callable[[], Any]) -> Any:
-        return left and right() if node.operator == "and" else left or right()
-
-    def chosen(
-        self, node: Conditional, condition: Any, then: Callable[[], Any], otherwise: Callable[[], Any]
-    ) -> Any:
-        return then() if condition else otherwise()
-
-
-_FUNCTIONS: dict[str, Callable[..., Any]] = {"abs": abs, "max": max, "min": min}
+    wanted = system.kinds[group.kind].parameters
+    found = scope.follow(given, compute, lambda name: Fraction(scope.holder[name].value), wanted)
+    return {name: found[name] for name in wanted if isinstance(found.get(name), Ratio)}
 
 
 def _power(base: Any, exponent: Any) -> Any:
@@ -295,6 +238,21 @@ def _power(base: Any, exponent: Any) -> Any:
     if whole != exponent:
         raise NotRational("takes a power that is not whole")
     return base**whole
+
+
+def _quotients(word: str) -> Callable[..., Any]:
+    """Return what an operation is of rationals, and of quotients of polynomials in the open parameters."""
+
+    def refuse(*_: Any) -> Any:
+        raise NotRational(f"takes {word}() of a parameter that is left open")
+
+    return carrying(word, _RULES.get(word, refuse))
+
+
+_RULES: dict[str, Callable[..., Any]] = {
+    **{word: rule for word, rule in RULES.items() if word not in ("sign", "floor")},
+    "pow": _power,
+}
 
 
 def _open_site(group: PeerGroup, opened: Mapping[str, Ratio], system: CompiledSystem) -> LinearSite:

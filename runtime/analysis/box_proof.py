@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from apc.analysis.box import Box, open_box
 from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import counted, with_unit, wrapped
 from apc.eigen.balls import (
     Balls,
     compose,
@@ -42,9 +41,11 @@ from apc.eigen.closing import ClosedSystem
 from apc.eigen.duals import Dual, mapped, slope_of, step_duals
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.ratios import Ratio
-from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_places, stays_rigid, what_stands
+from apc.eigen.relative import relative_places
+from apc.eigen.rigid import RigidModes, find_rigid_modes, stays_rigid, what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
 from apc.frame.site import LinearSite, entrywise
+from apc.result import Result
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -67,12 +68,14 @@ DOUBLINGS = 40
 
 
 @dataclass(frozen=True, slots=True)
-class BoxProof:
+class BoxProof(Result):
     """What was proved of a box; `stable` is None when neither was.
 
     `cells` were looked at; `open_share` of the box's volume is left open. `point`, SI values in the order of
     `ranges`, is where it is unstable, or the middle of the largest cell left open.
     """
+
+    shown_by = "analysis:box_proof"
 
     topology: str
     ranges: tuple[Range, ...]
@@ -82,47 +85,6 @@ class BoxProof:
     open_share: float
     point: tuple[float, ...]
     notes: tuple[str, ...]
-
-    def __str__(self) -> str:
-        """Return the answer in words, at most 80 columns wide."""
-        lines = [f"  {one}" for one in self.ranges]
-        if self.stable:
-            said = f"proved {self.verdict} for every value in the box ({counted(self.cells, 'cell')})"
-        elif self.stable is False:
-            said = "not stable in all of the box"
-            lines += ["proved unstable at", *(f"  {where}" for where in self._where())]
-        else:
-            said = f"undecided, {self.open_share:.2g} of the box is left open ({counted(self.cells, 'cell')})"
-            lines += ["among others around", *(f"  {where}" for where in self._where())] if self.point else []
-        lines += [f"  {note}" for note in self.notes]
-        return "\n".join([f"{self.topology}:", *wrapped(said), *lines])
-
-    def _where(self) -> list[str]:
-        return [
-            f"{one.label} = {with_unit(f'{value:.12g}', one.unit)}"
-            for one, value in zip(self.ranges, self.point, strict=True)
-        ]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the proof as plain data, ready for JSON."""
-        return {
-            "topology": self.topology,
-            "box": [
-                {
-                    "parameter": one.label,
-                    "unit": one.unit,
-                    "range": [float(one.low), float(one.high)],
-                }
-                for one in self.ranges
-            ],
-            "verdict": self.verdict,
-            "stable": self.stable,
-            "cells": self.cells,
-            "open_share": self.open_share,
-            "unstable_at": list(self.point) if self.stable is False else None,
-            "open_around": list(self.point) if self.stable is None and self.point else None,
-            "notes": list(self.notes),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,7 +224,7 @@ def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
     matrix = compose(question.system, sites, steps)
     if by is not None:
         matrix = mapped(slope_of, matrix)
-    return reduced_balls(matrix, question.vectors, question.held, question.rest)[0]
+    return reduced_balls(matrix, question.vectors, question.held, question.rest)
 
 
 def _site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSite:

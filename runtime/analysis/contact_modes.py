@@ -14,29 +14,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.words import in_hertz, measured, wrapped
-from apc.eigen.spectrum import UNSTABLE, finite
+from apc.eigen.spectrum import UNSTABLE
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import linearize
 from apc.frame.parameters import resolve
+from apc.result import Result
 
 EVERYONE = "on at every peer"
 NOBODY = "on at no peer"
 
-MOST_NAMED = 30  # columns of a mode's name; a longer one has a line of its own
-
 # For each group of the scene, the names of the parts that are on.
 _Setting = tuple[frozenset[str], ...]
-
-
-# Digits of a spectral radius that its column has room for.
-SHOWN = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +53,13 @@ class ContactMode:
 
 
 @dataclass(frozen=True, slots=True)
-class ContactModes:
+class ContactModes(Result):
     """Every mode of a scene; none where nothing switches.
 
     `parts` are the switching parts by name; `notes` say what was not looked into.
     """
+
+    shown_by = "analysis:contact_modes"
 
     topology: str
     parts: tuple[str, ...]
@@ -92,52 +87,6 @@ class ContactModes:
         if unknown:
             words += f"; not decided when {' or '.join(unknown)}"
         return f"{', '.join(self.parts)}: {words}"
-
-    def __str__(self) -> str:
-        """Return the modes as a table of at most 80 columns, and which is unstable in words."""
-        if not self.modes:
-            return "\n".join([f"{self.topology}: no part switches", *self.notes])
-        lines = [*wrapped(f"{self.topology}: {self.summary}"), ""]
-        lines += [f"  {name} on: it follows the motion; off: it does not" for name in self.parts]
-        width = min(MOST_NAMED, max(len(mode.name) for mode in self.modes))
-        lines += ["", f"  {'':<{width}}  {'spectral radius':<19}  {'frequency':>9}  verdict"]
-        for mode in self.modes:
-            if len(mode.name) > width:
-                lines.append(f"  {mode.name}")
-            head = f"  {mode.name if len(mode.name) <= width else '':<{width}}"
-            if mode.refusal:
-                lines += [f"{head}  not analysed:", *wrapped(mode.refusal, "    ", "    ")]
-                continue
-            radius = measured(mode.spectral_radius, max(mode.spectral_radius_error, SHOWN))
-            frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
-            verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
-            lines.append(f"{head}  {radius:<19}  {frequency:>9}  {verdict}{'*' if mode.linearized else ''}")
-        if any(mode.linearized for mode in self.modes):
-            lines += ["", "  * near the start values: this piece is not linear"]
-        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the modes as plain data, ready for JSON."""
-        return {
-            "topology": self.topology,
-            "parts": list(self.parts),
-            "unstable": list(self.unstable),
-            "modes": [
-                {
-                    "name": mode.name,
-                    "on": {group: list(parts) for group, parts in mode.on},
-                    "verdict": mode.verdict or None,
-                    "stable": mode.stable,
-                    "spectral_radius": mode.spectral_radius if mode.verdict else None,
-                    "spectral_radius_error": mode.spectral_radius_error if mode.verdict else None,
-                    "frequency_hz": finite(mode.frequency_hz) if mode.verdict else None,
-                    "linearized": mode.linearized,
-                    "refusal": mode.refusal,
-                }
-                for mode in self.modes
-            ],
-            "notes": list(self.notes),
-        }
 
 
 def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -> ContactModes:

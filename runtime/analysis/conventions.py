@@ -26,11 +26,11 @@ import numpy as np
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError
-from apc.compiler.words import measured
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.scheduling import build_schedules
 from apc.frame.site import LinearSite
+from apc.result import Result
 
 # The pairs of events whose order at one instant can change the frame, and what each order other than the
 # default means. Sending and ticking read the same instant and write different things: their order can't.
@@ -81,11 +81,13 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Conventions:
+class Conventions(Result):
     """The outcomes, the default one first; `repeated` says whether there are others to compare it with.
 
     `not_repeated` says why not. `start_matters` says whether the linearization depends on what is heard.
     """
+
+    shown_by = "analysis:conventions"
 
     topology: str
     outcomes: tuple[Outcome, ...]
@@ -111,53 +113,6 @@ class Conventions:
             return ""
         verdict = other.verdict or "not analysed"
         return f"the verdict hangs on a convention: {verdict} if {other.words} (--conventions lists all)"
-
-    def __str__(self) -> str:
-        """Return the outcomes as lines of at most 80 columns."""
-        lines = [f"{self.topology}: {self._headline()}", ""]
-        for number, one in enumerate(self.outcomes, 1):
-            radius = measured(one.spectral_radius, one.spectral_radius_error)
-            lines.append(f"  {number}  {one.verdict or 'not analysed'}")
-            lines.append(f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}")
-            lines += [f"     {departure}" for departure in one.departures or (DEFAULT,)]
-            if one.start:
-                lines.append(f"     heard before the first packet: {one.start}")
-            shown = " < ".join(one.orders[0])
-            lines.append(f"     {len(one.orders)} of {ORDERS} orders, such as {shown}")
-        if self.repeated and not self.start_matters:
-            lines += ["", "  What is heard before the first packet can't change the verdict."]
-        return "\n".join(lines)
-
-    def _headline(self) -> str:
-        if not self.repeated:
-            return self.not_repeated
-        if self.flips:
-            return "the verdict depends on the conventions"
-        return "the same verdict under every convention"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the outcomes as plain data, ready for JSON."""
-        return {
-            "topology": self.topology,
-            "flips": self.flips,
-            "repeated": self.repeated,
-            "not_repeated": self.not_repeated,
-            "start_matters": self.start_matters,
-            "outcomes": [
-                {
-                    "orders": [list(order) for order in one.orders],
-                    "departures": list(one.departures),
-                    "start": one.start,
-                    "verdict": one.verdict or None,
-                    "stable": one.stable,
-                    "spectral_radius": one.spectral_radius if one.verdict else None,
-                    "spectral_radius_error": one.spectral_radius_error if one.verdict else None,
-                    "frame_s": one.frame_s,
-                    "refusal": one.refusal,
-                }
-                for one in self.outcomes
-            ],
-        }
 
 
 def conventions(

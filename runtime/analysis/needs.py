@@ -16,13 +16,11 @@ from apc.analysis.analysis import prepare
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.words import counted
 from apc.frame.exchange import build_exchange
 from apc.frame.jacobians import edge_name
 from apc.frame.parameters import resolve
+from apc.result import Result
 from apc.trouble import finite_equations
-
-_NOUNS = {"determinant": "determinant", "krylov": "sparse system"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,23 +37,16 @@ class SiteNeeds:
         """All of it together."""
         return self.motion + self.remembered + self.packets
 
-    def __str__(self) -> str:
-        """Return it in words."""
-        parts = [f"{self.motion} motion"]
-        if self.remembered:
-            parts.append(f"{self.remembered} delayed force")
-        if self.packets:
-            parts.append(f"{self.packets} network")
-        return f"{self.states} states a peer ({', '.join(parts)})"
-
 
 @dataclass(frozen=True, slots=True)
-class Needs:
+class Needs(Result):
     """What a scene keeps: `sites` one a kind, `ticks` of each clock in a frame.
 
     It is analysed by `method` as `systems`, (count, size); `refused` says why there are none, where there are
     none. `pairs` names the receives that are evaluated once a pair of peers.
     """
+
+    shown_by = "analysis:needs"
 
     peers: int
     frame: Fraction  # s
@@ -65,16 +56,6 @@ class Needs:
     systems: tuple[tuple[int, int], ...]
     refused: str
     pairs: tuple[str, ...]
-
-    def __str__(self) -> str:
-        """Return it in one sentence."""
-        sites = "; ".join(f"{site.name}: {site}" if len(self.sites) > 1 else str(site) for site in self.sites)
-        whole = self.peers > 1 and sum(count for count, _ in self.systems) == 1
-        noun = _NOUNS.get(self.method, "system" if whole else "mode")
-        systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in self.systems)
-        analysed = f"not analysed: {self.refused}" if self.refused else f"analysed as {systems}"
-        pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in self.pairs)
-        return f"{sites}, {counted(self.peers, 'peer')}; {analysed}{pairs}"
 
 
 def needs(system: CompiledSystem) -> Needs:

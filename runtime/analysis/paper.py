@@ -29,12 +29,14 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis
 from apc.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import ClosedSystem
-from apc.eigen.rigid import RigidModes, find_rigid_modes, independent_places
+from apc.eigen.closing import ClosedSystem, Hearing, StateLayout, close
+from apc.eigen.relative import Relative, independent_places, relative_bounded
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
 from apc.frame.discretize import UNIT
-from apc.frame.lift import COEFFICIENT_ROUNDINGS
+from apc.frame.lift import COEFFICIENT_ROUNDINGS, FrameMap
 from apc.network.nominal import left_out
+from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 
@@ -48,8 +50,10 @@ RIGID_ROUNDINGS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NamedMatrix:
+class NamedMatrix(Result):
     """A matrix (rows, columns) and what its rows and columns are."""
+
+    shown_by = "analysis:matrix"
 
     values: Floats
     rows: tuple[str, ...]
@@ -60,23 +64,17 @@ class NamedMatrix:
         """The number of rows and of columns."""
         return len(self.rows), len(self.columns)
 
-    def __str__(self) -> str:
-        """Return the shape and the ends of the names."""
-        rows, columns = self.rows, self.columns
-        shown = f"{len(rows)} × {len(columns)}"
-        return (
-            f"{shown}: {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if self.values.size else shown
-        )
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperRoute:
+class PaperRoute(Result):
     """Every matrix of the paper's section III, for n peers at ratio R.
 
     `a`, `b`, `c` are eq. (18); `a_d`, `b_d`, `c_d`, `d_d` eq. (19), without delays; `a_aug` … `d_aug` the
     same with the delays; `f_d` the feedback; `closed` A_cl of eq. (20); `eigenvalues` its eigenvalues, the
     largest first, rigid ones included.
     """
+
+    shown_by = "analysis:paper_route"
 
     ratio: int
     frame_s: float
@@ -94,16 +92,6 @@ class PaperRoute:
     f_d: NamedMatrix
     closed: NamedMatrix
     eigenvalues: NDArray[np.complex128]
-
-    def __str__(self) -> str:
-        """Return the shapes, a line a matrix."""
-        named = (
-            *(("A", self.a), ("B", self.b), ("C", self.c), ("A_D", self.a_d), ("B_D", self.b_d)),
-            *(("C_D", self.c_d), ("D_D", self.d_d), ("A_aug", self.a_aug), ("B_aug", self.b_aug)),
-            *(("C_aug", self.c_aug), ("D_aug", self.d_aug), ("F_D", self.f_d), ("A_cl", self.closed)),
-        )
-        lines = [f"  {name:<6} {len(one.rows):>4} × {len(one.columns)}" for name, one in named]
-        return "\n".join([f"ratio {self.ratio}, frame {self.frame_s * 1e3:.6g} ms", *lines])
 
 
 def paper_route(system: CompiledSystem) -> PaperRoute:
@@ -241,16 +229,12 @@ def _lift(loop: OpenLoop, step: Floats, absolute: bool = False) -> _Lifted:
     return _Lifted((a_d, b_all @ at_once, c_d, d_all @ at_once), delayed, f, terms)
 
 
-def _close(lifted: _Lifted, ratio: int) -> Floats:
-    """Return A_cl of eq. (20): (I − D F)⁻¹ C by its finite series, as a force moves later samples only."""
-    a, b, c, d = lifted.delayed
-    total = term = c
-    for _ in range(ratio):
-        term = d @ (lifted.f @ term)
-        if not term.any():
-            return np.asarray(a + b @ (lifted.f @ total))
-        total = total + term
-    raise AssertionError("a force moves the sample it was computed from")
+def _close(lifted: _Lifted) -> Floats:
+    """Return A_cl of eq. (20): the loop u_D = F_D y_D closed; what is on its way is in the state."""
+    one = FrameMap(*lifted.delayed)
+    names = ("",) * len(one.p)
+    hearing = Hearing(lifted.f, np.zeros((len(lifted.f), len(one.p))))
+    return close([one], [hearing], StateLayout((0,), names, {})).matrix
 
 
 def _acting(loop: OpenLoop) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
@@ -292,7 +276,7 @@ def _route(loop: OpenLoop) -> PaperRoute:
     """Name every matrix."""
     n, _, _, _, ratio = _sizes(loop)
     lifted = _lift(loop, loop.step)
-    closed = _close(lifted, ratio)
+    closed = _close(lifted)
     times = [float(j * loop.period * 1000) for j in range(-ratio, ratio)]
     fast, slow = [one.name for one in loop.fast], [one.name for one in loop.slow]
     heard = [one.name for one in loop.heard]
@@ -347,13 +331,12 @@ def _waiting_names(loop: OpenLoop) -> tuple[str, ...]:
 def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tuple[ClosedSystem, int]:
     """Return A_cl in relative coordinates, its error and its motion; and how many zero columns were left out.
 
-    With the rigid motions V = [V_p; V_r], p as many positions as there are motions, and W = V_r V_p⁻¹, the
-    relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr.
+    As many positions are given up as there are rigid motions.
     """
     n, _, _, _, ratio = _sizes(loop)
     lifted, large = _lift(loop, loop.step), _lift(loop, loop.step_size, absolute=True)
     dead = (ratio - 1) * n
-    closed, size = _close(lifted, ratio), _close(large, ratio)
+    closed, size = _close(lifted), _close(large)
     # A path through a frame passes at most so many sums and coefficients (see `lift.lift`).
     roundings = (3 * ratio + 4) * (lifted.terms + 2 + COEFFICIENT_ROUNDINGS)
     charge = roundings * UNIT / (1 - roundings * UNIT)
@@ -374,22 +357,15 @@ def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tu
         wide = np.abs(basis[rest]) @ np.abs(inverse)
         off = doubt[rest] @ np.abs(inverse)
         off += wide @ (doubt[held] + wrong * np.abs(basis[held])) @ np.abs(inverse) + wrong * wide
-        error = (
-            error[np.ix_(rest, rest)]
-            + np.abs(weights) @ error[np.ix_(held, rest)]
-            + (2 * off + wrong * np.abs(weights)) @ size[np.ix_(held, rest)]
-            + UNIT * size[np.ix_(rest, rest)]
-        )
-        matrix = matrix[np.ix_(rest, rest)] - weights @ matrix[np.ix_(held, rest)]
+        at = Relative(held, rest, weights, 2 * off + wrong * np.abs(weights))
+        matrix, error = relative_bounded(matrix, error, at)
     system = ClosedSystem(
         name=METHOD,
         multiplicity=1,
         sites=(),  # a matrix by itself, its rigid motions already out
         coupling={},
         frame_s=float(ratio * loop.period),
-        names=tuple(names[place] for place in rest),
-        offsets=(0,),
-        packets=(),
+        layout=StateLayout((0,), tuple(names[place] for place in rest), {}),
         matrix=matrix,
         error=error,
         heard=(),

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from apc.analysis.switches import varying_slopes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.loop import Loop
+from apc.eigen.closing import Loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
 from apc.eigen.peers import more_differ, peer_groups

@@ -9,9 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
-
-from apc.compiler.words import with_unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +25,3 @@ class Range:
     def label(self) -> str:
         """The parameter as a person writes it, its group before it."""
         return self.name if self.group is None else f"{self.group}.{self.name}"
-
-    def __str__(self) -> str:
-        low, high = (with_unit(f"{float(one):.9g}", self.unit) for one in (self.low, self.high))
-        return f"{self.label} from {low} to {high}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the range as plain data, ready for JSON."""
-        return {"parameter": self.label, "unit": self.unit, "range": [float(self.low), float(self.high)]}

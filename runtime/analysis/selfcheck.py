@@ -22,7 +22,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import PRECISIONS, TOO_LARGE, UNIT, moved_together
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
-from apc.frame.lift import COEFFICIENT_ROUNDINGS, lift
+from apc.frame.lift import COEFFICIENT_ROUNDINGS, FrameMap, lift
 from apc.frame.linearize import linearize, linearize_exact
 from apc.frame.parameters import Numbers, exact_numbers, resolve
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
@@ -70,8 +70,8 @@ def check_frame(system: CompiledSystem) -> float:
             r = generator.standard_normal(len(schedule.heard))
             mapped = np.concatenate([lifted.p @ z + lifted.q @ r, lifted.s @ z + lifted.d @ r])
             # Forces and displacements differ by the stiffness: each row is measured by its own terms.
-            size = _terms(lifted.p, lifted.q, lifted.s, lifted.d, z, r)
-            proven = _terms(lifted.p_error, lifted.q_error, lifted.s_error, lifted.d_error, z, r)
+            size = _terms(lifted, z, r)
+            proven = _terms(lifted.error, z, r)
             if not (np.isfinite(size).all() and np.isfinite(proven).all()):
                 raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
             stepped = _precisely_stepped(exact, schedule, parameters, z, r, UNIT * size + TINY)
@@ -87,10 +87,10 @@ def check_frame(system: CompiledSystem) -> float:
     return largest
 
 
-def _terms(p: Floats, q: Floats, s: Floats, d: Floats, z: Floats, r: Floats) -> Floats:
+def _terms(frame: FrameMap, z: Floats, r: Floats) -> Floats:
     """Return the magnitudes that each row of z⁺ and s adds up."""
     both = np.abs(np.concatenate([z, r]))
-    return np.asarray(np.abs(np.vstack([np.hstack([p, q]), np.hstack([s, d])])) @ both)
+    return np.asarray(np.abs(np.block([[frame.p, frame.q], [frame.s, frame.d]])) @ both)
 
 
 def skipped(system: CompiledSystem) -> tuple[str, ...]:

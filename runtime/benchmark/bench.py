@@ -12,7 +12,7 @@ from __future__ import annotations
 import platform
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from os import cpu_count
@@ -35,6 +35,7 @@ from apc.eigen.balls import precision
 from apc.frame.discretize import UNIT
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
+from apc.result import Result
 from apc.simulation.blocks import blocks
 from apc.simulation.flow import state_scales
 from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings
@@ -122,8 +123,10 @@ class Comparison:
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
+class Bench(Result):
     """Both tasks on a scene; `machine` says where."""
+
+    shown_by = "bench:bench"
 
     topology: str
     peers: int
@@ -134,16 +137,6 @@ class Bench:
     def faults(self) -> tuple[str, ...]:
         """What must not be, on any scene: none where all is well."""
         return tuple(fault for one in self.comparisons for fault in one.faults)
-
-    def __str__(self) -> str:
-        """Return tables of at most 80 columns."""
-        from apc.benchmark.report import bench_report  # it needs this module
-
-        return bench_report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data, ready for JSON."""
-        return asdict(self)
 
 
 def bench(system: CompiledSystem, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:

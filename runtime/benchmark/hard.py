@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.source.source import MAX_BYTES
+from apc.result import Result
 from apc.threads import single_threaded
 
 TRUTHS = "truths.json"
@@ -67,8 +68,10 @@ class HardCase:
 
 
 @dataclass(frozen=True, slots=True)
-class HardReport:
+class HardReport(Result):
     """All cases of a folder, and its scenes without a truth."""
+
+    shown_by = "bench:hard"
 
     folder: str
     cases: tuple[HardCase, ...]
@@ -78,20 +81,6 @@ class HardReport:
     def failures(self) -> tuple[HardCase, ...]:
         """The cases that failed."""
         return tuple(case for case in self.cases if case.failed)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the report as plain data, ready for JSON."""
-        return {
-            "folder": self.folder,
-            "cases": [
-                asdict(case) | {"bound_over_error": case.looseness if case.error else None}
-                for case in self.cases
-            ],
-            "without_truth": list(self.without),
-            "failed": [case.name for case in self.failures],
-            "undecided": [case.name for case in self.cases if case.undecided],
-            "unbounded": [case.name for case in self.cases if case.unbounded],
-        }
 
 
 def run_hard_cases(

@@ -11,11 +11,11 @@ from __future__ import annotations
 import resource
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from apc.analysis.analysis import analyze
 from apc.benchmark.bench import reason_of
@@ -28,6 +28,7 @@ from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import parse_source, read_source
 from apc.compiler.words import counted
 from apc.processes import Patience, local_processes, results
+from apc.result import Result
 
 Found = TypeVar("Found")
 
@@ -53,21 +54,19 @@ class ScaleRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class Scale(Result):
     """A row a number; `refused` are the numbers that can't be analysed, with the reason.
 
     `floor` says how much memory the program takes by itself.
     """
+
+    shown_by = "bench:scale"
 
     topology: str
     group: str
     rows: tuple[ScaleRow, ...]
     refused: tuple[tuple[int, str], ...]
     floor: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data, ready for JSON."""
-        return asdict(self)
 
 
 def scale(path: Path, counts: Sequence[int]) -> Scale:

@@ -66,7 +66,7 @@ def analyze_command(
     never pull, which of them make it unstable.
     """
     start_single_threaded()
-    from apc.answers.answer import answer
+    from apc.answer import answer
     from apc.inputs import open_scene
 
     system = open_scene(file, settings)

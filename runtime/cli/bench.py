@@ -7,13 +7,11 @@ Does not: compute.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Any
 
 import click
 
-from apc.cli.options import json_option, print_document, set_option, tell
+from apc.cli.options import json_option, print_result, set_option, tell
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target
@@ -83,18 +81,17 @@ def bench_command(
         _scale(Path(file) if file else find_input(compiled_too=False), counts, as_json)
         return
     from apc.benchmark.bench import bench
-    from apc.benchmark.report import bench_report
 
     if plot is not None:
-        from apc.simulation.figures import check_format
+        from apc.present.pictures import check_format
 
         check_target(plot)
         check_format(plot)
     system = open_scene(file, settings, {"--plot": plot})
     found = bench(system)
-    _print(found.to_dict(), bench_report(found), as_json)
+    print_result(found, as_json=as_json)
     if plot is not None:
-        from apc.benchmark.figure import save_bench
+        from apc.present.bench import save_bench
 
         save_bench(found, plot)
         if not as_json:
@@ -107,10 +104,9 @@ def bench_command(
 def _hard(folder: Path, as_json: bool) -> None:
     """Report the hard cases; a failure is exit code 1."""
     from apc.benchmark.hard import run_hard_cases
-    from apc.benchmark.report import hard_report
 
     found = run_hard_cases(folder)
-    _print(found.to_dict(), hard_report(found), as_json)
+    print_result(found, as_json=as_json)
     if found.failures:
         names = ", ".join(case.name for case in found.failures)
         raise ApcError(Mistake("E922", Place(str(folder)), f"not every hard case came out right: {names}"))
@@ -118,7 +114,6 @@ def _hard(folder: Path, as_json: bool) -> None:
 
 def _scale(path: Path, counts: str, as_json: bool) -> None:
     """Report what more peers cost."""
-    from apc.benchmark.report import scale_report
     from apc.benchmark.scale import scale
 
     if path.suffix == ".apc":
@@ -132,20 +127,4 @@ def _scale(path: Path, counts: str, as_json: bool) -> None:
         expected = "numbers of peers like 3,30,300"
         raise ApcError(Mistake("E921", Place("--scale"), "the list", expected, counts[:80]))
     found = scale(path, [int(number) for number in numbers])
-    _print(found.to_dict(), scale_report(found), as_json)
-
-
-def _print(document: dict[str, Any], text: str, as_json: bool) -> None:
-    if as_json:
-        print_document(_finite(document))
-    else:
-        tell(text)
-
-
-def _finite(value: Any) -> Any:
-    """Replace what JSON has no word for by null."""
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    print_result(found, as_json=as_json)

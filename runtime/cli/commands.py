@@ -18,12 +18,12 @@ import click
 from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
 from apc.cli.critical import critical_command
-from apc.cli.options import tell
+from apc.cli.options import beside, tell
 from apc.cli.region import region_command
 from apc.cli.simulate import simulate_command
 from apc.cli.sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import unwritable, write_file
+from apc.compiler.files import unwritable, write_text
 from apc.compiler.words import counted
 from apc.suffixes import check_suffix
 from apc.threads import start_single_threaded
@@ -172,9 +172,9 @@ def _compile(path: Path, *, timings: bool) -> None:
     """Compile, check, save and report; with `timings`, how long each of it took."""
     from apc.analysis.needs import needs
     from apc.analysis.selfcheck import check_frame
-    from apc.answers.report import compile_report, timings_report
     from apc.compiler.pipeline import each_stage
     from apc.compiler.store import save
+    from apc.present.analysis import compile_text, timings_text
 
     taken: list[tuple[str, float]] = []
     last = time.perf_counter()
@@ -194,9 +194,9 @@ def _compile(path: Path, *, timings: bool) -> None:
     lap("self-check")
     save(system, target := path.with_suffix(".apc"), sealed=True)
     lap("save")
-    tell(compile_report(system, needs(system), target, difference))
+    tell(compile_text(system, needs(system), target, difference))
     if timings:
-        tell(timings_report(taken))
+        tell(timings_text(taken))
 
 
 @apc.command()
@@ -221,8 +221,8 @@ def show(file: str | None, format_: str | None, out: Path | None) -> None:
 
     wanted = format_ or "text"
     if out is not None and (out.suffix or not format_):
-        check_suffix(out, [suffix for suffix in FORMATS if format_ in (None, FORMATS[suffix])], "--out")
-        wanted = FORMATS[out.suffix.lower()]
+        known = [suffix for suffix in FORMATS if format_ in (None, FORMATS[suffix])]
+        wanted = FORMATS[check_suffix(out, known, "--out")]
     path = Path(file) if file else find_input(compiled_too=False)
     check_topology_outputs(path, {"--out": out})
     _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
@@ -253,8 +253,5 @@ def _print_or_write(text: str, out: Path | None) -> None:
         tell(text)
         return
 
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(f"{text}\n".encode())
-
-    write_file(out, write)
-    tell(f"{out} is written")
+    write_text(out, text)
+    tell(f"{out} is written", err=beside(out))

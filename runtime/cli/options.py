@@ -1,19 +1,22 @@
 """What commands have in common: the options `--set` and `--json`, and how a result is printed.
 
-Takes: a result. Gives: `set_option`, `json_option`, `WholeNumber`; `print_result`, `print_document`, `tell`.
+Takes: a result. Gives: `set_option`, `json_option`, `WholeNumber`; `print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
 
 from __future__ import annotations
 
-import json
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 import click
 
 from apc.compiler.digits import plain_int
 from apc.compiler.errors import visible
+from apc.compiler.files import is_stdout
+from apc.present.forms import json_text
+from apc.result import Result
 
 set_option = click.option(
     "--set",
@@ -38,24 +41,14 @@ class WholeNumber(click.IntRange):
         return super().convert(value, param, ctx)
 
 
-class Result(Protocol):
-    """What a command finds: it prints itself, and gives itself as plain data."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result as plain data, ready for JSON."""
-
-
-def print_result(found: Result, *, as_json: bool) -> None:
+def print_result(found: Result, *, as_json: bool, err: bool = False) -> None:
     """Print a result, as one JSON document or in words."""
-    if as_json:
-        print_document(found.to_dict())
-    else:
-        tell(str(found))
+    tell(json_text(found.to_dict()) if as_json else str(found), err=err)
 
 
-def print_document(document: Any) -> None:
-    """Print plain data as one JSON document."""
-    tell(json.dumps(document, ensure_ascii=False, allow_nan=False, indent=2))
+def beside(*outputs: Path | None) -> bool:
+    """Return whether what is printed goes to stderr, as one of the files written is stdout."""
+    return any(output is not None and is_stdout(output) for output in outputs)
 
 
 def tell(text: str, *, err: bool = False) -> None:

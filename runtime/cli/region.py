@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import WholeNumber, json_option, print_result, set_option, tell
+from apc.cli.options import WholeNumber, beside, json_option, print_result, set_option, tell
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
@@ -87,7 +87,7 @@ def region_command(
     """
     start_single_threaded()
     from apc.inputs import open_scene
-    from apc.regions.files import check_region_path, write_panels
+    from apc.present.region import check_region_path, write_panels
     from apc.regions.panels import compare_regions, parse_panel, parse_vary
 
     if out is not None:
@@ -103,6 +103,6 @@ def region_command(
         )
     if out is not None:
         write_panels(out, found)
-    print_result(found, as_json=as_json)
+    print_result(found, as_json=as_json, err=beside(out))
     if out is not None and not as_json:
-        tell(f"\n{out} is written")
+        tell(f"\n{out} is written", err=beside(out))

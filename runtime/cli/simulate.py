@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from apc.cli.options import WholeNumber, json_option, print_document, print_result, set_option, tell
+from apc.cli.options import WholeNumber, beside, json_option, print_result, set_option, tell
 from apc.cli.progress import progress_bar
 from apc.compiler.errors import ApcError
 from apc.compiler.files import partial_name
@@ -134,7 +134,7 @@ def simulate_command(
     seconds = duration_of(system, asked)
     check_length(system, seconds, runs=runs or 1)
     if still is not None:
-        from apc.simulation.still import save_still
+        from apc.present.still import save_still
 
         save_still(system, still)
     how = Settings(seconds, chosen, seed, jit=not no_jit)
@@ -158,12 +158,12 @@ class _Kept:
 def _check_files(out: Path | None, plot: Path | None, still: Path | None) -> None:
     """Refuse a file that can't be written, or a picture that can't be drawn, before anything is computed."""
     if out is not None:
-        from apc.simulation.recording import SUFFIXES
+        from apc.present.recording import SUFFIXES
 
         check_suffix(out, SUFFIXES, "--out")
     for path, option in ((plot, "--plot"), (still, "--still")):
         if path is not None:
-            from apc.simulation.figures import check_format
+            from apc.present.pictures import check_format
 
             check_format(path, option)
 
@@ -189,13 +189,7 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
     """Play a scene once, keep what is wanted of it, and print what it amounts to."""
     from apc.simulation.accuracy import compare_with
     from apc.simulation.simulation import prepare
-    from apc.simulation.trajectory import (
-        Keeper,
-        provenance_of,
-        result_document,
-        result_text,
-        trajectory_of,
-    )
+    from apc.simulation.trajectory import Keeper, Played, provenance_of, trajectory_of
 
     simulation = prepare(system, how, signals=kept.signals)
     keeper = Keeper(simulation) if kept.plot is not None else None
@@ -205,18 +199,23 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
     estimate = comparison.estimate() if comparison is not None else None
     plot = kept.plot
     if plot is not None and keeper is not None:
-        from apc.simulation.figures import save
+        from apc.present.simulation import save_picture
 
         plot = partial_name(plot) if interrupted else plot
-        save(trajectory_of(simulation, keeper, summary, interrupted), plot)
-    provenance = provenance_of(simulation)
-    if as_json:
-        print_document(result_document(system.name, summary, provenance, interrupted, estimate))
-    else:
-        tell(result_text(system.name, summary, provenance, estimate))
+        save_picture(trajectory_of(simulation, keeper, summary, interrupted), plot)
+    found = Played(
+        topology=system.name,
+        summary=summary,
+        provenance=provenance_of(simulation),
+        interrupted=interrupted,
+        error=estimate,
+    )
+    err = beside(out, plot, kept.still)
+    print_result(found, as_json=as_json, err=err)
+    if not as_json:
         for written in (out, plot, kept.still):
             if written is not None:
-                tell(f"  {written} is written")
+                tell(f"  {written} is written", err=err)
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
         tell(f"stopped at {until}; what was done is kept", err=True)
@@ -230,12 +229,14 @@ def _play_into(
 
     What was done is in the file even if the run can't go on.
     """
-    from apc.simulation.recording import open_recording
+    from apc.present.recording import SUFFIXES, open_recording
     from apc.simulation.simulation import size_note
     from apc.simulation.trajectory import play
 
     recording = open_recording(out, simulation) if out is not None else None
-    if out is not None and (note := size_note(simulation, decimal=out.suffix.lower() == ".csv")):
+    if out is not None and (
+        note := size_note(simulation, decimal=check_suffix(out, SUFFIXES, "--out") == ".csv")
+    ):
         tell(f"{out} {note}", err=True)
     total = float(simulation.settings.duration)
     try:

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import WholeNumber, json_option, print_result, set_option, tell
+from apc.cli.options import WholeNumber, beside, json_option, print_result, set_option, tell
 from apc.cli.progress import Bar, progress_bar
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import is_special
 from apc.given import given
 
 
@@ -87,7 +88,9 @@ def sweep_command(
     from apc.inputs import open_scene
     from apc.processes import Patience
     from apc.sweeps.sweep import sweep
+    from apc.tables import check_table_path
 
+    check_table_path(out, "--out")
     waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))
     values = _values(over)
     system = open_scene(file, settings, {"--out": out})
@@ -95,7 +98,7 @@ def sweep_command(
         result = sweep(
             system, values, of=of, out=out, jobs=jobs, cluster=cluster, progress=progress, patience=waiting
         )
-    print_result(result, as_json=as_json)
+    print_result(result, as_json=as_json, err=beside(out))
 
 
 def _seconds(patience: str | None) -> float | None:
@@ -135,7 +138,7 @@ def _progress(out: Path) -> Iterator[Bar]:
 
             yield progress
     except BaseException:
-        if state["done"] > 0:
+        if state["done"] > 0 and not is_special(out):
             kept = f"{state['done']:,.0f} of {state['of']:,.0f} points are kept in {out}.parts"
             tell(f"{kept}; the same command takes up from there", err=True)
         raise

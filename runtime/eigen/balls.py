@@ -22,9 +22,9 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedSystem, Packet, shift_packets
 from apc.eigen.graph_modes import Surd
-from apc.eigen.loop import Packet, packet_places
+from apc.eigen.relative import Relative, relative
 from apc.frame.discretize import step_balls
 from apc.frame.exact import is_rational
 from apc.frame.lift import follow
@@ -119,7 +119,7 @@ def compose(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[S
     """
     n = len(system.names)
     unit = np.eye(n, dtype=np.int64).astype(object)
-    place_of = packet_places(system.sites, system.packets, system.offsets)
+    place_of = system.layout.places
     rows_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
     weights = _weights(system)
     sent: dict[tuple[int, int], Balls] = {}
@@ -158,9 +158,7 @@ def compose(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[S
                 matrix[system.offsets[g] : system.offsets[g] + len(state)] = state
                 del courses[g]
         assert (len(courses), len(sent)) != known, "a packet is heard before it is sent"
-    for packet, place in place_of.items():
-        earlier = Packet(packet.site, packet.row, packet.lag - 1)
-        matrix[place] = unit[place_of[earlier]] if packet.lag > 1 else sent[packet.site, packet.row]
+    shift_packets(matrix, system.layout, lambda packet: sent[packet.site, packet.row])
     return matrix
 
 
@@ -203,8 +201,8 @@ def square(balls: Balls) -> Any:
 
 def reduced_balls(
     matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: Sequence[int], rest: Sequence[int]
-) -> tuple[Balls, Balls]:
-    """Return the matrix without its rigid motions, in relative coordinates, and W = V_r V_p⁻¹.
+) -> Balls:
+    """Return the matrix without its rigid motions, in relative coordinates (see `relative`), W exact.
 
     Parameters
     ----------
@@ -214,20 +212,14 @@ def reduced_balls(
         V: the rigid motions, exact, each (n,).
     held, rest
         The places p, as many as there are motions, whose coordinates go, and all others.
-
-    Notes
-    -----
-    The relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr, as V spans an invariant space.
     """
-    within = matrix[np.ix_(rest, rest)]
-    if not vectors:
-        return within, np.zeros((len(rest), 0), dtype=object)
     exact = [[flint.fmpq(v[place].numerator, v[place].denominator) for v in vectors] for place in held]
     others = [[flint.fmpq(v[place].numerator, v[place].denominator) for v in vectors] for place in rest]
     count = len(held)
-    weights = flint.fmpq_mat(len(rest), count, [e for row in others for e in row])
-    weights = weights * flint.fmpq_mat(count, count, [e for row in exact for e in row]).inv()
-    relative: Balls = np.empty(len(rest) * count, dtype=object)
-    relative[:] = [rational_ball(Fraction(int(e.p), int(e.q))) for e in weights.entries()]
-    relative = relative.reshape(len(rest), count)
-    return within - _multiply(relative, matrix[np.ix_(held, rest)]), relative
+    quotient = flint.fmpq_mat(len(rest), count, [e for row in others for e in row])
+    quotient = quotient * flint.fmpq_mat(count, count, [e for row in exact for e in row]).inv()
+    weights: Balls = np.empty(len(rest) * count, dtype=object)
+    weights[:] = [rational_ball(Fraction(int(e.p), int(e.q))) for e in quotient.entries()]
+    weights = weights.reshape(len(rest), count)
+    places = np.array(held, dtype=np.intp), np.array(rest, dtype=np.intp)
+    return relative(matrix, Relative(*places, weights, np.zeros(weights.shape)), multiply=_multiply)

@@ -25,7 +25,8 @@ from apc.eigen.balls import Balls, frame_balls, precision, rational_ball, reduce
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.components import components
 from apc.eigen.enclosure import discs
-from apc.eigen.rigid import RigidModes, find_rigid_modes, independent_places
+from apc.eigen.relative import independent_places
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.roots import approach_roots, root_discs
 
 Floats = NDArray[np.float64]
@@ -144,7 +145,7 @@ class _Part:
 
 def _relative(matrix: Balls, free: RigidModes, held: Sequence[int]) -> Balls:
     rest = [place for place in range(len(matrix)) if place not in set(held)]
-    return reduced_balls(matrix, free.exact, held, rest)[0]
+    return reduced_balls(matrix, free.exact, held, rest)
 
 
 def _parts(reduced: Balls) -> list[_Part]:

@@ -1,9 +1,12 @@
 """Close a loop: what each site hears is what the others send, and one matrix moves them all.
 
-Takes: a `Loop`.
-Gives: `ClosedSystem`, `close_loop`.
-Guarantees: the matrix comes with a bound on its rounding error, entry by entry.
-Does not: compute eigenvalues (see `spectrum`).
+Takes: groups of equal peers, and what each weighs the packets of each other by.
+Gives: `Loop`, `Coupling`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`, `close_loop`; `Hearing`,
+`hearing_of`, `close`, `closing_errors`, `shift_packets`.
+Guarantees: the state holds, site by site, z and then the packets on their way, in order of row and age. The
+matrix of `close_loop` comes with a bound on its rounding error, entry by entry; `close` takes one system or
+many (k, …), real or complex.
+Does not: know where the weights come from (see `modes`, `graph_loops`); compute eigenvalues (see `spectrum`).
 
     r_g = Σ_h W_gh s_h        each packet as old as its receiver finds it
 """
@@ -11,31 +14,122 @@ Does not: compute eigenvalues (see `spectrum`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.graph_modes import Surd
-from apc.eigen.loop import Coupling, Loop, Packet, StateLayout, lay_out
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peer_group import PeerGroup, states_of
 from apc.frame.discretize import UNIT
-from apc.frame.schedule import Way
+from apc.frame.lift import FrameMap
+from apc.frame.schedule import Schedule, Way
 
 Floats = NDArray[np.float64]
+Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
+
+# What site g hears of site h on a way: the weight on h's packet.
+Coupling = Mapping[Way, tuple[tuple[Fraction, ...], ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Some sites and what each hears of each, `coupling`: a closed system before its matrix is built.
+
+    The whole holds it `multiplicity` times. `doubts` and `surds` as in `ClosedSystem`.
+    """
+
+    name: str
+    multiplicity: int
+    sites: tuple[PeerGroup, ...]
+    coupling: Coupling
+    doubts: Mapping[Way, float] = field(default_factory=dict)
+    surds: Mapping[Way, Surd] = field(default_factory=dict)
+
+    @property
+    def packets(self) -> tuple[Packet, ...]:
+        """The packets on their way, in order of state."""
+        return tuple(
+            Packet(h, row, lag)
+            for h, group in enumerate(self.sites)
+            for row, depth in enumerate(group.schedule.depths)
+            for lag in range(1, depth + 1)
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the state."""
+        return lay_out_loop(self).names
+
+    @property
+    def states(self) -> int:
+        """How many states there are."""
+        return sum(states_of(group.schedule, group.jacobians) for group in self.sites)
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """A packet that is still to be heard: row of s of site `site`, sent `lag` frames ago (1 or more)."""
+
+    site: int
+    row: int
+    lag: int
+
+
+@dataclass(frozen=True, slots=True)
+class StateLayout:
+    """The state of a closed system: where each site's part starts, its names, and where each packet is."""
+
+    offsets: tuple[int, ...]
+    names: tuple[str, ...]
+    places: Mapping[Packet, int]  # in order of state
+
+    @property
+    def packets(self) -> tuple[Packet, ...]:
+        """The packets on their way, in order of state."""
+        return tuple(self.places)
+
+
+def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> StateLayout:
+    """Lay out a state: site by site what its z is named, then its packets."""
+    offsets: list[int] = []
+    names: list[str] = []
+    places: dict[Packet, int] = {}
+    for site, (own, schedule) in enumerate(zip(z_names, schedules, strict=True)):
+        offsets.append(len(names))
+        names += own
+        for row, depth in enumerate(schedule.depths):
+            for lag in range(1, depth + 1):
+                quanta = schedule.sent_times[row] - lag * schedule.frame
+                when = float(quanta * schedule.quantum * 1000)
+                places[Packet(site, row, lag)] = len(names)
+                names.append(f"{schedule.sent_names[row]}({when:.6g} ms)")
+    return StateLayout(tuple(offsets), tuple(names), places)
+
+
+def lay_out_loop(loop: Loop | ClosedSystem) -> StateLayout:
+    """Lay out the state of a loop; of several sites, each name says whose it is."""
+    groups = loop.sites
+    layout = lay_out([group.lifted.z_names for group in groups], [group.schedule for group in groups])
+    if len(groups) == 1:
+        return layout
+    sizes = np.diff([*layout.offsets, len(layout.names)])
+    owners = (group.name for group, size in zip(groups, sizes, strict=True) for _ in range(size))
+    return replace(
+        layout, names=tuple(f"{own}.{name}" for own, name in zip(owners, layout.names, strict=True))
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class ClosedSystem:
     """One autonomous system: state⁺ = `matrix` · state, once a frame.
 
-    The state holds, site by site, z and then the packets on their way; `names` names it, `offsets` says
-    where each site's part starts, `packets` lists the packets in order of state (site by site). `error`
+    `layout` says what the state holds; `motion` where in it the continuous states are (site by site). `error`
     bounds the rounding error of the matrix entry by entry. `heard` is what each site hears in a frame, over
-    the state; `motion` says where the continuous states are in the state (site by site). `doubts` say by how
-    much each weight of a way may be off; `surds`, of a system of one site, what its weights are in closed
-    form.
+    the state. `doubts` say by how much each weight of a way may be off; `surds`, of a system of one site,
+    what its weights are in closed form.
     """
 
     name: str
@@ -43,9 +137,7 @@ class ClosedSystem:
     sites: tuple[PeerGroup, ...]
     coupling: Coupling
     frame_s: float
-    names: tuple[str, ...]
-    offsets: tuple[int, ...]
-    packets: tuple[Packet, ...]
+    layout: StateLayout
     matrix: Floats  # (n, n)
     error: Floats  # (n, n)
     heard: tuple[Floats, ...]  # (n_r, n), one a site
@@ -53,81 +145,92 @@ class ClosedSystem:
     doubts: Mapping[Way, float] = field(default_factory=dict)
     surds: Mapping[Way, Surd] = field(default_factory=dict)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the state."""
+        return self.layout.names
 
-def close_loop(loop: Loop) -> ClosedSystem:
-    """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it.
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """Where each site's part of the state starts."""
+        return self.layout.offsets
 
-    Notes
-    -----
-    Packets heard in the frame they are sent in make a loop within the frame, s = S z + D r and r = W₀ s + …,
-    that time orders: D W₀ is nilpotent, and I − D W₀ is solved exactly by as many steps as there are packets.
-    """
+    @property
+    def packets(self) -> tuple[Packet, ...]:
+        """The packets on their way, in order of state."""
+        return self.layout.packets
+
+
+def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
+    """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it."""
     lifted = [group.lifted for group in loop.sites]
-    layout = lay_out(loop)
-    exact = [(site.p, site.q, site.s, site.d) for site in lifted]
-    matrix, heard = _closed(exact, _links(loop, layout, lambda weight, _: float(weight)), layout)
-    motion = [
-        offset + place
-        for site, offset in zip(lifted, layout.offsets, strict=True)
-        for place in range(site.continuous)
-    ]
+    layout = lay_out_loop(loop)
+    closed = close(lifted, hearing_of(loop, layout, lambda weight, _: float(weight)), layout)
+    # The magnitudes, and these with their errors: those of the sites, and of the weights.
+    hearing = hearing_of(loop, layout, lambda weight, _: float(abs(weight)))
+    doubtful = hearing_of(loop, layout, lambda weight, doubt: float(abs(weight)) + doubt)
+    sizes = [site.mapped(np.abs) for site in lifted]
+    wide = [size.mapped(np.add, site.error) for size, site in zip(sizes, lifted, strict=True)]
+    error = closing_errors(sizes, wide, hearing, layout, doubtful=doubtful)
     return ClosedSystem(
         name=loop.name,
         multiplicity=loop.multiplicity,
         sites=loop.sites,
         coupling=loop.coupling,
         frame_s=lifted[0].frame_s,
-        names=layout.names,
-        offsets=layout.offsets,
-        packets=layout.packets,
-        matrix=matrix,
-        error=_closing_errors(loop, layout, exact),
-        heard=tuple(heard),
-        motion=tuple(motion),
+        layout=layout,
+        matrix=closed.matrix,
+        error=error.matrix,
+        heard=closed.heard,
+        motion=tuple(
+            offset + place
+            for site, offset in zip(lifted, layout.offsets, strict=True)
+            for place in range(site.continuous)
+        ),
         doubts=loop.doubts,
         surds=loop.surds,
     )
 
 
-def _closing_errors(loop: Loop, layout: StateLayout, exact: Sequence[Sequence[Floats]]) -> Floats:
-    """Return bounds on the errors of a closed matrix, entry by entry: its sites', its weights' and rounding.
+@dataclass(frozen=True, slots=True)
+class Hearing:
+    """What a site hears, r = `now` s + `before` x.
 
-    The magnitudes, and the magnitudes with their errors: the difference bounds the error to all orders.
+    s are the packets that all sites send in this frame, site by site; x is the state, and behind it, if
+    `before` has more columns, what comes from outside.
     """
-    lifted = [group.lifted for group in loop.sites]
-    large = [tuple(np.abs(block) for block in blocks) for blocks in exact]
-    wide = [
-        tuple(
-            block + error
-            for block, error in zip(
-                blocks, (site.p_error, site.q_error, site.s_error, site.d_error), strict=True
-            )
-        )
-        for blocks, site in zip(large, lifted, strict=True)
-    ]
-    weights = _links(loop, layout, lambda weight, _: float(abs(weight)))
-    doubtful = (
-        _links(loop, layout, lambda weight, doubt: float(abs(weight)) + doubt) if loop.doubts else weights
-    )
-    bound, _ = _closed(large, weights, layout)
-    upper, _ = _closed(wide, doubtful, layout)
-    # A sum rounds as often as it has terms that are not zero, whatever the size of the whole.
-    listened = max(len(group.schedule.heard) for group in loop.sites)
-    senders = max((int(np.count_nonzero(now, axis=1).max(initial=0)) for now, _ in weights), default=0)
-    terms = max(len(site.z_names) for site in lifted) + listened * (1 + senders)
-    roundings = 4 * (terms + 2) * (1 + len(loop.sites[0].schedule.sent)) * UNIT
-    return (upper - bound) + roundings * upper
+
+    now: Matrix  # (n_r, n_s)
+    before: Matrix  # (n_r, n)
+
+    @property
+    def size(self) -> Hearing:
+        """The magnitudes of its weights."""
+        return Hearing(np.abs(self.now), np.abs(self.before))
 
 
-def _links(
-    loop: Loop, layout: StateLayout, weigh: Callable[[Fraction, float], float]
-) -> list[tuple[Floats, Floats]]:
-    """Return, for each site, r over the packets sent this frame and over the state.
+@dataclass(frozen=True, slots=True)
+class Closed:
+    """A closed loop over its state and what comes from outside: what it becomes, is heard and is sent.
+
+    `turns` says how many packets in a row are sent upon one another in a frame.
+    """
+
+    matrix: Matrix  # (n, n) or more columns
+    heard: tuple[Matrix, ...]  # one a site
+    sent: Matrix  # of all sites, one below the other
+    turns: int
+
+
+def hearing_of(
+    loop: Loop | ClosedSystem, layout: StateLayout, weigh: Callable[[Fraction, float], float]
+) -> list[Hearing]:
+    """Return what each site hears.
 
     `weigh` makes a number of a weight and by how much it may be off.
     """
     row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in loop.sites]
-    starts = np.cumsum([0] + [len(group.lifted.s) for group in loop.sites])
+    starts = np.cumsum([0] + [len(group.schedule.sent) for group in loop.sites])
     found = []
     for g, group in enumerate(loop.sites):
         now = np.zeros((len(group.schedule.heard), starts[-1]))
@@ -142,41 +245,133 @@ def _links(
                     now[line, starts[h] + row] = weigh(weight, doubt)
                 else:
                     before[line, layout.places[Packet(h, row, one.lag)]] = weigh(weight, doubt)
-        found.append((now, before))
+        found.append(Hearing(now, before))
     return found
 
 
-def _closed(
-    blocks: Sequence[Sequence[Floats]], links: Sequence[tuple[Floats, Floats]], layout: StateLayout
-) -> tuple[Floats, list[Floats]]:
-    """Return the closed matrix and what each site hears, over the state."""
-    n = len(layout.names)
-    send_state, send_now = [], []
-    for (p, _, s, d), (now, before), offset in zip(blocks, links, layout.offsets, strict=True):
-        row = np.zeros((len(s), n))
-        row[:, offset : offset + len(p)] = s
-        send_state.append(row + d @ before)
-        send_now.append(d @ now)
-    source, within = np.vstack(send_state), np.vstack(send_now)
-    sent, term = source, within @ source
-    for _ in range(len(within)):
-        if not term.any():
-            break
-        sent, term = sent + term, within @ term
-    assert not term.any(), "a packet is heard before it is sent"
+def close(maps: Sequence[FrameMap], hearing: Sequence[Hearing], layout: StateLayout) -> Closed:
+    """Close a loop, or many of one layout (k, …).
 
-    matrix = np.zeros((n, n))
-    heard = []
-    for (p, q, _, _), (now, before), offset in zip(blocks, links, layout.offsets, strict=True):
-        r = now @ sent + before
-        heard.append(r)
-        rows = slice(offset, offset + len(p))
-        matrix[rows, rows] += p
-        matrix[rows] += q @ r
-    starts = np.cumsum([0] + [len(s) for _, _, s, _ in blocks])
+    Parameters
+    ----------
+    maps, hearing
+        Each site's, over real or complex numbers.
+    layout
+        The state's.
+
+    Notes
+    -----
+    Packets heard in the frame they are sent in make a loop within the frame, s = S z + D r and r = W₀ s + …,
+    that time orders: D W₀ is nilpotent, and I − D W₀ is solved exactly by as many steps as there are packets.
+    """
+    n, columns = len(layout.names), hearing[0].before.shape[-1]
+    parts = [block for one in maps for block in one.blocks] + [one.before for one in hearing]
+    many = np.broadcast_shapes(*(block.shape[:-2] for block in parts))
+    number = np.result_type(*parts)
+    starts = np.cumsum([0] + [one.s.shape[-2] for one in maps])
+    rows = [slice(start, start + one.s.shape[-2]) for one, start in zip(maps, starts, strict=False)]
+    z = [slice(offset, offset + one.p.shape[-1]) for one, offset in zip(maps, layout.offsets, strict=True)]
+    sent = np.zeros((*many, starts[-1], columns), dtype=number)
+    for one, heard, own, place in zip(maps, hearing, rows, z, strict=True):
+        sent[..., own, place] = one.s
+        sent[..., own, :] += one.d @ heard.before
+    turns, at_once = 0, any(heard.now.any() for heard in hearing)
+    if at_once:
+        within = np.zeros((*many, starts[-1], starts[-1]), dtype=number)
+        for one, heard, own in zip(maps, hearing, rows, strict=True):
+            within[..., own, :] = one.d @ heard.now
+        sent, turns = _sent_in_turn(within, sent)
+    matrix = np.zeros((*many, n, columns), dtype=number)
+    received = []
+    for one, heard, place in zip(maps, hearing, z, strict=True):
+        r = heard.now @ sent + heard.before if at_once else heard.before
+        received.append(r)
+        matrix[..., place, place] = one.p
+        matrix[..., place, :] += one.q @ r
+    shift_packets(matrix, layout, lambda packet: sent[..., starts[packet.site] + packet.row, :])
+    return Closed(matrix, tuple(received), sent, turns)
+
+
+def _sent_in_turn(within: Matrix, alone: Matrix) -> tuple[Matrix, int]:
+    """Return (1 − D W₀)⁻¹ times what is sent without hearing anybody in this frame, and the turns it takes.
+
+    NaN where a part is.
+    """
+    sent = term = alone
+    most = within.shape[-1]
+    for turns in range(most):
+        term = within @ term
+        if not term.any():
+            return sent, turns
+        sent = sent + term
+    assert not (np.isfinite(term) & (term != 0)).any(), "a packet is heard before it is sent"
+    return sent, most
+
+
+def shift_packets(matrix: Matrix, layout: StateLayout, sent: Callable[[Packet], Matrix]) -> None:
+    """Write how packets grow older: the youngest of a row is what was `sent`, each other the one before it.
+
+    Parameters
+    ----------
+    matrix
+        The closed matrix (…, n, columns), of any kind of number, whose rows of packets are still zero.
+    layout
+        Its state's.
+    sent
+        Gives what was sent (…, columns).
+    """
     for packet, place in layout.places.items():
         if packet.lag == 1:
-            matrix[place] = sent[starts[packet.site] + packet.row]
+            matrix[..., place, :] = sent(packet)
         else:
-            matrix[place, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = 1.0
-    return matrix, heard
+            matrix[..., place, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = 1
+
+
+def closing_errors(
+    size: Sequence[FrameMap],
+    wide: Sequence[FrameMap],
+    hearing: Sequence[Hearing],
+    layout: StateLayout,
+    *,
+    doubtful: Sequence[Hearing] | None = None,
+    times: int = 1,
+) -> Closed:
+    """Bound the errors of a closed loop, entry by entry: those of its sites and weights, and its rounding.
+
+    Parameters
+    ----------
+    size, wide
+        The magnitudes of the sites' maps, and these with their errors: what they close to differs by a bound
+        on the errors to all orders.
+    hearing, doubtful
+        The magnitudes of what each weighs, and these with their errors where they have any.
+    layout
+        The state's.
+    times
+        How many products stand for one.
+
+    Returns
+    -------
+    The bounds.
+    """
+    doubtful = hearing if doubtful is None else doubtful
+    bound, upper = close(size, hearing, layout), close(wide, doubtful, layout)
+    roundings = times * _closing_roundings(wide, doubtful, upper.turns)
+
+    def off(large: Matrix, small: Matrix) -> Matrix:
+        return np.asarray((large - small) + roundings * large)
+
+    heard = tuple(off(*pair) for pair in zip(upper.heard, bound.heard, strict=True))
+    return Closed(off(upper.matrix, bound.matrix), heard, off(upper.sent, bound.sent), upper.turns)
+
+
+def _closing_roundings(maps: Sequence[FrameMap], hearing: Sequence[Hearing], turns: int) -> float:
+    """Return how much closing a loop rounds, relative to its magnitudes.
+
+    A sum rounds as often as it has terms that are not zero, whatever the size of the whole.
+    """
+    listened = max(one.now.shape[-2] for one in hearing)
+    senders = max(int(np.count_nonzero(one.now, axis=-1).max(initial=0)) for one in hearing)
+    terms = max(one.p.shape[-1] for one in maps) + listened * (1 + senders)
+    turns = max(turns, *(one.s.shape[-2] for one in maps))
+    return float(4 * (terms + 2) * (1 + turns) * UNIT)

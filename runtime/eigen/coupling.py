@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 
-from apc.eigen.loop import Coupling
+from apc.eigen.closing import Coupling
 from apc.eigen.peer_group import PeerGroup, used_ways
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Way

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.components import components
+from apc.eigen.eigenpairs import Eigenpairs, left_vectors
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
-from apc.eigen.rigid import independent_places
+from apc.eigen.relative import independent_places
 from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]
@@ -51,8 +52,8 @@ class Enclosure:
 
 def enclose_eigenvalues(
     matrix: Matrix, error: Floats, *, whole: bool = False
-) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
-    """Compute eigenvalues, right vectors (columns), left vectors (rows), errors, and the radius's bounds.
+) -> tuple[Eigenpairs, Enclosure]:
+    """Compute all eigenvalues, the largest first, with their vectors, and enclose them.
 
     Parameters
     ----------
@@ -75,17 +76,15 @@ def enclose_eigenvalues(
     for part in parts:
         if len(part) > 1:
             block = np.ix_(part, part)
-            values[part], right[block], left[block], errors[part], inner, outer = _enclose_part(
-                matrix[block], error[block]
-            )
-            low, high = float(np.maximum(low, inner)), float(np.maximum(high, outer))  # NaN stays
+            pairs, found = _enclose_part(matrix[block], error[block])
+            values[part], right[block], left[block] = pairs.values, pairs.right, pairs.left
+            errors[part] = found.errors
+            low, high = float(np.maximum(low, found.low)), float(np.maximum(high, found.high))  # NaN stays
     order = np.lexsort((-values.imag, values.real, -np.abs(values)))
-    return values[order], right[:, order], left[order], errors[order], low, high
+    return Eigenpairs(values, right, left).at(order), Enclosure(low, high, errors[order])
 
 
-def _enclose_part(
-    matrix: Matrix, error: Floats
-) -> tuple[Complexes, Complexes, Complexes, Floats, float, float]:
+def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
     """Enclose the eigenvalues of a matrix whose states all drive each other.
 
     The eigenvalues are split by magnitude, large from small, see `_enclose`. A chain of packets or forces
@@ -98,7 +97,7 @@ def _enclose_part(
     values, right = (part.astype(np.complex128) for part in np.linalg.eig(matrix))
     order = np.lexsort((-values.imag, values.real, -np.abs(values)))
     values, right = values[order], right[:, order]
-    left = _left_vectors(matrix, values)
+    left = left_vectors(matrix, values)
     sizes = np.abs(values)
 
     # Splits between k and k + 1: conjugates stay together.
@@ -115,20 +114,7 @@ def _enclose_part(
     low, high = max(one.low for one in tried), min(one.high for one in tried)
     # No estimate is farther from its eigenvalue than both are from zero.
     errors = np.minimum(np.min([one.errors for one in tried], axis=0), sizes + high)
-    return values, right * scale[:, None], left / scale, errors, min(low, high), high
-
-
-def _left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
-    """Return left eigenvectors as rows in the order of the values: those of Mᵀ, each to its nearest value."""
-    n = len(matrix)
-    found, vectors = np.linalg.eig(matrix.T)
-    distances = np.abs(values[:, None] - found[None, :])
-    left = np.empty((n, n), dtype=np.complex128)
-    for i in range(n):
-        nearest = int(np.argmin(distances[i]))
-        left[i] = vectors[:, nearest]
-        distances[:, nearest] = np.inf
-    return left
+    return Eigenpairs(values, right * scale[:, None], left / scale), Enclosure(min(low, high), high, errors)
 
 
 def _enclose(

@@ -26,11 +26,10 @@ from fractions import Fraction
 import numpy as np
 
 from apc.compiler.weights import exact_weight
-from apc.eigen.closing import ClosedSystem, close_loop
+from apc.eigen.closing import ClosedSystem, Loop, close_loop
 from apc.eigen.coupling import complete_degrees, couple
 from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale
 from apc.eigen.graph_modes import graph_modes
-from apc.eigen.loop import Loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
 from apc.eigen.twins import split_twins
 from apc.frame.exchange import Exchange

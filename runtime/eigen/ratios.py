@@ -18,7 +18,7 @@ import flint
 MOST_TERMS = 2000
 
 
-class NotRational(Exception):
+class NotRational(ValueError):
     """What was asked is no quotient of polynomials in the open parameters."""
 
 

@@ -1,8 +1,7 @@
 """The motions that nothing holds back, found in exact arithmetic.
 
 Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
-Gives: `RigidModes`, `find_rigid_modes`; `Standing`, `what_stands`; `stays_rigid`; `independent_places`,
-`relative_places`, `relative_coordinates`.
+Gives: `RigidModes`, `find_rigid_modes`; `Standing`, `what_stands`; `stays_rigid`.
 Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
 a stiffness of exactly zero frees what it held.
 Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
@@ -29,9 +28,8 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedSystem, Coupling, Loop
 from apc.eigen.graph_modes import QUICK_PRIME
-from apc.eigen.loop import Coupling, Loop
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.frame.schedule import Act, Propagate, Send, Tick, Value
 from apc.frame.site import LinearSite
@@ -186,8 +184,12 @@ def stays_rigid(
     other = system if coupling is None else replace(system, coupling=coupling)
     numbering = _Numbering(system.sites)
     exact = [group.exact for group in system.sites]
-    for solution in _standing_solutions(system, exact, numbering):
-        if any(_value(form, solution) for form in _standing(other, others, numbering)):
+    solutions = _standing_solutions(system, exact, numbering)
+    forms = (
+        list(_standing(other, others, numbering)) if solutions else []
+    )  # of the matrices alone: once for all
+    for solution in solutions:
+        if any(_value(form, solution) for form in forms):
             return False
         moved = zip(
             _standing_state(system, others, numbering, solution),
@@ -221,36 +223,6 @@ def _standing_solutions(
     )
     kept = _independent([_standing_state(system, exact, numbering, solution) for solution in still])
     return [still[place] for place in kept]
-
-
-def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
-    """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
-    left = np.array(rows)
-    places: list[int] = []
-    for _ in range(len(rows)):
-        scaled = np.abs(left) / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        line, place = divmod(int(np.argmax(scaled)), rows.shape[1])
-        places.append(place)
-        if left[line, place] != 0:
-            pivot = left[line] / left[line, place]
-            left = left - left[:, [place]] * pivot
-            left[line] = 0.0
-    return np.array(sorted(places), dtype=np.intp)
-
-
-def relative_places(basis: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the places p whose coordinates rigid motions V (n, d) take away, d of them, and all others r."""
-    held = independent_places(basis.T)
-    return held, np.delete(np.arange(len(basis)), held)  # np.setdiff1d imports numpy.ma, 10 ms
-
-
-def relative_coordinates(basis: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Return p and r as `relative_places`, and W = V_r V_p⁻¹ (n − d, d), of rigid motions V = [V_p; V_r].
-
-    As V spans an invariant space, the relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr.
-    """
-    held, rest = relative_places(basis)
-    return held, rest, basis[rest] @ np.linalg.inv(basis[held])
 
 
 class _Numbering:

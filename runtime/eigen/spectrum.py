@@ -21,11 +21,11 @@ from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.components import components
+from apc.eigen.eigenpairs import Eigenpairs
 from apc.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
-from apc.eigen.rigid import RigidModes, find_rigid_modes, independent_places, relative_places
+from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.course import turns
-from apc.frame.discretize import UNIT
 from apc.frame.schedule import Propagate
 
 Floats = NDArray[np.float64]
@@ -214,28 +214,14 @@ def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[str, 
 
 
 def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
-    """Solve one system in floats.
-
-    With the rigid motions V = [V_p; V_r], p as many places as there are motions, and W = V_r V_p⁻¹, the
-    relative coordinates x_r − W x_p move by themselves, by M_rr − W M_pr: that map has all other eigenvalues.
-    """
-    n = len(system.names)
-    count = free.basis.shape[1]
-    if count == n:
+    """Solve one system in floats."""
+    if free.basis.shape[1] == len(system.names):
         return _Solved(free, [], 0.0, 0.0, True, 0)
-    matrix, error = system.matrix, system.error
-    held, rest = relative_places(free.basis)
-    weights, weights_error = _relative(free.basis[held], free.basis[rest])
-    reduced = matrix[np.ix_(rest, rest)] - weights @ matrix[np.ix_(held, rest)]
-    size = np.abs(matrix) + error
-    reduced_error = error[np.ix_(rest, rest)] + weights_error @ size[np.ix_(held, rest)]
-    reduced_error += np.abs(weights) @ error[np.ix_(held, rest)]
-    rounded = np.abs(weights) @ size[np.ix_(held, rest)]
-    reduced_error += (PRODUCT_ROUNDINGS * (count + 2) * UNIT) * (rounded + np.abs(reduced) * (count > 0))
-
-    values, right, left, errors, low, high = enclose_eigenvalues(reduced, reduced_error, whole=count > 0)
-    inside = False if low > 1 else True if high < 1 else None  # NaN decides nothing
-    return _Solved(free, _modes(system, free, values, right, left, errors), low, high, inside, 0)
+    at = relative_coordinates(free.basis)
+    reduced, reduced_error = relative_bounded(system.matrix, system.error, at)
+    pairs, found = enclose_eigenvalues(reduced, reduced_error, whole=len(at.held) > 0)
+    inside = False if found.low > 1 else True if found.high < 1 else None  # NaN decides nothing
+    return _Solved(free, _modes(system, free, pairs, found.errors), found.low, found.high, inside, 0)
 
 
 def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
@@ -253,7 +239,8 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     modes = estimate.modes
     known = not found.high - found.low > estimate.high - estimate.low
     if known and proof.right is not None and proof.left is not None:
-        modes = _modes(system, proof.free, proof.values, proof.right, proof.left, found.errors)
+        pairs = Eigenpairs(proof.values, proof.right, proof.left)
+        modes = _modes(system, proof.free, pairs, found.errors)
     low, high = max(estimate.low, found.low), min(estimate.high, found.high)
     return _Solved(proof.free, modes, low, high, inside, bits)
 
@@ -261,13 +248,12 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
 def _modes(
     system: ClosedSystem,
     free: RigidModes,
-    values: Complexes,
-    right: Complexes,
-    left: Complexes,
+    pairs: Eigenpairs,
     errors: Floats,
 ) -> list[Mode]:
-    """Describe eigenvalues of the relative coordinates, their vectors as columns and rows."""
-    vectors, shares = whole_vectors(system, free, values, right, left)
+    """Describe eigenvalues of the relative coordinates."""
+    vectors, shares = whole_vectors(system, free, pairs)
+    values = pairs.values
     magnitudes = np.abs(values)
     gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(errors, SMALL))
     angles = np.zeros(len(values))
@@ -305,9 +291,7 @@ def _ticks(system: ClosedSystem) -> bool:
 def whole_vectors(
     system: ClosedSystem,
     free: RigidModes,
-    values: Complexes,
-    right: Complexes,
-    left: Complexes,
+    pairs: Eigenpairs,
     *,
     aside: float = 0.0,
 ) -> tuple[Complexes, Floats]:
@@ -317,49 +301,30 @@ def whole_vectors(
     ----------
     system, free
         The closed system and its rigid motions.
-    values, right, left
-        Eigenvalues (k,) of the relative coordinates, with their vectors as columns and as rows.
+    pairs
+        Eigenvalues (k,) of the relative coordinates, with their vectors.
     aside
         By how much larger, relatively, each eigenvalue is taken: one of 1 leaves open how far the peers stand
         aside together.
     """
-    count, matrix = free.basis.shape[1], system.matrix
-    held, rest = relative_places(free.basis)
-    weights, _ = _relative(free.basis[held], free.basis[rest])
+    matrix, at = system.matrix, relative_coordinates(free.basis)
+    held, rest, weights, count = at.held, at.rest, at.weights, len(at.held)
     # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
     corner = matrix[np.ix_(held, held)] + matrix[np.ix_(held, rest)] @ weights
-    vectors, covectors = np.zeros((2, len(system.names), len(values)), dtype=np.complex128)
-    vectors[rest], covectors[rest] = right, left.T
+    vectors, covectors = np.zeros((2, len(system.names), len(pairs.values)), dtype=np.complex128)
+    vectors[rest], covectors[rest] = pairs.right, pairs.left.T
     if count:
-        driven = matrix[np.ix_(held, rest)] @ right
-        for place, value in enumerate(values):
+        driven = matrix[np.ix_(held, rest)] @ pairs.right
+        for place, value in enumerate(pairs.values):
             shifted = value * (1 + aside) * np.eye(count) - corner
             vectors[held, place] = np.linalg.lstsq(shifted, driven[:, place], rcond=None)[0]
         vectors[rest] += weights @ vectors[held]
-        covectors[held] = -(left @ weights).T
+        covectors[held] = -(pairs.left @ weights).T
     shares = np.abs(vectors * covectors)
     total = shares.sum(axis=0)
     sizes = np.abs(vectors)
     shares = np.where(total > 0, shares / total, sizes / sizes.sum(axis=0))
     return vectors, shares
-
-
-def _relative(held: Floats, rest: Floats) -> tuple[Floats, Floats]:
-    """Return W = V_r V_p⁻¹ and a bound on its error, entry by entry; V itself is rounded once.
-
-    W − W* = (V_r − W V_p + a rounding of either) V_p*⁻¹ up to sign.
-    """
-    count = len(held)
-    inverse = np.linalg.inv(held)
-    weights = rest @ inverse
-    charge = PRODUCT_ROUNDINGS * (count + 2) * UNIT
-    left = np.abs(rest - weights @ held) + charge * (np.abs(rest) + np.abs(weights) @ np.abs(held))
-    size = np.abs(inverse)
-    wrong = np.abs(np.eye(count) - inverse @ held) + 2 * charge * (size @ np.abs(held))
-    assert count == 0 or float(wrong.sum(axis=1).max()) < 0.5, "rigid motions too alike to tell apart"
-    # V_p*⁻¹ = (I − F)⁻¹ Y, and |(I − F)⁻¹| ≤ I + |F| + …, at most doubling the largest.
-    size = size + 2 * wrong.sum(axis=1, keepdims=True) * size.max(axis=0, initial=0.0)
-    return weights, left @ size
 
 
 def oscillation(magnitude: float, angle: float, frame_s: float) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.eigen.loop import Loop
+from apc.eigen.closing import Loop
 from apc.eigen.peer_group import PeerGroup, group_name
 from apc.frame.exchange import Exchange
 from apc.frame.schedule import Way

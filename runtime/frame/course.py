@@ -115,7 +115,7 @@ def _course(
     below = np.eye(n_x + n_u)[n_x:]
     for duration, number in points.items():
         seconds = float(duration * schedule.quantum) / number
-        step = exponential_rows(site.a[None], site.b[None], seconds)[0][0]
+        step = exponential_rows(site.a[None], site.b[None], seconds).matrix[0]
         powers = [np.vstack([step, below])]
         while 2 ** len(powers) <= number:
             powers.append(powers[-1] @ powers[-1])

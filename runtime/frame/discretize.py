@@ -53,10 +53,14 @@ TOO_LARGE = (
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """[F G] of one duration (n_x, n_x + n_u); the true entries lie within `UNIT * size` of `matrix`."""
+    """[F G] of one duration (n_x, n_x + n_u), or of many sites (k, …); real or complex.
 
-    matrix: Floats
+    The true entries lie within `roundings` · UNIT · `size` of `matrix`.
+    """
+
+    matrix: NDArray[Any]
     size: Floats
+    roundings: float = 1.0
 
 
 def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> tuple[Step, ...]:

@@ -1,7 +1,7 @@
-"""Walk a CasADi function's instructions over any kind of number.
+"""Walk a CasADi function's operations over any kind of number.
 
-Takes: a CasADi SX Function and arguments that are rationals, intervals, long floats, anything with
-arithmetic. Gives: `evaluate_exact`, `is_rational`.
+Takes: a CasADi SX Function and arguments that are rationals, intervals, long floats, arrays, anything with
+arithmetic. Gives: `evaluate_exact`, `is_rational`; `ROWS`, NumPy's rules.
 Guarantees: over `Fraction`, sums, products, quotients, whole powers, comparisons and constants are exact.
 Does not: evaluate MX functions; transcendental operations over `Fraction` are rounded to double precision.
 """
@@ -10,59 +10,90 @@ from __future__ import annotations
 
 import functools
 import math
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
-import casadi
+import numpy as np
 
-# Functions whose instructions are kept: an analysis walks the same few of a scene's kinds many times, and to
+from apc.compiler.plain import ROUNDED, RULES, PlainFunction, straight, walk
+
+# Functions whose operations are kept: an analysis walks the same few of a scene's kinds many times, and to
 # ask CasADi for them takes longer than the arithmetic.
 KEPT = 16
 # Of a numerator or denominator: what a thousand factors of 53 bits, each divided by as many, stay well below.
 BITS = 2**20
 
-_UNARY: dict[int, Callable[[Any], Any]] = {
-    casadi.OP_ASSIGN: lambda a: a,
-    casadi.OP_NEG: operator.neg,
-    casadi.OP_SQ: lambda a: a * a,
-    casadi.OP_TWICE: lambda a: a + a,
-    casadi.OP_INV: lambda a: 1 / a,
-    casadi.OP_FABS: abs,
-    casadi.OP_SIGN: lambda a: (a > 0) - (a < 0),
-    casadi.OP_NOT: lambda a: int(a == 0),
-    casadi.OP_FLOOR: math.floor,
-    casadi.OP_CEIL: math.ceil,
-}
-_BINARY: dict[int, Callable[[Any, Any], Any]] = {
-    casadi.OP_ADD: operator.add,
-    casadi.OP_SUB: operator.sub,
-    casadi.OP_MUL: operator.mul,
-    casadi.OP_FMIN: min,
-    casadi.OP_FMAX: max,
-    casadi.OP_LT: lambda a, b: int(a < b),
-    casadi.OP_LE: lambda a, b: int(a <= b),
-    casadi.OP_EQ: lambda a, b: int(a == b),
-    casadi.OP_NE: lambda a, b: int(a != b),
-    casadi.OP_AND: lambda a, b: int(a != 0 and b != 0),
-    casadi.OP_OR: lambda a, b: int(a != 0 or b != 0),
-    # The product with a condition: zero whatever b is, when the condition is false.
-    casadi.OP_IF_ELSE_ZERO: lambda a, b: b if a != 0 else 0 * b,
-}
-_ROUNDED: dict[int, Callable[[float], float]] = {
-    casadi.OP_SQRT: math.sqrt,
-    casadi.OP_EXP: math.exp,
-    casadi.OP_LOG: math.log,
-    casadi.OP_SIN: math.sin,
-    casadi.OP_COS: math.cos,
-    casadi.OP_TAN: math.tan,
-    casadi.OP_ASIN: math.asin,
-    casadi.OP_ACOS: math.acos,
-    casadi.OP_ATAN: math.atan,
-    casadi.OP_SINH: math.sinh,
-    casadi.OP_COSH: math.cosh,
-    casadi.OP_TANH: math.tanh,
+
+def _row_power(base: Any, exponent: Any) -> Any:
+    """Return base^exponent."""
+    b, e = np.real(base), np.real(exponent)
+    value = np.float_power(b, e)
+    if not (np.iscomplexobj(base) or np.iscomplexobj(exponent)):
+        return value
+    slope = e * np.float_power(b, e - 1) * np.imag(base)
+    growing = np.imag(exponent)
+    if np.any(growing):
+        slope = slope + value * np.log(b) * growing
+    return _step(value, slope)
+
+
+def _row_quotient(above: Any, below: Any) -> Any:
+    """Return a quotient; a complex step doesn't lead around a division by zero."""
+    if not (np.iscomplexobj(above) or np.iscomplexobj(below)):
+        return np.true_divide(above, below)
+    value = np.true_divide(np.real(above), np.real(below))
+    return _step(value, (np.imag(above) - value * np.imag(below)) / np.real(below))
+
+
+def _row_function(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return an elementary function; where the real part has no value, nor has a complex step from there."""
+
+    def value(a: Any) -> Any:
+        return _step(function(np.real(a)), np.imag(function(a))) if np.iscomplexobj(a) else function(a)
+
+    return value
+
+
+def _step(value: Any, slope: Any) -> Any:
+    """Return a complex step: a product with 1j would spoil the value where the slope is infinite."""
+    found = np.empty(np.broadcast_shapes(np.shape(value), np.shape(slope)), dtype=np.complex128)
+    found.real, found.imag = value, slope
+    return found
+
+
+def _of_real(rule: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what takes the real parts alone: steps, and conditions, which are 0 or 1 as in CasADi."""
+    return lambda *operands: 1.0 * rule(*map(np.real, operands))
+
+
+# What the operations are of NumPy's numbers and arrays, real or complex steps: of these the imaginary part is
+# a derivative and follows the real part.
+ROWS: dict[str, Callable[..., Any]] = {
+    **RULES,
+    "const": np.float64,  # NaN too: what comes of it is no number, and is told as such
+    "inv": lambda a: _row_quotient(1.0, a),
+    "div": _row_quotient,
+    "fabs": lambda a: np.where(np.real(a) < 0, -a, a),
+    "sign": _of_real(np.sign),
+    "floor": _of_real(np.floor),
+    "ceil": _of_real(np.ceil),
+    "not": _of_real(np.logical_not),
+    "fmin": np.fmin,
+    "fmax": np.fmax,
+    "lt": _of_real(np.less),
+    "le": _of_real(np.less_equal),
+    "eq": _of_real(np.equal),
+    "ne": _of_real(np.not_equal),
+    "and": _of_real(np.logical_and),
+    "or": _of_real(np.logical_or),
+    "if_else_zero": lambda a, b: np.where(np.real(a), b, 0.0),
+    "pow": _row_power,
+    "constpow": _row_power,
+    **{
+        name: _row_function(getattr(np, f"arc{name[1:]}" if name.startswith("a") else name))
+        for name in ROUNDED
+    },
 }
 
 
@@ -72,9 +103,9 @@ def evaluate_exact(
     *,
     number: Callable[[float], Any] = Fraction,
     rounded: Callable[[str, Any], Any] | None = None,
-    rules: Mapping[int, Callable[..., Any]] | None = None,
+    rules: Mapping[str, Callable[..., Any]] | None = None,
 ) -> list[list[Any]]:
-    """Evaluate an SX function instruction by instruction over another number type.
+    """Evaluate an SX function operation by operation over another number type.
 
     Parameters
     ----------
@@ -88,7 +119,7 @@ def evaluate_exact(
         Evaluates a transcendental function, by its name in `math`, in the number type. Left out, its
         value is rounded to a double first.
     rules
-        Operations, by CasADi's code, that this kind of number does in another way than Python's numbers.
+        Operations, by their names in `plain`, that this kind of number does in another way than Python's.
 
     Returns
     -------
@@ -101,74 +132,63 @@ def evaluate_exact(
     OverflowError
         A rational number takes more than BITS bits.
     """
-    work: list[Any] = [None] * function.sz_w()
-    results: list[list[Any]] = [[number(0.0)] * function.nnz_out(i) for i in range(function.n_out())]
-    own = rules or {}
+    known = _operations(function)
+    if "const" not in (rules or {}) and any(math.isnan(constant) for constant in known.constants):
+        raise ValueError("math domain error")  # of constants alone, which CasADi evaluates at once
+    entries = [
+        entry
+        for (_, size), argument in zip(known.inputs, arguments, strict=True)
+        for entry in _of_size(argument, size)
+    ]
+    own: dict[str, Callable[..., Any]] = {**_SHORT, "pow": _power_of(number), "constpow": _power_of(number)}
+    for name, of_float in ROUNDED.items():
+        own[name] = _rounding(name, of_float, number, rounded)
+    own.update(rules or {})
+    found = walk(known, [*entries, *map(own.get("const", number), known.constants)], own.__getitem__)
+    return [[found[place] for place in places] for places in known.results]
 
-    def transcendental(code: int, a: Any) -> Any:
-        function_of = _ROUNDED[code]
-        return rounded(function_of.__name__, a) if rounded else number(function_of(float(a)))
 
-    for code, inputs, outputs, constant in _instructions(function):
-        if code == casadi.OP_INPUT:
-            work[outputs[0]] = arguments[inputs[0]][inputs[1]]
-        elif code == casadi.OP_OUTPUT:
-            results[outputs[0]][outputs[1]] = work[inputs[0]]
-        elif code == casadi.OP_CONST:
-            if math.isnan(constant):
-                raise ValueError("math domain error")  # of constants alone, which CasADi evaluates at once
-            work[outputs[0]] = number(constant)
-        elif code in own:
-            work[outputs[0]] = own[code](*(work[place] for place in inputs))
-        elif code == casadi.OP_DIV:
-            work[outputs[0]] = _short(_quotient(work[inputs[0]], work[inputs[1]]))
-        elif code in (casadi.OP_POW, casadi.OP_CONSTPOW):
-            work[outputs[0]] = _power(work[inputs[0]], work[inputs[1]], number)
-        elif code in _UNARY:
-            work[outputs[0]] = _short(_UNARY[code](work[inputs[0]]))
-        elif code in _BINARY:
-            work[outputs[0]] = _short(_BINARY[code](work[inputs[0]], work[inputs[1]]))
-        elif code in _ROUNDED:
-            work[outputs[0]] = transcendental(code, work[inputs[0]])
-        else:
-            raise ValueError(f"no exact rule for CasADi operation {code} in {function.name()}")
-    return results
+def _of_size(argument: Sequence[Any], size: int) -> Sequence[Any]:
+    assert len(argument) == size, "an argument of another size"
+    return argument
 
 
 def is_rational(function: Any) -> bool:
     """Say whether a function's value over `Fraction` is exact: no step of it is rounded to a double."""
     if not function.is_a("SXFunction"):
         return False
-    constants: dict[int, float] = {}
-    for code, inputs, outputs, constant in _instructions(function):
-        if code == casadi.OP_CONST:
-            constants[outputs[0]] = constant
-            continue
-        if code in (casadi.OP_POW, casadi.OP_CONSTPOW):
-            exponent = constants.get(inputs[1], 0.5)
+    known = _operations(function)
+    first = sum(size for _, size in known.inputs)
+    constants = dict(enumerate(known.constants, first))
+    for word, *places in known.operations:
+        if word in ("pow", "constpow"):
+            exponent = constants.get(places[1], 0.5)
             if exponent != int(exponent):
                 return False
-        elif code in _ROUNDED:
+        elif word in ROUNDED:
             return False
-        if code != casadi.OP_OUTPUT:
-            constants.pop(outputs[0], None)
     return True
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _instructions(function: Any) -> tuple[tuple[int, list[int], list[int], float], ...]:
-    """Return each instruction of an SX function: its code, where it reads and writes, and its constant."""
-    listed = []
-    for index in range(function.n_instructions()):
-        code = function.instruction_id(index)
-        constant = function.instruction_constant(index) if code == casadi.OP_CONST else 0.0
-        listed.append((code, function.instruction_input(index), function.instruction_output(index), constant))
-    return tuple(listed)
+def _operations(function: Any) -> PlainFunction:
+    return straight(function)
 
 
-def _quotient(above: Any, below: Any) -> Any:
-    """Return a quotient; that of two conditions, which are whole numbers, is a rational too."""
-    return Fraction(above, below) if isinstance(above, int) and isinstance(below, int) else above / below
+def _rounding(
+    name: str,
+    of_float: Callable[[float], float],
+    number: Callable[[float], Any],
+    rounded: Callable[[str, Any], Any] | None,
+) -> Callable[[Any], Any]:
+    """Return a transcendental function of a kind of number."""
+    if rounded is not None:
+        return functools.partial(rounded, name)
+    return lambda a: number(of_float(float(a)))
+
+
+def _power_of(number: Callable[[float], Any]) -> Callable[[Any, Any], Any]:
+    return lambda base, exponent: _power(base, exponent, number)
 
 
 def _short(value: Any) -> Any:
@@ -193,3 +213,10 @@ def _power(base: Any, exponent: Any, number: Callable[[float], Any]) -> Any:
     if base < 0:
         raise ValueError("math domain error")  # as of math.sqrt; Python's own power is complex
     return number(float(base) ** float(exponent))
+
+
+def _shortened(rule: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *operands: _short(rule(*operands))
+
+
+_SHORT = {word: _shortened(rule) for word, rule in RULES.items()}

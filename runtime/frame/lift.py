@@ -1,9 +1,9 @@
 """One frame of one site as one linear map.
 
-Takes: a `LinearSite` and its `Schedule`.
-Gives: `LiftedSite`, `lift`; `follow`, the same frame over numbers of any kind.
-Guarantees: the continuous part is propagated by its exact exponential; every matrix comes with a bound on
-its rounding error, entry by entry.
+Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
+Gives: `FrameMap`, `compose`; `LiftedSite`, `lift`, `bounded`; `follow`, the frame event by event.
+Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
+exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
 Does not: know who the others are (see `modes`).
 
     z⁺ = P z + Q r        z: continuous states, then the remembered values (`Schedule.carried`)
@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import UNIT, discretize
+from apc.compiler.compiled import Kind
+from apc.frame.discretize import UNIT, Step, discretize
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.site import LinearSite, magnitudes
 
-Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 
 # Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
@@ -35,20 +35,42 @@ COEFFICIENT_ROUNDINGS = 8
 
 
 @dataclass(frozen=True, slots=True)
-class LiftedSite:
-    """The one-frame map of a site. `*_error` bounds the rounding error of the matrix, entry by entry."""
+class FrameMap:
+    """The map of one frame, z⁺ = P z + Q r and s = S z + D r; of many with a leading axis (k)."""
 
+    p: Matrix  # (n_z, n_z)
+    q: Matrix  # (n_z, n_r)
+    s: Matrix  # (n_s, n_z)
+    d: Matrix  # (n_s, n_r)
+
+    @property
+    def blocks(self) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+        """P, Q, S and D."""
+        return self.p, self.q, self.s, self.d
+
+    def mapped(self, change: Callable[..., Matrix], *others: FrameMap) -> FrameMap:
+        """Return the map whose blocks are made of these and of those of others."""
+        return FrameMap(*map(change, self.blocks, *(one.blocks for one in others)))
+
+    @property
+    def largest(self) -> Matrix:
+        """The largest entry of [P Q] and that of [S D]; NaN where one is."""
+        p, q, s, d = (block.max(initial=0.0) for block in self.blocks)
+        return np.maximum([p, s], [q, d])
+
+
+@dataclass(frozen=True, slots=True)
+class LiftedSite(FrameMap):
+    """The one-frame map of a site, or of many of one kind; `error` bounds it entry by entry.
+
+    `estimated` says that the errors of some site are an estimate, as the bound says nothing.
+    """
+
+    error: FrameMap
     z_names: tuple[str, ...]
     continuous: int  # the first so many entries of z are continuous states
     frame_s: float
-    p: Floats  # (n_z, n_z)
-    q: Floats  # (n_z, n_r)
-    s: Floats  # (n_s, n_z)
-    d: Floats  # (n_s, n_r)
-    p_error: Floats
-    q_error: Floats
-    s_error: Floats
-    d_error: Floats
+    estimated: bool = False
 
 
 def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = None) -> LiftedSite:
@@ -63,6 +85,51 @@ def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = Non
     exact
         The site's matrices in rationals, whose exponentials are taken; without it, those of `site` count as
         exact.
+    """
+    durations = step_durations(schedule)
+    exact = site if exact is None else exact
+    found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
+    return named(site.kind, schedule, *bounded(site, schedule, dict(zip(durations, found, strict=True))))
+
+
+def step_durations(schedule: Schedule) -> list[int]:
+    """Return the durations of a frame's steps, in quanta."""
+    return sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
+
+
+def named(
+    kind: Kind, schedule: Schedule, frame: FrameMap, error: FrameMap, *, estimated: bool = False
+) -> LiftedSite:
+    """Return a frame's map and its error with the names of its states.
+
+    Parameters
+    ----------
+    kind, schedule
+        Of the site or sites.
+    frame, error
+        Their map, and the bounds on it.
+    estimated
+        Whether these are an estimate.
+    """
+    return LiftedSite(
+        *frame.blocks,
+        error=error,
+        z_names=(*(state.name for state in kind.states), *schedule.value_names),
+        continuous=len(kind.states),
+        frame_s=float(schedule.frame_s),
+        estimated=estimated,
+    )
+
+
+def bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> tuple[FrameMap, FrameMap]:
+    """Compose a frame, and bound its rounding error.
+
+    Parameters
+    ----------
+    site, schedule
+        One site or many, and what happens in a frame.
+    steps
+        Its exponentials by duration in quanta.
 
     Notes
     -----
@@ -71,53 +138,50 @@ def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = Non
     composition, so the whole frame is off by at most γ times the composition of the magnitudes, with the
     roundings of every event added up. That bound holds whatever the scaling of the states.
     """
-    durations = sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
-    exact = site if exact is None else exact
-    found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
-    steps = {duration: step.matrix for duration, step in zip(durations, found, strict=True)}
-    large_steps = {duration: step.size for duration, step in zip(durations, found, strict=True)}
-    frame = _compose(site, schedule, steps)
-    large = _compose(magnitudes(site), schedule, large_steps)
+    frame = compose(site, schedule, {duration: step.matrix for duration, step in steps.items()})
+    large = compose(magnitudes(site), schedule, {duration: step.size for duration, step in steps.items()})
+    roundings = roundings_of(site, schedule, steps)
+    gamma = roundings * UNIT / (1 - roundings * UNIT)
+    return frame, large.mapped(lambda size: gamma * size)
 
-    size = sum(site.b.shape)
-    width = size + max((tick.m.shape[1] + tick.r.shape[1] for tick in site.ticks), default=0)
+
+def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:
+    """Return the roundings of all events of a frame, in units of UNIT."""
+    size = sum(site.b.shape[-2:])
+    width = size + max((tick.m.shape[-1] + tick.r.shape[-1] for tick in site.ticks), default=0)
     width += len(schedule.heard)
-    roundings = sum(
-        size + 1 if isinstance(event, Propagate) else width + COEFFICIENT_ROUNDINGS
+    return sum(
+        size + steps[event.duration].roundings
+        if isinstance(event, Propagate)
+        else width + COEFFICIENT_ROUNDINGS
         for event in schedule.events
         if not isinstance(event, Act)
     )
-    gamma = roundings * UNIT / (1 - roundings * UNIT)
-
-    n_z = len(site.kind.states) + len(schedule.carried)
-    z, s = frame
-    z_large, s_large = large
-    return LiftedSite(
-        z_names=(*(state.name for state in site.kind.states), *schedule.value_names),
-        continuous=len(site.kind.states),
-        frame_s=float(schedule.frame_s),
-        p=z[:, :n_z],
-        q=z[:, n_z:],
-        s=s[:, :n_z],
-        d=s[:, n_z:],
-        p_error=gamma * z_large[:, :n_z],
-        q_error=gamma * z_large[:, n_z:],
-        s_error=gamma * s_large[:, :n_z],
-        d_error=gamma * s_large[:, n_z:],
-    )
 
 
-def _compose(site: LinearSite, schedule: Schedule, steps: Mapping[int, Floats]) -> tuple[Floats, Floats]:
-    """Follow z and r through one frame; return (z⁺, s), every row over the columns (z, r)."""
+def compose(site: LinearSite, schedule: Schedule, steps: Mapping[int, Matrix]) -> FrameMap:
+    """Follow z and r through one frame.
+
+    Parameters
+    ----------
+    site
+        The matrices of one site, or of many (k, …), in any kind of number.
+    schedule
+        What happens in a frame.
+    steps
+        [F G] (n_x, n_x + n_u) by duration in quanta, or of many (k, …).
+    """
     n_z = len(site.kind.states) + len(schedule.carried)
     unit = np.eye(n_z + len(schedule.heard))
-    sent = np.zeros((len(schedule.sent), len(unit)))
+    sent: dict[int, Matrix] = {}
     course = follow(site, schedule, steps, unit[:n_z], lambda row: unit[n_z + row])
     while True:
         try:
             row, packet = next(course)
         except StopIteration as end:
-            return end.value, sent
+            z = end.value
+            s = _over(z[..., :0, :], [sent[row] for row in range(len(schedule.sent))])
+            return FrameMap(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
         sent[row] = packet
 
 
@@ -131,9 +195,9 @@ def follow(
     multiply: Callable[[Matrix, Matrix], Matrix] = np.matmul,
     watch: Callable[[int, Matrix], None] | None = None,
 ) -> Generator[tuple[int, Matrix], None, Matrix]:
-    """Follow a site through one frame, event by event, over numbers of any kind.
+    """Follow a site, or many, through one frame, event by event, over numbers of any kind.
 
-    Every quantity is a row over columns of the caller's choice.
+    Every quantity is a row over columns of the caller's choice; of many, with a leading axis (k).
 
     Parameters
     ----------
@@ -164,32 +228,45 @@ def follow(
     n_x = len(site.kind.states)
     nothing = np.zeros(start.shape[1], dtype=start.dtype)
     value: dict[Value, Matrix] = {one: start[n_x + row] for row, one in enumerate(schedule.carried)}
+    many = np.broadcast_shapes(site.a.shape[:-2], *(step.shape[:-2] for step in steps.values()))
+    number = np.result_type(start, site.a, *steps.values())
     # The continuous states above what the holds put out: a step multiplies both at once.
     acting = [nothing if one is None else value.get(one, nothing) for one in schedule.acting]
-    moving = np.vstack([start[:n_x], *acting])
-    sends = [np.hstack([send.x, send.u]) for send in site.sends]
-    ticks = [np.hstack([tick.x, tick.u, tick.m, tick.r]) for tick in site.ticks]
+    x = np.broadcast_to(start[:n_x].astype(number), (*many, n_x, start.shape[1]))
+    moving = _over(x, acting)
+    sends = [np.concatenate([send.x, send.u], axis=-1) for send in site.sends]
+    ticks = [np.concatenate([tick.x, tick.u, tick.m, tick.r], axis=-1) for tick in site.ticks]
     for event in schedule.events:
         match event:
             case Propagate(duration):
                 if watch is not None:
                     watch(duration, moving)
-                moving[:n_x] = multiply(steps[duration][:n_x], moving)
+                moving[..., :n_x, :] = multiply(steps[duration][..., :n_x, :], moving)
             case Act(hold, one):
-                moving[n_x + hold] = value.get(one, nothing)
+                moving[..., n_x + hold, :] = value.get(one, nothing)
             case Send(partition, rows):
                 everything = multiply(sends[partition], moving)
                 for channel, row in rows:
-                    yield row, everything[channel]
+                    yield row, everything[..., channel, :]
             case Tick(partition, index, rows_heard):
                 memories = site.kind.clocks[partition].memories
                 before = [value.get(Value(partition, o, index - 1), nothing) for o in memories]
                 received = yield from _received(rows_heard, hear, nothing)
-                inputs = np.vstack([moving, *before, *received])
-                for output, row_of in enumerate(multiply(ticks[partition], inputs)):
-                    value[Value(partition, output, index)] = row_of
+                computed = multiply(ticks[partition], _over(moving, [*before, *received]))
+                for output in range(computed.shape[-2]):
+                    value[Value(partition, output, index)] = computed[..., output, :]
     later = [replace(one, index=one.index + schedule.ticks[one.partition]) for one in schedule.carried]
-    return np.vstack([moving[:n_x], *(value[one] for one in later)])
+    return _over(moving[..., :n_x, :], [value[one] for one in later])
+
+
+def _over(block: Matrix, rows: Sequence[Matrix]) -> Matrix:
+    """Return a block (…, n, columns) over rows (columns,) or (k, columns)."""
+    *many, height, columns = block.shape
+    found = np.empty((*many, height + len(rows), columns), dtype=block.dtype)
+    found[..., :height, :] = block
+    for place, row in enumerate(rows, height):
+        found[..., place, :] = row
+    return found
 
 
 def _received(

@@ -2,21 +2,29 @@
 
 Takes: a `CompiledSystem` and overrides such as `contact.stiffness=800 N/m`.
 Gives: `Override`, `parse_override`, `apply`.
-Guarantees: what depends on a changed parameter by an expression changes with it, in exact rationals; bounds
-are kept; the rest keeps the very numbers it was compiled with.
+Guarantees: what depends on a changed parameter by a formula changes with it, in exact rationals; the rest
+keeps the very numbers it was compiled with. Every value out of what its component allows is told, all
+together; of a parameter that differs from peer to peer, the first peer's.
 Does not: change what was compiled as structure (which parts there are, how many peers).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import TypeVar
 
-from apc.compiler.compiled import CompiledSystem, Parameter, Timing
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.bounds import check_bounds
+import numpy as np
+
+from apc.compiler.compiled import CompiledSystem, Group, Parameter, Timing
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.formula import exact_value
+from apc.compiler.words import with_unit
 from apc.frame.names import OVERRIDE, find, unit_of
+from apc.frame.parameters import Scope, columns_of, scope_of
+
+N = TypeVar("N", Parameter, Timing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +62,7 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
 
 
 def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSystem:
-    """Return the system with new values; a parameter set loses its expression, what depends on it follows.
+    """Return the system with new values; a parameter set loses its formula, what depends on it follows.
 
     Raises
     ------
@@ -65,9 +73,9 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     if not overrides:
         return system
     everywhere = {one.name: one.value for one in overrides if one.group is None}
+    timings = {timing.name for timing in system.timings}
     parameters = {parameter.name: parameter for parameter in system.parameters}
-    timings = {timing.name: timing for timing in system.timings}
-    common = _Scope(parameters, timings, everywhere)
+    common = _changed(scope_of(system), everywhere)
     groups = []
     for group in system.groups:
         own = {one.name: one.value for one in overrides if one.group == group.name}
@@ -76,119 +84,125 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         values = {value.name: value for value in group.values if value.name not in shared}
         values |= {name: parameters[name] for name in own if name not in values}
         if own:
-            _check_times(group.name, _Scope({**parameters, **values}, timings, own), system.timings)
-        scope = _Scope({**parameters, **values}, timings, {**shared, **own})
-        # What a group leaves to everybody is its own as soon as it depends on a value of its own.
-        values |= {
-            name: parameter
-            for name, parameter in parameters.items()
-            if name not in values and own and scope.parameter(name) != common.parameter(name)
-        }
+            _check_times(system, group.name, list(values.values()), own)
+        given = {**shared, **own}
+        changed = _changed(scope_of(system, list(values.values())), given)
+        if own:
+            # What a group leaves to everybody is its own as soon as it depends on a value of its own.
+            values |= {
+                name: one
+                for name, one in parameters.items()
+                if name not in values and _renewed(one, changed, given) != _renewed(one, common, everywhere)
+            }
         groups.append(
             replace(
                 group,
-                values=tuple(scope.parameter(name) for name in values),
+                values=tuple(_renewed(one, changed, given) for one in values.values()),
                 # One value for the group, or for everybody, is one for each of its peers.
                 columns=tuple(
                     column for column in group.columns if column.name not in everywhere.keys() | own.keys()
                 ),
             )
         )
-    changed = replace(
+    found = replace(
         system,
-        parameters=tuple(common.parameter(name) for name in parameters),
-        timings=tuple(common.timing(name) for name in timings),
+        parameters=tuple(_renewed(one, common, everywhere) for one in system.parameters),
+        timings=tuple(_renewed(one, common, everywhere) for one in system.timings),
         groups=tuple(groups),
     )
-    check_bounds(changed)
-    return changed
+    _check_bounds(found)
+    return found
 
 
-def _check_times(group: str, scope: _Scope, timings: Sequence[Timing]) -> None:
+def _changed(scope: Scope, given: Mapping[str, Fraction]) -> dict[str, Fraction]:
+    """Return the values given and what follows from them, exactly."""
+    return scope.follow(given, exact_value, lambda name: scope.holder[name].number)
+
+
+def _renewed(one: N, changed: Mapping[str, Fraction], given: Collection[str]) -> N:
+    """Return a number with its value; one that is given loses its formula."""
+    if one.name not in changed:
+        return one
+    value, formula = changed[one.name], None if one.name in given else one.formula
+    if isinstance(one, Timing):
+        return replace(one, value=value, formula=formula)
+    return replace(one, value=float(value), exact=value, formula=formula)
+
+
+def _check_times(
+    system: CompiledSystem, group: str, values: Sequence[Parameter], own: Mapping[str, Fraction]
+) -> None:
     """Refuse what a group sets for itself where a time for all groups depends on it.
 
     Parameters
     ----------
-    group, scope
-        The group, and a scope that only its own overrides reach.
-    timings
-        The times before any override.
+    system
+        The scene before any override.
+    group, values, own
+        The group, its own numbers, and what it sets.
     """
-    for timing in timings:
-        if scope.timing(timing.name) is not timing:
+    changed = _changed(scope_of(system, [*values, *system.timings]), own)
+    for timing in system.timings:
+        if timing.name in changed:
             what = f"{timing.name} is one time for all groups, and depends on what is set for {group}"
             hint = "the same without the group, or a group with a set of its own"
             raise ApcError(Mistake("E622", OVERRIDE, what, hint=hint))
 
 
-class _Scope:
-    """Parameters and timings as one group sees them, with the overrides that reach it."""
+def _check_bounds(system: CompiledSystem) -> None:
+    """Raise the mistakes of every value that is out of its bounds."""
+    mistakes = Mistakes()
+    for parameter in system.parameters:
+        _check_parameter(parameter, parameter.name, mistakes)
+    for group in system.groups:
+        for parameter in group.values:
+            _check_parameter(parameter, f"{group.name}.{parameter.name}", mistakes)
+        _check_columns(system, group, mistakes)
+    periods = {clock.period for clock in system.clocks}
+    for timing in system.timings:
+        got = f"{float(timing.value)} s"
+        if timing.name in periods and timing.value <= 0:
+            mistakes.add("E625", OVERRIDE, timing.name, expected="a time above 0 s", got=got)
+        elif timing.value < 0:
+            mistakes.add("E625", OVERRIDE, timing.name, expected="a time of 0 s or more", got=got)
+    seconds = {timing.name: timing.value for timing in system.timings}
+    for clock in system.clocks:
+        if not seconds[clock.phase] < seconds[clock.period] and seconds[clock.period] > 0:
+            got = f"{float(seconds[clock.phase])} s"
+            mistakes.add("E625", OVERRIDE, clock.phase, expected="less than the clock's period", got=got)
+    mistakes.raise_if_any()
 
-    def __init__(
-        self,
-        parameters: Mapping[str, Parameter],
-        timings: Mapping[str, Timing],
-        overridden: Mapping[str, Fraction],
-    ) -> None:
-        self._parameters = parameters
-        self._timings = timings
-        self._overridden = overridden
-        self._changed: dict[str, Fraction | None] = {}
-        self._open: set[str] = set()
 
-    def parameter(self, name: str) -> Parameter:
-        """Return a parameter with its value in this scope."""
-        parameter = self._parameters[name]
-        value = self._new(name, parameter.expression)
-        if value is None:
-            return parameter
-        kept = None if name in self._overridden else parameter.expression
-        return replace(parameter, value=float(value), exact=value, expression=kept)
+def _check_parameter(parameter: Parameter, name: str, mistakes: Mistakes) -> None:
+    """Record a value below the minimum or above the maximum."""
+    low, high, value = parameter.minimum, parameter.maximum, parameter.value
 
-    def timing(self, name: str) -> Timing:
-        """Return a timing with its value in this scope."""
-        timing = self._timings[name]
-        value = self._new(name, timing.expression)
-        if value is None:
-            return timing
-        kept = None if name in self._overridden else timing.expression
-        return replace(timing, value=value, expression=kept)
+    def told(number: float) -> str:
+        return with_unit(f"{number:g}", parameter.unit)
 
-    def _new(self, name: str, expression: str | None) -> Fraction | None:
-        """Return the changed value, or None when no override reaches it."""
-        if name in self._overridden:
-            return self._overridden[name]
-        if expression is None:
-            return None
-        if name not in self._changed:
-            assert name not in self._open, f"{name} depends on itself"
-            self._open.add(name)
-            self._changed[name] = self._evaluate(name, expression)
-            self._open.discard(name)
-        return self._changed[name]
+    def out(expected: str, number: float) -> None:
+        mistakes.add("E624", OVERRIDE, name, expected=f"{expected} {told(number)}", got=told(value))
 
-    def _evaluate(self, name: str, text: str) -> Fraction | None:
-        """Evaluate an expression if an override reaches one of its names."""
-        from apc.compiler.language.evaluation import evaluate
-        from apc.compiler.language.expression import names
-        from apc.compiler.language.grammar import parse_expression
+    if low is not None and parameter.open_minimum and value <= low:
+        out("more than", low)
+    elif low is not None and value < low:
+        out("at least", low)
+    if high is not None and value > high:
+        out("at most", high)
 
-        place = Place(name, 1, 1, text)
-        tree = parse_expression(text, place)
-        reached = [self._expression_value(".".join(node.parts)) for node in names(tree)]
-        if all(value is None for value in reached):
-            return None
-        return Fraction(evaluate(tree, self._look_up, place))
 
-    def _expression_value(self, name: str) -> Fraction | None:
-        holder: Parameter | Timing | None = self._parameters.get(name) or self._timings.get(name)
-        return self._new(name, holder.expression) if holder else None
-
-    def _look_up(self, parts: tuple[str, ...]) -> Fraction:
-        name = ".".join(parts)
-        changed = self._expression_value(name)
-        if changed is not None:
-            return changed
-        if name in self._timings:
-            return self._timings[name].value
-        return self._parameters[name].number
+def _check_columns(system: CompiledSystem, group: Group, mistakes: Mistakes) -> None:
+    """Record the first peer's value that is out of its bounds, of each parameter that differs."""
+    columns = columns_of(system, group)
+    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    for name, parameter in holder.items():
+        if name not in columns:
+            continue
+        values = columns[name]
+        low = -np.inf if parameter.minimum is None else parameter.minimum
+        high = np.inf if parameter.maximum is None else parameter.maximum
+        below = values <= low if parameter.open_minimum else values < low
+        wrong = np.flatnonzero(below | (values > high))
+        if len(wrong):
+            peer, value = f"{group.name}[{int(wrong[0]) + 1}]", float(values[wrong[0]])
+            _check_parameter(replace(parameter, value=value, exact=None), f"{peer}.{name}", mistakes)

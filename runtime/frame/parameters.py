@@ -1,25 +1,144 @@
-"""The numbers with which a compiled system becomes matrices.
+"""The numbers with which a compiled system becomes matrices, what follows from others worked out with them.
 
-Takes: a `CompiledSystem` and overrides.
-Gives: `Numbers`, `resolve`; `exact_numbers`.
-Guarantees: peers with the same parameters share one row; what depends on a parameter that differs from peer
-to peer is worked out peer by peer, in floats, in a time that grows with the number of peers.
-Does not: read or apply overrides (`overrides`); build a matrix (`linearize`, `scheduling`).
+Takes: a `CompiledSystem`, and new values by name, in any kind of number.
+Gives: `Scope`, `scope_of`, the one resolver of what follows from what; `Numbers`, `resolve`, `exact_numbers`;
+`columns_of`; `free_rows`, `free_values`.
+Guarantees: what a value reaches by a formula is worked out with it, in the order settled when the scene was
+compiled; what none reaches keeps the very number it was compiled with. Peers with the same parameters share
+one row. Complex values are complex steps: the imaginary part is a derivative.
+Does not: read or apply overrides, or check bounds (`overrides`); build a matrix (`linearize`, `scheduling`).
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind
-from apc.frame.overrides import Override, apply
-from apc.frame.rows import Floats, different_rows
+from apc.compiler.compiled import CompiledSystem, Formula, Group, Kind, Parameter, Timing
+from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.formula import computed
+from apc.frame.exact import ROWS
+from apc.frame.names import OVERRIDE, Free
+
+Floats = NDArray[np.float64]
+V = TypeVar("V")
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """The numbers that a group of peers sees, or everybody: `holder` by name, `formulas` in their order."""
+
+    holder: Mapping[str, Parameter | Timing]
+    formulas: Mapping[str, Formula]
+
+    def follow(
+        self,
+        given: Mapping[str, V],
+        compute: Callable[[str, Formula, list[Any]], V],
+        now: Callable[[str], Any],
+        wanted: Collection[str] | None = None,
+    ) -> dict[str, V]:
+        """Return the values given, and those of all that follows from them.
+
+        Parameters
+        ----------
+        given
+            New values by name.
+        compute
+            Gives the value of a name by its formula, from the values of `Formula.names`.
+        now
+            Gives the value of a name that nothing given reaches.
+        wanted
+            The names asked for: what none of them follows from is left out. None for all.
+        """
+        needed = self.formulas.keys() if wanted is None else self.needed(wanted)
+        found = dict(given)
+        for name, formula in self.formulas.items():
+            if name in needed and name not in given and not found.keys().isdisjoint(formula.names):
+                values = [found[one] if one in found else now(one) for one in formula.names]
+                found[name] = compute(name, formula, values)
+        return found
+
+    def needed(self, wanted: Collection[str]) -> set[str]:
+        """Return some names, and all that these follow from."""
+        needed = set(wanted)
+        for name in reversed(list(self.formulas)):
+            if name in needed:
+                needed.update(self.formulas[name].names)
+        return needed
+
+
+def scope_of(
+    system: CompiledSystem, own: Sequence[Parameter | Timing] = (), *, fixed: Collection[str] = ()
+) -> Scope:
+    """Return the numbers of a scene as they are seen by a group of peers, or by everybody.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    own
+        What the group has of its own; of two of a name the later counts.
+    fixed
+        Names that follow from nothing here.
+    """
+    numbers: list[Parameter | Timing] = [*system.timings, *system.parameters, *own]
+    holder = {one.name: one for one in numbers}
+    formulas = {
+        name: formula
+        for name in system.followers
+        if name in holder and name not in fixed and (formula := holder[name].formula) is not None
+    }
+    return Scope(holder, formulas)
+
+
+def _rows(name: str, formula: Formula, values: list[Any]) -> Any:
+    """Return a formula's value for all values (k,) of its names at once."""
+    with np.errstate(all="ignore"):
+        return computed(formula, values, ROWS.__getitem__)
+
+
+def columns_of(
+    system: CompiledSystem, group: Group, wanted: Collection[str] | None = None, peer: int | None = None
+) -> dict[str, Floats]:
+    """Return the parameters of a group that differ from peer to peer, given or by a formula, (count,) each.
+
+    Parameters
+    ----------
+    system, group
+        The group of the scene.
+    wanted
+        The names asked for; None for all.
+    peer
+        The only peer (1,) that is asked for, its number in the group from 0.
+
+    Raises
+    ------
+    ApcError
+        E331 what has no finite value for a peer.
+    """
+    if not group.columns:
+        return {}
+    some = slice(None) if peer is None else slice(peer, peer + 1)
+    given = {column.name: column.values[some] for column in group.columns}
+    scope = scope_of(system, group.values, fixed=given)
+
+    def compute(name: str, formula: Formula, values: list[Any]) -> Floats:
+        found = np.asarray(_rows(name, formula, values), dtype=np.float64)
+        wrong = np.flatnonzero(~np.isfinite(found))
+        if len(wrong):
+            where = f"{group.name}[{int(wrong[0]) + (peer or 0) + 1}]"
+            what = f"{name} = {formula.text[:80]} has no finite value for {where}"
+            raise ApcError(Mistake("E331", OVERRIDE, what))
+        return found
+
+    return scope.follow(given, compute, lambda name: float(scope.holder[name].value), wanted)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,21 +155,34 @@ class Numbers:
     timings: Mapping[str, Fraction]
 
 
-def resolve(system: CompiledSystem, overrides: Sequence[Override] = ()) -> Numbers:
-    """Return the numbers of a system, after the overrides.
-
-    Raises
-    ------
-    ApcError
-        As `apply`.
-    """
-    system = apply(system, overrides)
-    found = [different_rows(system, group) for group in system.groups]
+def resolve(system: CompiledSystem) -> Numbers:
+    """Return the numbers of a system. Raises ApcError as `columns_of`."""
+    found = [_different_rows(system, group) for group in system.groups]
     return Numbers(
         parameters=tuple(parameters for parameters, _ in found),
         rows=tuple(rows for _, rows in found),
         timings={timing.name: timing.value for timing in system.timings},
     )
+
+
+def _different_rows(system: CompiledSystem, group: Group) -> tuple[Floats, NDArray[np.int64]]:
+    """Return a group's different parameter rows (k, n_p) and which of them each peer has (count,)."""
+    names = system.kinds[group.kind].parameters
+    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    common = np.array([[holder[name].value for name in names]], dtype=np.float64).reshape(1, -1)
+    columns = columns_of(system, group, names)
+    varying = {place: columns[name] for place, name in enumerate(names) if name in columns}
+    if not varying:
+        # A view of one zero: a million equal peers take no memory.
+        return common, np.broadcast_to(np.int64(0), (group.count,))
+    table = np.stack(list(varying.values()), axis=1) + 0.0  # −0 and 0 are one number
+    known: dict[bytes, int] = {}
+    rows = np.array([known.setdefault(row.tobytes(), len(known)) for row in table], dtype=np.int64)
+    first = np.zeros(len(known), dtype=np.int64)
+    first[rows[::-1]] = np.arange(len(rows))[::-1]
+    parameters = np.repeat(common, len(known), axis=0)
+    parameters[:, list(varying)] = table[first]
+    return parameters, rows
 
 
 def exact_numbers(kind: Kind, vector: Floats) -> list[Fraction]:
@@ -69,3 +201,66 @@ def exact_numbers(kind: Kind, vector: Floats) -> list[Fraction]:
         assert float(rationals[near]) == vector[place], f"{kind.parameters[place]} is none of its values"
         numbers[place] = rationals[near]
     return numbers
+
+
+def free_rows(
+    system: CompiledSystem, group: Group, peer: int, values: Mapping[Free, NDArray[Any]]
+) -> NDArray[Any]:
+    """Return a peer's parameter vector for many values of some parameters, what depends on them included.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    group, peer
+        The peer: its group, and its number in it, from 0.
+    values
+        Values (k,) of each free parameter, as `apply` would set them; complex ones are complex steps, whose
+        imaginary part comes out as the derivative.
+
+    Returns
+    -------
+    The vectors (k, n_p), or (1, n_p) when none of the values reaches this peer.
+    """
+    listed = free_values(system, group, peer, values, ROWS.__getitem__)
+    count = max((len(one) for one in listed if np.ndim(one)), default=1)
+    dtype = np.result_type(np.float64, *(one.dtype for one in listed if np.ndim(one)))
+    rows = np.empty((count, len(listed)), dtype=dtype)
+    for place, one in enumerate(listed):
+        rows[:, place] = one
+    return rows
+
+
+def free_values(
+    system: CompiledSystem,
+    group: Group,
+    peer: int,
+    values: Mapping[Free, Any],
+    rule: Callable[[str], Callable[..., Any]],
+) -> list[Any]:
+    """Return a peer's parameters, those that a free one reaches in its kind of number, the others as floats.
+
+    Parameters
+    ----------
+    system, group, peer
+        As for `free_rows`.
+    values
+        The value of each free parameter.
+    rule
+        What an operation is in their kind of number, as of `plain.walk`.
+    """
+    wanted = system.kinds[group.kind].parameters
+    columns = columns_of(system, group, wanted, peer)
+    scope = scope_of(system, group.values, fixed={column.name for column in group.columns})
+    given = {free.name: value for free, value in values.items() if free.group is None}
+    given |= {free.name: value for free, value in values.items() if free.group == group.name}
+
+    def now(name: str) -> float:
+        return float(columns[name][0]) if name in columns else float(scope.holder[name].value)
+
+    def compute(name: str, formula: Formula, values_of: list[Any]) -> Any:
+        with np.errstate(all="ignore"):
+            return computed(formula, values_of, rule)
+
+    found = scope.follow(given, compute, now, wanted)
+    return [found[name] if name in found else now(name) for name in wanted]

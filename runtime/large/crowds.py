@@ -9,15 +9,15 @@ Does not: merge equal peers of different groups (see `peers`), or take sites tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.frame.batch_lift import CHUNK, LiftedRows, lift_rows
-from apc.frame.discretize import UNIT
+from apc.eigen.closing import Closed, Hearing, StateLayout, close, closing_errors, lay_out
+from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import LiftedSite
 from apc.frame.linearize import linearize_rows, site_of_row
@@ -28,9 +28,6 @@ from apc.large.transfer import StateSpace
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-
-# The matrices of `LiftedRows`, one a site.
-ROWS = ("p", "q", "s", "d", "p_error", "q_error", "s_error", "d_error")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +43,7 @@ class Crowd:
     jacobians: SiteJacobians
     schedule: Schedule
     parameters: Floats
-    lifted: LiftedRows
+    lifted: LiftedSite
     rows: Integers
     counts: Floats
 
@@ -84,29 +81,19 @@ def crowds(
     return tuple(found)
 
 
-def some_rows(lifted: LiftedRows, places: slice | Integers) -> LiftedRows:
+def some_rows(lifted: LiftedSite, places: slice | Integers) -> LiftedSite:
     """Return some of the sites."""
-    return replace(lifted, **{name: getattr(lifted, name)[places] for name in ROWS})
+    return _every_block(lifted, lambda block: block[places])
 
 
-def rows_of(lifted: LiftedSite, count: int) -> LiftedRows:
+def rows_of(lifted: LiftedSite, count: int) -> LiftedSite:
     """Return `count` copies of one lifted site."""
+    return _every_block(lifted, lambda block: np.broadcast_to(block, (count, *block.shape)))
 
-    def copies(matrix: Floats) -> Floats:
-        return np.broadcast_to(matrix, (count, *matrix.shape))
 
-    return LiftedRows(
-        z_names=lifted.z_names,
-        frame_s=lifted.frame_s,
-        p=copies(lifted.p),
-        q=copies(lifted.q),
-        s=copies(lifted.s),
-        d=copies(lifted.d),
-        p_error=copies(lifted.p_error),
-        q_error=copies(lifted.q_error),
-        s_error=copies(lifted.s_error),
-        d_error=copies(lifted.d_error),
-    )
+def _every_block(lifted: LiftedSite, change: Callable[[Floats], Floats]) -> LiftedSite:
+    p, q, s, d = lifted.mapped(change).blocks
+    return replace(lifted, p=p, q=q, s=s, d=d, error=lifted.error.mapped(change))
 
 
 def site_one(crowd: Crowd, row: int) -> LinearSite:
@@ -114,7 +101,7 @@ def site_one(crowd: Crowd, row: int) -> LinearSite:
     return site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, crowd.parameters[[row]])[0])
 
 
-def hear_themselves(lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats) -> StateSpace:
+def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> StateSpace:
     """Let every site hear its own packets, weighed, and leave the rest of what it hears open.
 
     Parameters
@@ -132,7 +119,7 @@ def hear_themselves(lifted: LiftedRows, schedule: Schedule, own: Floats, others:
     -----
     The state is z, then the packets on their way, row by row of s, the youngest first. With A₀ and B_p
     picking what each line hears of this frame's packets and of those on their way,
-    r = others·τ + own·(A₀ s + B_p q) and s = S z + D r: as in `modes.close_loop`, D A₀ is nilpotent.
+    r = others·τ + own·(A₀ s + B_p q) and s = S z + D r: as in `closing.close`, D A₀ is nilpotent.
     """
     parts = []
     for start in range(0, len(own), CHUNK):
@@ -143,28 +130,39 @@ def hear_themselves(lifted: LiftedRows, schedule: Schedule, own: Floats, others:
 
 
 def hear_roughly(
-    lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats
+    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return M, B, S and D as `hear_themselves` has them, without their errors."""
-    now, before, count = lines_of(schedule)
-    return _closed((lifted.p, lifted.q, lifted.s, lifted.d), own, others, now, before, schedule, count)
+    layout, hearing = _open_loop(lifted, schedule, own, others)
+    return _cut(close([lifted], [hearing], layout))
 
 
 def _hear_themselves(
-    lifted: LiftedRows, schedule: Schedule, own: Floats, others: Floats
+    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, ...]:
     """Close a chunk of sites, with the errors."""
-    now, before, count = lines_of(schedule)
-    blocks = (lifted.p, lifted.q, lifted.s, lifted.d)
-    errors = (lifted.p_error, lifted.q_error, lifted.s_error, lifted.d_error)
-    large = [np.abs(block) for block in blocks]
-    wide = [block + error for block, error in zip(large, errors, strict=True)]
-    value = _closed(blocks, own, others, now, before, schedule, count)
-    bound = _closed(large, np.abs(own), np.abs(others), now, before, schedule, count)
-    upper = _closed(wide, np.abs(own), np.abs(others), now, before, schedule, count)
-    terms = lifted.p.shape[-1] + 2 * len(schedule.heard) + 4
-    roundings = 4 * terms * (1 + len(schedule.sent)) * UNIT
-    return (*value, *((u - b) + roundings * u for u, b in zip(upper, bound, strict=True)))
+    layout, hearing = _open_loop(lifted, schedule, own, others)
+    size = lifted.mapped(np.abs)
+    wide = size.mapped(np.add, lifted.error)
+    error = closing_errors([size], [wide], [hearing.size], layout)
+    return (*_cut(close([lifted], [hearing], layout)), *_cut(error))
+
+
+def _open_loop(
+    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
+) -> tuple[StateLayout, Hearing]:
+    """Return the state of each site by itself, and what it hears of it and, behind it, of the others."""
+    now, before, _ = lines_of(schedule)
+    nothing = np.zeros((*own.shape, lifted.p.shape[-1]))
+    outside = others[:, :, None] * np.eye(own.shape[1])
+    heard = np.concatenate([nothing, own[:, :, None] * before, outside], axis=-1)
+    return lay_out([lifted.z_names], [schedule]), Hearing(own[:, :, None] * now, heard)
+
+
+def _cut(closed: Closed) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return M, B, S and D of closed loops over their states and what comes from outside."""
+    n = closed.matrix.shape[-2]
+    return closed.matrix[..., :n], closed.matrix[..., n:], closed.sent[..., :n], closed.sent[..., n:]
 
 
 def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:
@@ -181,39 +179,3 @@ def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:
         else:
             before[line, starts[place[one.sent]] + one.lag - 1] = 1.0
     return now, before, int(starts[-1])
-
-
-def _closed(
-    blocks: Sequence[Floats],
-    own: Floats,
-    others: Floats,
-    now: Floats,
-    before: Floats,
-    schedule: Schedule,
-    packets: int,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return M, B, S and D of the sites with their own packets closed."""
-    p, q, s, d = blocks
-    sites, n_z = p.shape[:2]
-    in_frame = own[:, :, None] * now  # (k, n_r, n_s)
-    spread = np.broadcast_to(np.eye(len(schedule.heard)), (sites, *[len(schedule.heard)] * 2))
-    if in_frame.any() and d.any():  # Neumann's series ends: nothing is heard before it is sent
-        loop = term = in_frame @ d
-        for _ in range(len(schedule.sent)):
-            spread, term = spread + term, term @ loop
-        assert not term.any(), "a packet is heard before it is sent"
-    r_z = spread @ (in_frame @ s)
-    r_q = spread @ (own[:, :, None] * before)
-    r_t = spread * others[:, None, :]
-    s_all = np.concatenate([s + d @ r_z, d @ r_q], axis=2)
-    s_t = d @ r_t
-    m = np.zeros((sites, n_z + packets, n_z + packets))
-    b = np.zeros((sites, n_z + packets, len(schedule.heard)))
-    m[:, :n_z, :n_z], m[:, :n_z, n_z:], b[:, :n_z] = p + q @ r_z, q @ r_q, q @ r_t
-    place = n_z
-    for row, depth in enumerate(schedule.depths):
-        if depth:
-            m[:, place], b[:, place] = s_all[:, row], s_t[:, row]
-            m[:, range(place + 1, place + depth), range(place, place + depth - 1)] = 1.0
-        place += depth
-    return m, b, s_all, s_t

@@ -20,7 +20,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.loop import Coupling
+from apc.eigen.closing import Coupling
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange, check_mean
@@ -150,7 +150,7 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
     transfers = []
     for g, group in enumerate(sites):
         one = group.lifted
-        blocks = (one.p, one.q, one.s, one.d, one.p_error, one.q_error, one.s_error, one.d_error)
+        blocks = (*one.blocks, *one.error.blocks)
         rows = np.arange(sent_starts[g], sent_starts[g + 1])
         lines = np.arange(heard_starts[g], heard_starts[g + 1])
         space = _placed(StateSpace(*(block[None] for block in blocks)), rows, lines, n_s, n_r)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.loop import Loop
+from apc.eigen.closing import Loop
 from apc.eigen.rigid import find_rigid_modes
 from apc.eigen.spectrum import Mode, Spectrum, judge, oscillation
 from apc.frame.course import turns

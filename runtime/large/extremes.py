@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.pseudospectrum import balance
-from apc.eigen.rigid import relative_coordinates
+from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.large.crowds import hear_themselves, rows_of
 from apc.large.diagonal import block_diagonal, block_norms, block_resolvent
@@ -111,11 +111,11 @@ def find_extremes(group: PeerGroup, weights: Floats, values: Floats, rigid: Floa
 
 
 class _Family:
-    """M(μ) of a site, the rigid motions taken out: relative coordinates x_r − W x_p move by M_rr − W M_pr."""
+    """M(μ) of a site, the rigid motions taken out."""
 
     def __init__(self, group: PeerGroup, weights: Floats, rigid: Floats, largest: float) -> None:
         self.group, self.weights = group, weights
-        self.held, self.rest, self.mixing = relative_coordinates(rigid)
+        self.relative = relative_coordinates(rigid)
         delayed = all(one.lag for one in group.schedule.heard)
         self.affine = delayed or not group.lifted.d.any()
         ends, error = self._matrices(np.array([0.0, largest]))
@@ -130,12 +130,7 @@ class _Family:
         """Return M(μ) (k, n, n), relative coordinates, and bounds on their errors."""
         own = values[:, None] * self.weights
         space = hear_themselves(rows_of(self.group.lifted, len(values)), self.group.schedule, own, 0 * own)
-        m, e, w = space.m, space.m_error, self.mixing
-        reduced = m[:, self.rest][:, :, self.rest] - w @ m[:, self.held][:, :, self.rest]
-        error = e[:, self.rest][:, :, self.rest] + np.abs(w) @ (
-            e[:, self.held][:, :, self.rest] + 8 * UNIT * np.abs(m[:, self.held][:, :, self.rest])
-        )
-        return reduced, error
+        return relative_bounded(space.m, space.m_error, self.relative)
 
     def radii(self, values: Floats) -> Floats:
         """Return estimates of the spectral radii at some graph eigenvalues."""

@@ -60,11 +60,8 @@ def sparse_system(listed: Sequence[Crowd], exchange: Exchange) -> SparseSystem:
     sizes = np.array([crowd.lifted.p.shape[-1] + sum(crowd.schedule.depths) for crowd in listed])
     starts = np.concatenate([[0], np.cumsum(sizes[crowd_of])])
     lags, hearing = _hearing(listed, exchange, crowd_of)
-    exact = [(crowd.lifted.p, crowd.lifted.q, crowd.lifted.s, crowd.lifted.d) for crowd in listed]
-    errors = [
-        (crowd.lifted.p_error, crowd.lifted.q_error, crowd.lifted.s_error, crowd.lifted.d_error)
-        for crowd in listed
-    ]
+    exact = [crowd.lifted.blocks for crowd in listed]
+    errors = [crowd.lifted.error.blocks for crowd in listed]
     large = [tuple(np.abs(block) for block in blocks) for blocks in exact]
     wide = [
         tuple(block + error for block, error in zip(blocks, off, strict=True))

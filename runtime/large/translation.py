@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.weights import exact_weight
-from apc.eigen.loop import Loop
+from apc.eigen.closing import Loop
 from apc.eigen.modes import complete_loops
 from apc.eigen.peer_group import PeerGroup, states_of, used_ways
 from apc.eigen.peers import group_of_row

@@ -12,6 +12,7 @@ from __future__ import annotations
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.names import Free, unit_of
+from apc.frame.parameters import scope_of
 from apc.network.channel import channel_law
 
 NOT_LINEAR = "left out: the scene is not linear, and this holds near its start values only"
@@ -51,29 +52,14 @@ def left_out(system: CompiledSystem, *, linear: bool = True) -> tuple[str, ...]:
 
 def channel_numbers(system: CompiledSystem) -> frozenset[str]:
     """Return the names of what links lose and delay packets by, and of all that these follow from."""
-    from apc.compiler.language.expression import names
-    from apc.compiler.language.grammar import parse_expression
-
-    text = {one.name: one.expression for one in system.parameters}
-    text |= {one.name: one.expression for one in system.timings}
-    found: set[str] = set()
-    waiting: list[str] = []
+    found: list[str] = []
     for link in system.links:
         if link.channel is not None and link.channel.loss is not None:
             loss = link.channel.loss
-            waiting += [loss.p, loss.r, loss.one_minus_h, loss.one_minus_k]
+            found += [loss.p, loss.r, loss.one_minus_h, loss.one_minus_k]
         if link.channel is not None and link.channel.jitter is not None:
-            waiting.append(link.channel.jitter)
-    while waiting:
-        name = waiting.pop()
-        if name in found:
-            continue
-        found.add(name)
-        expression = text.get(name)
-        if expression:
-            tree = parse_expression(expression, Place(name, 1, 1, expression))
-            waiting += [".".join(node.parts) for node in names(tree)]
-    return frozenset(found)
+            found.append(link.channel.jitter)
+    return frozenset(scope_of(system).needed(found))
 
 
 def refuse_channel_number(system: CompiledSystem, free: Free, place: Place) -> None:

@@ -6,9 +6,7 @@ Guarantees: all points at once; what is small is computed in few calls. A comple
 eigenvalue of positive imaginary part.
 Does not: know what the two coordinates are.
 
-For a simple eigenvalue λ of M with right and left vectors, M v = λ v and w M = λ w (w a row),
-
-    dλ/dx = w (dM/dx) v / (w v),      d log|λ|/dx = Re(dλ/dx / λ).
+    d log|λ|/dx = Re(dλ/dx / λ)
 """
 
 from __future__ import annotations
@@ -19,17 +17,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.eigen.eigenpairs import Eigenpairs, refined
+
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Integers = NDArray[np.int64]
-
-# How far from the predicted eigenvalue inverse iteration is shifted, so that the matrix it inverts stays
-# regular. Each step leaves a share of about SHIFT/gap of the other vectors.
-SHIFT = 1e-7
-
-# Steps of inverse iteration with one inverse. The vectors give the slopes: with a guess right to 1e-4 and
-# other eigenvalues 0.1 away, 1e-9 of what there was of the others is left.
-STEPS = 3
 
 # What is smaller decides nothing, and its logarithm must be finite.
 LEAST_MAGNITUDE = 1e-3
@@ -131,16 +123,12 @@ def follow(family: Family, points: Floats, guess: Pairs) -> Pairs:
         rows = np.flatnonzero(system == s)
         n = family.sizes[s]
         matrix, derivatives = family.slopes(s, points[rows])
-        shift = guess.value[rows] * (1 + SHIFT)
-        inverse = np.linalg.inv(matrix - shift[:, None, None] * np.eye(n))
-        v, w = guess.right[rows, :n, None], guess.left[rows, None, :n]
-        for _ in range(STEPS):
-            v, w = inverse @ v, w @ inverse
-        v, w = v / np.abs(v).max(axis=1, keepdims=True), w / np.abs(w).max(axis=2, keepdims=True)
-        product = (w @ v)[:, 0, 0]
-        value[rows] = (w @ (matrix @ v))[:, 0, 0] / product
-        slope[rows] = ((w @ (derivatives @ v))[..., 0, 0] / product).T
-        right[rows, :n], left[rows, :n] = v[..., 0], w[:, 0]
+        near = guess.at(rows)
+        pair = refined(
+            matrix, Eigenpairs(near.value[:, None], near.right[:, :n, None], near.left[:, None, :n])
+        )
+        value[rows], slope[rows] = pair.values[:, 0], pair.slopes(derivatives)[..., 0].T
+        right[rows, :n], left[rows, :n] = pair.right[..., 0], pair.left[:, 0]
     gradient = (slope / value[:, None]).real
     return Pairs(system, value, slope, gradient, right, left)
 
@@ -150,7 +138,7 @@ def value_errors(family: Family, pairs: Pairs) -> Floats:
     found = np.zeros(len(pairs.value))
     for s in np.unique(pairs.system).tolist():
         rows, n = np.flatnonzero(pairs.system == s), family.sizes[s]
-        v, w = pairs.right[rows, :n], pairs.left[rows, :n]
-        reached = (np.abs(w) @ family.errors[s] * np.abs(v)).sum(axis=1)
-        found[rows] = reached / np.abs((w * v).sum(axis=1))
+        own = pairs.at(rows)
+        pair = Eigenpairs(own.value[:, None], own.right[:, :n, None], own.left[:, None, :n])
+        found[rows] = pair.errors(family.errors[s])[:, 0]
     return found

@@ -1,7 +1,7 @@
 """Stable regions side by side: several scenes in one panel, several settings in several panels.
 
 Takes: compiled scenes, what each panel sets, and two axes.
-Gives: `Panel`, `Panels`, `panel_letter`; `compare_regions`, `parse_panel`, `parse_vary`, `gain_factor`.
+Gives: `Panel`, `Panels`; `compare_regions`, `parse_panel`, `parse_vary`, `gain_factor`.
 Guarantees: what is multiplied for a comparison at equal gain follows from the scene's equations, and is told.
 Does not: draw.
 """
@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from apc.frame.parameters import resolve
 from apc.regions.axes import PLACE, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.region import CELLS, Floats, Region, region
+from apc.result import Result
 from apc.vary.search import Told
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
@@ -46,21 +46,12 @@ class Panel:
     gains: tuple[int, ...]
     overlays: tuple[tuple[str, Floats], ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the panel as plain data, ready for JSON."""
-        return {
-            "panel": self.title,
-            "regions": [
-                {**one.to_dict(), "y_multiplied_by": gain}
-                for one, gain in zip(self.regions, self.gains, strict=True)
-            ],
-            "overlays": [{"label": label, "points": points.tolist()} for label, points in self.overlays],
-        }
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Panels:
+class Panels(Result):
     """Regions to be seen together; `normalized` says that y is an effective gain, see `gain_factor`."""
+
+    shown_by = "region:panels"
 
     panels: tuple[Panel, ...]
     normalized: bool
@@ -73,28 +64,9 @@ class Panels:
         regions = self.panels[0].regions
         return regions[0] if len(regions) == 1 else None
 
-    def __str__(self) -> str:
-        """Return what was found, in words."""
-        from apc.regions.report import panels_report  # it needs this module
-
-        return panels_report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the region itself if it is alone, else the panels, as plain data, ready for JSON."""
-        if self.alone is not None:
-            return self.alone.to_dict()
-        return {"normalized": self.normalized, "panels": [panel.to_dict() for panel in self.panels]}
-
     def plot(self) -> Any:
         """Draw all panels; return the matplotlib Figure."""
-        from apc.regions.figure import draw_panels
-
-        return draw_panels(self)
-
-
-def panel_letter(place: int) -> str:
-    """Return the letter of a panel, "a" for the first; after "z" they begin anew."""
-    return ascii_lowercase[place % len(ascii_lowercase)]
+        return self._shown("picture")
 
 
 def parse_panel(text: str) -> tuple[str, ...]:
@@ -212,7 +184,7 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
     """
     first = resolve(system)
     value = axis.low + (axis.high - axis.low) * (MOVE - 1)
-    second = resolve(system, [Override(axis.name, axis.group, value)])
+    second = resolve(apply(system, [Override(axis.name, axis.group, value)]))
     exchange = build_exchange(system, first.timings)
     found: set[int] = set()
     for place, group in enumerate(system.groups):

@@ -5,7 +5,7 @@ Gives: `Curve`, `Region`, `region`, `side_of_curves`.
 Guarantees: every curve comes with a bound on its distance from the boundary, the mode that makes it and that
 mode's frequency; an empty region and one without boundary are answers. What was looked at how finely is part
 of the answer: a component smaller than a cell, with nothing around it that hints at it, can be missed.
-Does not: draw, or write files (see `region.figure`, `region.files`).
+Does not: draw, or write files (see `present`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.words import counted
-from apc.eigen.spectrum import finite
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.network.nominal import left_out, refuse_channel_number
@@ -35,6 +34,7 @@ from apc.regions.eigenpairs import Family, log_magnitudes
 from apc.regions.staircase import trace_steps
 from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.surrogate import Rectangle, point_errors, resolve_family
+from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator, matrix_errors
@@ -113,22 +113,9 @@ class Curve:
             found += (np.abs(listed) / (2 * np.pi * frame)).tolist()
         return min(found), max(found)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the curve as plain data, ready for JSON."""
-        return {
-            "points": self.points.tolist(),
-            "tangents": self.tangents.tolist(),
-            "error": self.error,
-            "mode": self.mode,
-            "frequency_hz": [finite(one) for one in self.frequency_hz],
-            "closed": self.closed,
-            "smooth": self.smooth,
-            "stable_side": "left",
-        }
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Region:
+class Region(Result):
     """The stable region of a rectangle of two parameters.
 
     `stable_area` is in the product of the axes' units. `cell` are the sides of the cells the rectangle was
@@ -137,6 +124,8 @@ class Region:
     vary, `linearized` that the scene is not linear;
     `left_out` says what of the scene the answer does not look at.
     """
+
+    shown_by = "region:region"
 
     topology: str
     x: Range
@@ -152,47 +141,20 @@ class Region:
     left_out: tuple[str, ...]
     system: CompiledSystem
 
-    def __str__(self) -> str:
-        """Return what was found, in words."""
-        from apc.regions.report import region_report  # it needs this module
-
-        return region_report(self)
-
     @property
     def rectangle(self) -> Rectangle:
         """The ranges."""
         low = np.array([float(self.x.low), float(self.y.low)])
         return Rectangle(low, np.array([float(self.x.high), float(self.y.high)]) - low)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the region as plain data, ready for JSON."""
-        return {
-            "topology": self.topology,
-            "x": self.x.to_dict(),
-            "y": self.y.to_dict(),
-            "boundary": [curve.to_dict() for curve in self.curves],
-            "stable_area": self.stable_area,
-            "stable_area_error": self.stable_area_error,
-            "area_unit": _product(self.x.unit, self.y.unit),
-            "cell": list(self.cell),
-            "finest_cell": self.finest,
-            "left_out": list(self.left_out),
-            "origin": dict(self.system.origin.texts),
-        }
-
     def to_dataframe(self) -> pandas.DataFrame:
         """Return the points of all curves as a table (needs pandas)."""
-        import pandas
-
-        from apc.regions.files import headings, region_rows
-
-        return pandas.DataFrame(list(region_rows(self)), columns=headings(self))
+        table: pandas.DataFrame = self._shown("table")
+        return table
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the region into a matplotlib Axes, or a figure of its own; return the Axes."""
-        from apc.regions.figure import draw_region
-
-        return draw_region(self, ax)
+        return self._shown("picture", ax)
 
     def contains(self, x: Any, y: Any) -> Any:
         """Say whether points are stable: by the curves or, nearer to them than their error, by eigenvalues.
@@ -463,9 +425,3 @@ def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
         answer = analyze(apply(found.system, overrides), prepared=prepared)
         decided.append(bool(answer.stable))
     return np.array(decided, dtype=bool)
-
-
-def _product(x: str, y: str) -> str:
-    """Return the unit of an area."""
-    units = [unit for unit in (x, y) if unit != "1"]
-    return "*".join(f"({unit})" if "/" in unit or "*" in unit else unit for unit in units) or "1"

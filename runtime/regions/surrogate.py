@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.pseudospectrum import balance
-from apc.eigen.rigid import find_rigid_modes, relative_coordinates
+from apc.eigen.relative import relative_bounded, relative_coordinates
+from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.regions.eigenpairs import Family
 from apc.vary.batch import Evaluator
@@ -238,9 +239,8 @@ def point_errors(source: PointEvaluator, values: Floats) -> tuple[Floats, ...]:
     start = 0
     for system in source.closed_at(middle.tolist()):
         free = find_rigid_modes(system, with_drifts=False)
-        held, rest, weights = relative_coordinates(free.basis)
-        error = system.error[np.ix_(rest, rest)] + np.abs(weights) @ system.error[np.ix_(held, rest)]
-        rows = slice(start, min(start + len(rest), matrix.shape[-1]))
+        _, error = relative_bounded(system.matrix, system.error, relative_coordinates(free.basis))
+        rows = slice(start, min(start + len(error), matrix.shape[-1]))
         found[0, rows, rows] = error[: rows.stop - start, : rows.stop - start]
         start = rows.stop
     return (found,)

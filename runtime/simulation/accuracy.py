@@ -1,7 +1,7 @@
 """How far a simulation is from the scene's true motion: the same played again, more closely.
 
 Takes: a `Simulation`.
-Gives: `Comparison`, `SignalError`, `ErrorEstimate`, `compare_with`, `error_text`.
+Gives: `Comparison`, `SignalError`, `ErrorEstimate`, `compare_with`.
 Guarantees: the two runs hear the same packets; the memory used does not grow with the duration.
 Does not: prove a bound: where a motion is unstable, or contacts are lost and made, both runs go ways of their
 own, and the estimate says so by its size.
@@ -58,17 +58,6 @@ class ErrorEstimate:
         """The signal with the largest error relative to its range."""
         return max(self.signals, key=lambda one: one.relative, default=None)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data, ready for JSON."""
-        return {
-            "kind": self.kind,
-            "compared_with": self.compared,
-            "signals": [
-                {"name": one.name, "unit": one.unit, "error": one.error, "time_s": one.at, "range": one.span}
-                for one in self.signals
-            ],
-        }
-
 
 class Comparison:
     """Takes the blocks of a run as they come and plays the closer one beside it."""
@@ -120,16 +109,6 @@ def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> Comp
     if method.step is not None:
         return Comparison(closer, "method", f"half the step, {method}", factor)
     return Comparison(closer, "method", f"tolerance {method.tolerance:g}", factor)
-
-
-def error_text(estimate: ErrorEstimate) -> str:
-    """Return what a person reads of an estimate: the signal that is worst, and what it was compared with."""
-    worst = estimate.worst
-    about = "none but rounding; about " if estimate.kind == "rounding" else "about "
-    if worst is None or not worst.error:
-        return f"{about}0 in every signal ({estimate.compared})"
-    size = f"{worst.error:.1g} {worst.unit} in {worst.name} at {worst.at:g} s"
-    return f"{about}{size}, {worst.relative:.1g} of its range ({estimate.compared})"
 
 
 def _rows(played: Iterator[Block]) -> Iterator[Floats]:

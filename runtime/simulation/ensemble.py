@@ -1,7 +1,7 @@
 """Many runs of one scene, each with packets of its own, and what they have in common.
 
 Takes: a `CompiledSystem`, its `Settings`, how many runs.
-Gives: `Run`, `Ensemble`, `play_many`; `ensemble_text`.
+Gives: `Run`, `Ensemble`, `play_many`; `share_interval`.
 Guarantees: run k is the same whoever plays it, in whatever order, however many there are; a share and a mean
 stand with how far chance may have moved them; on Ctrl-C the runs that are done are kept.
 Does not: keep rows: to see run k, play it alone.
@@ -16,13 +16,11 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import counted
 from apc.processes import (
     Patience,
     Workers,
@@ -32,6 +30,7 @@ from apc.processes import (
     results,
     this_process,
 )
+from apc.result import Result
 from apc.simulation.blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
@@ -40,11 +39,6 @@ from apc.simulation.summary import Watch
 QUANTILES = (0.05, 0.5, 0.95)
 SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
 PART = 20  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
-LABELS = {
-    "settled": "settled at [s]",
-    "largest_force": "largest force [N]",
-    "copies_apart": "copies apart [m]",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,18 +68,16 @@ class Statistics:
 
 
 @dataclass(frozen=True, slots=True)
-class Ensemble:
+class Ensemble(Result):
     """Runs of a scene, in their order; `interrupted` says that there were to be more."""
+
+    shown_by = "simulation:ensemble"
 
     topology: str
     duration: Fraction
     seed: int
     runs: tuple[Run, ...]
     interrupted: bool = False
-
-    def __str__(self) -> str:
-        """Return it in words."""
-        return ensemble_text(self)
 
     @property
     def verdicts(self) -> tuple[tuple[str, int], ...]:
@@ -102,35 +94,6 @@ class Ensemble:
         error = float(values.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
         quantiles = tuple(float(one) for one in np.quantile(values, QUANTILES))
         return Statistics(n, float(values.mean()), error, float(values.min()), float(values.max()), quantiles)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data, ready for JSON."""
-        n = len(self.runs)
-        found = {name: self.statistics(name) for name in LABELS}
-        return {
-            "topology": self.topology,
-            "duration_s": float(self.duration),
-            "seed": self.seed,
-            "runs": n,
-            "interrupted": self.interrupted,
-            "verdicts": {
-                verdict: {"runs": count, "share": count / n, "share_95": list(share_interval(count, n))}
-                for verdict, count in self.verdicts
-            },
-            **{
-                name: None
-                if one is None
-                else {
-                    "runs": one.count,
-                    "mean": one.mean,
-                    "standard_error": one.standard_error if one.count > 1 else None,
-                    "low": one.low,
-                    "high": one.high,
-                    "quantiles": dict(zip(map(str, QUANTILES), one.quantiles, strict=True)),
-                }
-                for name, one in found.items()
-            },
-        }
 
 
 def share_interval(count: int, total: int) -> tuple[float, float]:
@@ -232,29 +195,3 @@ def _played(simulation: Simulation, number: int) -> Run:
         None if force is None else force[1],
         max(apart) if apart else None,
     )
-
-
-def ensemble_text(ensemble: Ensemble) -> str:
-    """Return what many runs amount to, in words of at most 80 columns."""
-    n = len(ensemble.runs)
-    lines = [
-        f"{ensemble.topology[:40]}: {counted(n, 'run')} of {float(ensemble.duration):g} s, "
-        f"seed {ensemble.seed}"
-    ]
-    for verdict, count in ensemble.verdicts:
-        low, high = share_interval(count, n)
-        told = f"{100 * count / n:.3g} % (95 % sure: {100 * low:.3g} % to {100 * high:.3g} %)"
-        lines.append(f"  {verdict:<10} {count:>8}   {told}")
-    lines.append(f"  {'':<18}{'mean':>10} ±{'error':>8}{'5 %':>10}{'median':>10}{'95 %':>10}{'most':>10}")
-    for name, label in LABELS.items():
-        one = ensemble.statistics(name)
-        if one is not None:
-            error = f"{one.standard_error:>8.1g}" if one.count > 1 else f"{'':>8}"
-            numbers = "".join(f"{value:>10.4g}" for value in (*one.quantiles, one.high))
-            lines.append(f"  {label:<18}{one.mean:>10.4g} ±{error}{numbers}")
-    settled = ensemble.statistics("settled")
-    if settled is not None and settled.count < n:
-        lines.append(f"  settled at: of the {settled.count} runs that settle")
-    if ensemble.interrupted:
-        lines.append("  interrupted: there were to be more runs")
-    return "\n".join(lines)

@@ -148,6 +148,7 @@ def _integrated(
     fine, apart = integrate(found, g)
     size = np.maximum(magnitude(found, g), size)
     off: NDArray[np.bool_] = ~np.all(apart <= AGREE * size, axis=1)
+    off &= np.isfinite(fine).all(axis=1)  # halves of what has no value have none either
     if off.any():  # it may be that of rounding the instants, which no halving mends
         some = found if len(found.after) == 1 else found.chosen(off)
         drift = at_instants(site.forcing.drift, site.parameters, instants[off])

@@ -12,45 +12,17 @@ each instant.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.exact import evaluate_exact
+from apc.frame.exact import ROWS, evaluate_exact
 
 Floats = NDArray[np.float64]
 
 # Instants of one walk: the arrays it holds then stay in the cache of a processor.
 MOST = 8192
-
-# Where Python's operators won't do for arrays. A condition is 0 or 1, as in CasADi.
-_RULES: dict[int, Callable[..., Any]] = {
-    casadi.OP_SIGN: np.sign,
-    casadi.OP_NOT: lambda a: 1.0 * (a == 0),
-    casadi.OP_FLOOR: np.floor,
-    casadi.OP_CEIL: np.ceil,
-    casadi.OP_FMIN: np.fmin,
-    casadi.OP_FMAX: np.fmax,
-    casadi.OP_LT: lambda a, b: 1.0 * (a < b),
-    casadi.OP_LE: lambda a, b: 1.0 * (a <= b),
-    casadi.OP_EQ: lambda a, b: 1.0 * (a == b),
-    casadi.OP_NE: lambda a, b: 1.0 * (a != b),
-    casadi.OP_AND: lambda a, b: 1.0 * np.logical_and(a, b),
-    casadi.OP_OR: lambda a, b: 1.0 * np.logical_or(a, b),
-    casadi.OP_IF_ELSE_ZERO: lambda a, b: np.where(a, b, 0.0),
-    casadi.OP_POW: np.float_power,
-    casadi.OP_CONSTPOW: np.float_power,
-    casadi.OP_SQRT: np.sqrt,
-    casadi.OP_EXP: np.exp,
-    casadi.OP_LOG: np.log,
-    casadi.OP_SIN: np.sin,
-    casadi.OP_COS: np.cos,
-    casadi.OP_TAN: np.tan,
-    casadi.OP_TANH: np.tanh,
-}
 
 
 def at_instants(function: Any, parameters: Floats, instants: Floats) -> Floats:
@@ -77,7 +49,7 @@ def at_instants(function: Any, parameters: Floats, instants: Floats) -> Floats:
         for start in range(0, flat.size, MOST):
             some = slice(start, start + MOST)
             for row, found in enumerate(
-                evaluate_exact(function, [listed, [flat[some]]], number=np.float64, rules=_RULES)[0]
+                evaluate_exact(function, [listed, [flat[some]]], number=np.float64, rules=ROWS)[0]
             ):
                 values[row, some] = found
     return values.reshape(len(values), *instants.shape)

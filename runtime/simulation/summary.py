@@ -1,7 +1,7 @@
-"""What a simulated motion amounts to, in numbers and words: whether it settles, and how far it goes.
+"""What a simulated motion amounts to, in numbers and a word: whether it settles, and how far it goes.
 
-Takes: the blocks of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`, `summary_text`.
-Guarantees: the memory used does not grow with the duration; a text fits 80 columns.
+Takes: the blocks of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`.
+Guarantees: the memory used does not grow with the duration.
 Does not: prove anything: what it says holds for the time that was simulated (see `analysis` for proof).
 
 Settled means: from some time on, well before the end, every position stays within `BAND` of its range around
@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import wrapped
 from apc.simulation.blocks import Block
 from apc.simulation.signals import Signal, sent_states
 from apc.simulation.simulation import Simulation
@@ -244,66 +243,3 @@ def _copies(system: CompiledSystem, signals: Sequence[Signal], last: Floats) -> 
         if len(values) > 1:
             found.append((name, float(np.max(values) - np.min(values))))
     return tuple(found)
-
-
-_WORDS = {
-    "rests": "Nothing moves: no force and no start value sets it in motion.",
-    "settles": "From {settled} on every position stays within 5 % of its range.",
-    "dies away": "At the end it still swings, less and less: {swing}.",
-    "shakes": "At the end it swings without dying away: {swing}.",
-    "moves on": "At the end some position still moves on.",
-    "diverges": "{stopped} leaves the range of numbers after {stopped_at}.",
-}
-
-
-def summary_text(topology: str, summary: Summary, notes: Sequence[tuple[str, str]] = ()) -> str:
-    """Return a summary in words.
-
-    Parameters
-    ----------
-    topology
-        The scene's name.
-    summary
-        What is to be told.
-    notes
-        Titles and texts that stand at the end.
-    """
-    swing = ""
-    if summary.swing:
-        name, size, rate = summary.swing
-        unit = next(one.unit for one in summary.extents if one.name == name)
-        swing = f"{name} by {quantity(size, unit)}, {rate:.3g} times a second"
-    words = _WORDS[summary.verdict].format(
-        settled=quantity(summary.settled or 0.0, "s"),
-        swing=swing,
-        stopped=summary.stopped,
-        stopped_at=quantity(summary.stopped_at or 0.0, "s"),
-    )
-    lines = [f"{topology}: {summary.verdict}", ""]
-    lines += wrapped(words, "  ", "  ")
-    rows = []
-    if summary.largest_force and (summary.largest_force[1] or summary.verdict != "rests"):
-        name, size, at = summary.largest_force
-        rows.append(("largest force", f"{quantity(size, 'N')}, {name} at {quantity(at, 's')}"))
-    if summary.overshoot:
-        rows.append(("overshoot", f"{100 * summary.overshoot[1]:.3g} %, {summary.overshoot[0]}"))
-    for name, distance in summary.copies:
-        if not distance and summary.verdict == "rests":
-            continue
-        unit = next(one.unit for one in summary.extents if one.name.endswith(f".{name}"))
-        rows.append(("copies", f"{name} differs by {quantity(distance, unit)} between peers at the end"))
-    if any(one for _, one in summary.work):
-        done = ", ".join(f"{part} {quantity(one, 'J')}" for part, one in summary.work)
-        rows.append(("work put in", f"{done} by held forces"))
-    rows.append(("recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"))
-    lines.append("")
-    for title, text in [*rows, *notes]:
-        lines += wrapped(text, f"  {title:<15}", " " * 17)
-    return "\n".join(lines)
-
-
-def quantity(value: float, unit: str) -> str:
-    """Return a number with its unit, thousandths of it where it is small."""
-    if value and abs(value) < 0.1 and unit in ("m", "s", "J", "N"):
-        return f"{1e3 * value:.3g} m{unit}" if abs(value) >= 1e-4 else f"{1e6 * value:.3g} µ{unit}"
-    return f"{value:.3g} {unit}"

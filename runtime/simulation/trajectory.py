@@ -1,14 +1,13 @@
 """A scene played in time, as a person gets it: rows, columns with names and units, and what made them.
 
-Takes: a `Simulation`. Gives: `Trajectory`, `Provenance`, `provenance_of`, `simulate`.
+Takes: a `Simulation`. Gives: `Played`, `Trajectory`, `Provenance`, `provenance_of`, `simulate`.
 Guarantees: no number is NaN or infinite; what diverges is kept up to the last finite row, and says so.
-Does not: write files (see `recording`), or draw (see `figures`).
+Does not: write files, or draw (see `present`).
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -21,14 +20,14 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.distribution import versions
 from apc.given import given
-from apc.optional import need
-from apc.simulation.accuracy import ErrorEstimate, compare_with, error_text
+from apc.result import Result
+from apc.simulation.accuracy import ErrorEstimate, compare_with
 from apc.simulation.blocks import Block, blocks
 from apc.simulation.flow import Tolerance
-from apc.simulation.settings import DEFAULT, EXACT, Method, Settings
+from apc.simulation.settings import DEFAULT, Method, Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, prepare
-from apc.simulation.summary import Summary, Watch, summary_text
+from apc.simulation.summary import Summary, Watch
 
 Floats = NDArray[np.float64]
 
@@ -50,48 +49,33 @@ class Provenance:
     timings: tuple[tuple[str, str], ...]
     versions: tuple[tuple[str, str], ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data, ready for JSON."""
-        return {
-            "topology": self.topology,
-            "sha256": self.texts,
-            "duration_s": self.duration_s,
-            "method": self.method,
-            "tolerances": {
-                one.state: {"relative": one.relative, "absolute": one.absolute, "unit": one.unit}
-                for one in self.tolerances
-            },
-            "seed": self.seed,
-            "parameters": {name: {"value": value, "unit": unit} for name, value, unit in self.parameters},
-            "timings_s": dict(self.timings),
-            "versions": dict(self.versions),
-        }
 
-    def to_json(self) -> str:
-        """Return it as one line of JSON."""
-        return json.dumps(self.to_dict(), ensure_ascii=False, allow_nan=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Played(Result):
+    """What a run amounts to, its rows left out; `interrupted` says that it ended before its time.
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Rows over time: `time` (rows,) in seconds, `values` (rows, signals) in SI, a column a signal.
-
-    A row holds what was before the tick at its time. `interrupted` says that it ended before its time;
     `error` is there if it was asked for.
     """
 
+    shown_by = "simulation:played"
+
     topology: str
+    summary: Summary
+    provenance: Provenance
+    interrupted: bool
+    error: ErrorEstimate | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Trajectory(Played):
+    """Rows over time: `time` (rows,) in seconds, `values` (rows, signals) in SI, a column a signal.
+
+    A row holds what was before the tick at its time.
+    """
+
     time: Floats
     values: Floats
     signals: tuple[Signal, ...]
-    summary: Summary
-    provenance: Provenance
-    interrupted: bool = False
-    error: ErrorEstimate | None = None
-
-    def __str__(self) -> str:
-        """Return the summary in words."""
-        return result_text(self.topology, self.summary, self.provenance, self.error)
 
     def __getitem__(self, name: str) -> Floats:
         """Return the column of a signal (rows,). Raises KeyError if there is none of that name."""
@@ -100,25 +84,13 @@ class Trajectory:
                 return self.values[:, place]
         raise KeyError(name)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the summary as plain data, ready for JSON; the rows are not in it."""
-        return result_document(self.topology, self.summary, self.provenance, self.interrupted, self.error)
-
     def to_dataframe(self) -> Any:
         """Return a pandas DataFrame: index `time [s]`, a column a signal, headings with units."""
-        pandas = need("pandas", "data")
-        columns = [signal.heading for signal in self.signals]
-        return pandas.DataFrame(self.values, pandas.Index(self.time, name="time [s]"), columns)
+        return self._shown("table")
 
     def to_xarray(self) -> Any:
         """Return an xarray Dataset over `time`, a variable a signal with its unit as attribute."""
-        xarray = need("xarray", "data")
-        variables = {
-            signal.name: ("time", self.values[:, place], {"units": signal.unit})
-            for place, signal in enumerate(self.signals)
-        }
-        time = ("time", self.time, {"units": "s"})
-        return xarray.Dataset(variables, {"time": time}, {"provenance": self.provenance.to_json()})
+        return self._shown("dataset")
 
     def plot(self, ax: Any = None) -> Any:
         """Draw a panel a quantity, or all signals into one matplotlib Axes; return the Figure.
@@ -128,87 +100,7 @@ class Trajectory:
         ax
             Where to draw; signals of more than one unit need a figure of their own.
         """
-        from apc.simulation.figures import draw  # it needs this module
-
-        return draw(self, ax)
-
-
-def result_text(
-    topology: str, summary: Summary, provenance: Provenance, error: ErrorEstimate | None = None
-) -> str:
-    """Return what `apc simulate` prints: the summary, the method if it is not exact, the error if known.
-
-    Parameters
-    ----------
-    topology
-        The scene's name.
-    summary, provenance
-        What the motion amounts to, and what made it.
-    error
-        How far off it is, if that was estimated.
-    """
-    notes = [] if provenance.method == EXACT else [("method", method_text(provenance))]
-    return summary_text(topology, summary, notes + ([("error", error_text(error))] if error else []))
-
-
-def method_text(provenance: Provenance) -> str:
-    """Return the method with its tolerances, of each unit the smallest."""
-    smallest: dict[str, float] = {}
-    for one in provenance.tolerances:
-        smallest[one.unit] = min(smallest.get(one.unit, one.absolute), one.absolute)
-    absolute = ", ".join(f"{value:.1g} {unit}" for unit, value in smallest.items())
-    return provenance.method + (f"; absolute tolerances from {absolute}" if absolute else "")
-
-
-def result_document(
-    topology: str,
-    summary: Summary,
-    provenance: Provenance,
-    interrupted: bool,
-    error: ErrorEstimate | None = None,
-) -> dict[str, Any]:
-    """Return what `apc simulate --json` prints.
-
-    Parameters
-    ----------
-    topology, summary, provenance, error
-        As for `result_text`.
-    interrupted
-        Whether the run ended before its time.
-    """
-
-    def named(pair: tuple[str, float] | None, key: str) -> dict[str, Any] | None:
-        return None if pair is None else {"signal": pair[0], key: pair[1]}
-
-    force, swing = summary.largest_force, summary.swing
-    return {
-        "topology": topology,
-        "verdict": summary.verdict,
-        "settled_s": summary.settled,
-        "diverged": {"signal": summary.stopped, "time_s": summary.stopped_at} if summary.stopped else None,
-        "interrupted": interrupted,
-        "swing": None if swing is None else {"signal": swing[0], "size": swing[1], "frequency_hz": swing[2]},
-        "overshoot": named(summary.overshoot, "part"),
-        "largest_force": None if force is None else {"signal": force[0], "N": force[1], "time_s": force[2]},
-        "copies_apart": dict(summary.copies),
-        "work_J": dict(summary.work),
-        "rows": summary.rows,
-        "end_s": summary.end,
-        "signals": [
-            {
-                "name": one.name,
-                "unit": one.unit,
-                "first": one.first,
-                "last": one.last,
-                "low": one.low,
-                "high": one.high,
-                "settled_s": one.settled,
-            }
-            for one in summary.extents
-        ],
-        "error_estimate": None if error is None else error.to_dict(),
-        "provenance": provenance.to_dict(),
-    }
+        return self._shown("picture", ax)
 
 
 def provenance_of(simulation: Simulation) -> Provenance:

@@ -1,7 +1,7 @@
 """What a sweep can compute at each of its points.
 
 Takes: a `CompiledSystem` and a name such as `analyze` or `critical:coordination.stiffness`.
-Gives: `Quantity`, `ResultColumn`, `QUANTITIES`, `find_quantity`, `faulty`.
+Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`.
 Guarantees: what all points share is prepared once; a row depends on its point's numbers alone, not on the
 points before it; a number that isn't finite is left out of a row.
 Does not: choose points, or hold results.
@@ -11,39 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.eigen.spectrum import finite
 from apc.frame.names import find, unit_of
+from apc.tables import Column, Row
 
 PLACE = Place("sweep")
-
-Cell = float | int | bool | str | None
-Row = tuple[Cell, ...]
 
 # What stands in the verdict's column of a point whose numbers can't be computed with.
 FAULT = "error: "
 
 
-@dataclass(frozen=True, slots=True)
-class ResultColumn:
-    """A column of results: `kind` says what its cells are, if they are anything at all."""
-
-    name: str
-    unit: str
-    kind: Literal["number", "count", "text"]
-
-    @property
-    def heading(self) -> str:
-        """The column's heading: name, and unit if it has one."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
-
-
-VERDICT = ResultColumn("verdict", "", "text")
-MESSAGE = ResultColumn("message", "", "text")
+VERDICT = Column("verdict", "", "text")
+MESSAGE = Column("message", "", "text")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +36,7 @@ class Quantity:
     The first column is the verdict, the last a message, empty but where a point is at fault.
     """
 
-    columns: tuple[ResultColumn, ...]
+    columns: tuple[Column, ...]
     evaluate: Callable[[CompiledSystem], Row]
 
 
@@ -80,7 +63,7 @@ def find_quantity(system: CompiledSystem, text: str) -> Quantity:
     return make(system, argument.strip())
 
 
-def faulty(columns: tuple[ResultColumn, ...], error: ApcError) -> Row:
+def faulty(columns: tuple[Column, ...], error: ApcError) -> Row:
     """Return the row of a point at fault: the message's code as its verdict, and the message."""
     first = error.mistakes[0]
     return (FAULT + first.code, *(None for _ in columns[1:-1]), first.sentence)
@@ -92,11 +75,11 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
         raise ApcError(Mistake("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
     columns = (
         VERDICT,
-        ResultColumn("spectral_radius", "", "number"),
-        ResultColumn("spectral_radius_error", "", "number"),
-        ResultColumn("rigid_modes", "", "count"),
-        ResultColumn("frequency", "Hz", "number"),
-        ResultColumn("damping_ratio", "", "number"),
+        Column("spectral_radius", "", "number"),
+        Column("spectral_radius_error", "", "number"),
+        Column("rigid_modes", "", "count"),
+        Column("frequency", "Hz", "number"),
+        Column("damping_ratio", "", "number"),
         MESSAGE,
     )
     prepared = prepare(system)
@@ -129,10 +112,10 @@ def _critical(system: CompiledSystem, argument: str) -> Quantity:
     shown = "" if unit == "1" else unit
     columns = (
         VERDICT,
-        ResultColumn("value", shown, "number"),
-        ResultColumn("error", shown, "number"),
-        ResultColumn("crossings", "", "count"),
-        ResultColumn("proof", "", "text"),
+        Column("value", shown, "number"),
+        Column("error", shown, "number"),
+        Column("crossings", "", "count"),
+        Column("proof", "", "text"),
         MESSAGE,
     )
 

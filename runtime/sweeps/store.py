@@ -30,7 +30,7 @@ from typing import IO, Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file, unwritable, write_file
-from apc.sweeps.quantities import Row
+from apc.tables import Row
 
 SUFFIX = ".parts"
 _MANIFEST = "manifest.json"

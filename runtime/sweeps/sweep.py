@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import counted, with_unit, wrapped
+from apc.compiler.files import is_special
 from apc.frame.jacobians import jacobians
 from apc.frame.names import Free
 from apc.network.nominal import left_out, refuse_channel_number
@@ -35,11 +35,12 @@ from apc.processes import (
     results,
     this_process,
 )
+from apc.result import Result
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
-from apc.sweeps.quantities import VERDICT, Cell, Row, find_quantity
+from apc.sweeps.quantities import VERDICT, find_quantity
 from apc.sweeps.store import Parts, open_parts, remove_parts
-from apc.sweeps.table_file import check_table_path, write_table
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
+from apc.tables import Cell, Column, Row, check_table_path, write_table
 
 if TYPE_CHECKING:
     import pandas
@@ -63,12 +64,14 @@ LOST = Mistake(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sweep:
+class Sweep(Result):
     """The rows of a sweep, by columns: swept parameters first, in SI, then results.
 
     A column of numbers is a float64 array (n,), NaN where a point has no number; others are object arrays.
     `made_of` says what made it: model, axes, versions. `notes` tell what was out of the ordinary.
     """
+
+    shown_by = "vary:sweep"
 
     topology: str
     of: str
@@ -96,37 +99,8 @@ class Sweep:
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return the sweep as a pandas table, with the headings as its columns."""
-        import pandas
-
-        return pandas.DataFrame(dict(zip(self.headings, self.columns, strict=True)))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what the sweep is and how it came out, without its rows, ready for JSON."""
-        return {
-            **self.made_of,
-            "columns": list(self.headings),
-            "verdicts": dict(self.verdicts),
-            "out": str(self.out) if self.out else None,
-            "notes": list(self.notes),
-        }
-
-    def __str__(self) -> str:
-        """Return the sweep in a few lines: where the rows are, what was swept, the verdicts."""
-        where = f" → {self.out}" if self.out else ""
-        lines = [f"{self.topology}: {self.points:,} points{where}"]
-        for note in self.made_of["left_out"]:
-            lines += wrapped(note, "  ", "    ")
-        for axis in self.grid.axes:
-            ends = f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}"
-            lines.append(
-                f"  {axis.label}: {with_unit(ends, axis.unit)}, {counted(len(axis.values), 'value')}"
-            )
-        lines += [f"  {count:>10,} × {verdict}" for verdict, count in self.verdicts]
-        messages = Counter(cell for cell in self.columns[-1].tolist() if cell)
-        if messages:
-            text, count = messages.most_common(1)[0]
-            lines += wrapped(f"at {count:,} of them: {text}", "  ", "    ")
-        return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
+        table: pandas.DataFrame = self._shown("table")
+        return table
 
 
 def sweep(
@@ -167,8 +141,8 @@ def sweep(
     ------
     ApcError
         An axis is at fault (E622, E881 to E883, E896, E204, …); E884 nothing is computed under that name;
-        E885 other work stands at the target; E887 or E601 the target can't be written; E888 the cluster;
-        E889 a process ended, or nothing came for too long. What is finished is kept.
+        E885 other work stands at the target; E878, E887 or E601 the target can't be written; E888 the
+        cluster; E889 a process ended, or nothing came for too long. What is finished is kept.
     """
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
@@ -180,7 +154,7 @@ def sweep(
             what = f"{axis.label} is swept: there is nothing to look for at one value of it"
             raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
     if out is not None:
-        check_table_path(out)
+        check_table_path(out, "out=")
     if jobs is not None and jobs < 1:
         raise ApcError(Mistake("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
     work = Work(model_bytes(system), of, grid, max(PART_POINTS, -(-grid.points // MOST_PARTS)))
@@ -188,12 +162,13 @@ def sweep(
     with _kept(out, made_of) as kept:
         whose = Whose(jobs or cores(), cluster, patience or Patience())
         notes = _compute_missing(work, kept, whose, progress)
-        headings = (*(axis.heading for axis in grid.axes), *(one.heading for one in quantity.columns))
-        kinds = (*("number" for _ in grid.axes), *(one.kind for one in quantity.columns))
-        columns = _columns(work, kept, kinds)
+        listed = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
+        columns = _columns(work, kept, [one.kind for one in listed])
         if out is not None:
-            write_table(out, headings, kinds, _rows(work, kept), made_of)
-            remove_parts(out)
+            write_table(out, listed, _rows(work, kept), made_of)
+            if isinstance(kept, Parts):
+                remove_parts(out)
+    headings = tuple(one.heading for one in listed)
     return Sweep(system.name, of, grid, headings, columns, out, made_of, notes)
 
 
@@ -241,7 +216,7 @@ _Kept = Parts | _Memory
 
 @contextmanager
 def _kept(out: Path | None, made_of: Mapping[str, Any]) -> Iterator[_Kept]:
-    if out is None:
+    if out is None or is_special(out):
         yield _Memory()
         return
     with open_parts(out, made_of) as parts:

@@ -22,7 +22,8 @@ from apc.distribution import versions
 from apc.frame.overrides import apply
 from apc.processes import model_of_bytes
 from apc.sweeps.grid import Grid
-from apc.sweeps.quantities import Quantity, Row, faulty, find_quantity
+from apc.sweeps.quantities import Quantity, faulty, find_quantity
+from apc.tables import Row
 from apc.threads import single_threaded
 
 # What makes the numbers: with another version of one of them, the last digits may be others.

@@ -22,36 +22,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import ClosedSystem, close_loop
-from apc.eigen.loop import Loop
+from apc.eigen.closing import Closed, ClosedSystem, close_loop, closing_errors
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
+from apc.eigen.relative import Relative, relative_bounded
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.batch_lift import (
     HOPELESS,
     PERTURBED_FRAMES,
     SAFE,
-    compose_rows,
     exponential_rows,
     lift_rows,
-    roundings_of,
 )
-from apc.frame.discretize import UNIT
+from apc.frame.discretize import UNIT, Step
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import lift
+from apc.frame.lift import FrameMap, compose, lift, roundings_of
 from apc.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
-from apc.frame.rows import free_rows
+from apc.frame.parameters import free_rows
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix
 from apc.vary.wiring import (
-    Lifted,
     Wiring,
     are_rigid,
     closed_loop,
     reduced,
-    relative_weights,
+    relative_at,
     site_key,
     told_by_constants,
     wire,
@@ -169,16 +166,7 @@ class BatchEvaluator:
             for one in system.sites
             if (new := moved[site_key(one)])
         ]
-        return close_loop(
-            Loop(
-                system.name,
-                system.multiplicity,
-                tuple(sites),
-                system.coupling,
-                system.doubts,
-                system.surds,
-            )
-        )
+        return close_loop(replace(system, sites=tuple(sites)))
 
     def exact_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems with the sites of one point (m,), for exact arithmetic.
@@ -205,15 +193,15 @@ class BatchEvaluator:
         point = np.array([value], dtype=np.float64)
         return [(group, self.vectors(group, point)[0]) for group in self.groups]
 
-    def lifted(self, values: Matrices) -> dict[tuple[int, int], Lifted]:
+    def lifted(self, values: Matrices) -> dict[tuple[int, int], FrameMap]:
         """Return the maps of all groups, each once, by the identity of site and schedule."""
-        found: dict[tuple[int, int], Lifted] = {}
+        found: dict[tuple[int, int], FrameMap] = {}
         for group in self.groups:
             if site_key(group) not in found:
                 found[site_key(group)] = self._lift(group, values)
         return found
 
-    def _lift(self, group: PeerGroup, values: Matrices) -> Lifted:
+    def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
         built, schedule = group.jacobians, group.schedule
         rows = self.rows(built, self.vectors(group, values))
         site = sites_of_rows(built, rows)
@@ -222,16 +210,11 @@ class BatchEvaluator:
         if steps is None:
             site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
             steps = self.steps(site, values)
-        count = max(len(rows), *(len(step) for step in steps.values()), 1)
-        kind_of_number = np.result_type(rows, *steps.values())
-        if count > len(rows) or kind_of_number != rows.dtype:
-            rows = np.broadcast_to(rows, (count, rows.shape[1])).astype(kind_of_number)
-            site = sites_of_rows(built, rows)
         with np.errstate(all="ignore"):
-            z, s = compose_rows(site, schedule, steps)
-        z[beyond if len(beyond) == len(z) else slice(0, len(z) if beyond.any() else 0)] = np.nan
-        n_z = z.shape[1]
-        return Lifted(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
+            frame = compose(site, schedule, steps)
+        lost = beyond if len(beyond) == len(frame.p) else slice(0, len(frame.p) if beyond.any() else 0)
+        frame.p[lost] = frame.q[lost] = np.nan
+        return frame
 
     def steps(self, site: LinearSite, values: Matrices) -> dict[int, Matrices]:
         """Return the exponentials of every step, one for all points where A, B and the time stay."""
@@ -245,7 +228,7 @@ class BatchEvaluator:
                 gone = np.abs(seconds) < VANISHING * abs(constant)
                 seconds = np.where(gone, seconds - seconds.real, seconds)
             with np.errstate(all="ignore"):
-                steps[quanta] = exponential_rows(a * seconds, b * seconds, 1.0)[0]
+                steps[quanta] = exponential_rows(a * seconds, b * seconds, 1.0).matrix
         return steps
 
     def rows(self, built: SiteJacobians, vectors: Matrices) -> Matrices:
@@ -358,38 +341,38 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
     Notes
     -----
     The composition of magnitudes and that of magnitudes with their errors differ by a bound on the error to
-    all orders, as in `modes.close_loop`; the roundings of closing are added to it.
+    all orders, as in `closing.closing_errors`; the roundings of closing are added to it.
     """
     assert not evaluator.timed, "the errors of a step belong to its time"
     plain = evaluator.lifted(values)
-    large: dict[tuple[int, int], Lifted] = {}
-    wide: dict[tuple[int, int], Lifted] = {}
+    large: dict[tuple[int, int], FrameMap] = {}
+    wide: dict[tuple[int, int], FrameMap] = {}
     for group in evaluator.groups:
         rows = linearize_rows(group.jacobians, evaluator.vectors(group, values))
         one = lift_rows(group.jacobians, group.schedule, rows)
-        sizes = [np.abs(block) for block in (one.p, one.q, one.s, one.d)]
-        errors = (one.p_error, one.q_error, one.s_error, one.d_error)
-        large[site_key(group)] = Lifted(*sizes)
-        wide[site_key(group)] = Lifted(*(a + b for a, b in zip(sizes, errors, strict=True)))
+        large[site_key(group)] = one.mapped(np.abs)
+        wide[site_key(group)] = large[site_key(group)].mapped(np.add, one.error)
     found = []
     for wiring in evaluator.wirings:
-        positive = replace(
-            wiring,
-            now=tuple(map(np.abs, wiring.now)),
-            before=tuple(map(np.abs, wiring.before)),
-        )
-        bound, upper = closed_loop(positive, large), closed_loop(positive, wide)
-        terms = max(len(group.lifted.z_names) for group in wiring.system.sites)
-        terms += sum(now.shape[0] + now.shape[1] for now in wiring.now)
-        error = (upper - bound) + 4 * (terms + 2) * (1 + len(wiring.now[0])) * UNIT * upper
-        rest, held = wiring.rest, wiring.held
-        own = error[:, rest[:, None], rest]
-        if len(held):
-            weights, off = _relative_errors(wiring, closed_loop(wiring, plain), error)
-            below, wide_below = error[:, held[:, None], rest], upper[:, held[:, None], rest]
-            own = own + np.abs(weights) @ (below + 8 * (len(held) + 2) * UNIT * wide_below) + off @ wide_below
+        error = _closing_errors(wiring, large, wide).matrix
+        matrix = closed_loop(wiring, plain)
+        _, own = relative_bounded(matrix, error, _relative_here(wiring, matrix, error))
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
+
+
+def _closing_errors(
+    wiring: Wiring,
+    size: Mapping[tuple[int, int], FrameMap],
+    wide: Mapping[tuple[int, int], FrameMap],
+    *,
+    times: int = 1,
+) -> Closed:
+    """Return `closing.closing_errors` of a system, from the magnitudes of its sites and these with errors."""
+    keys = [site_key(group) for group in wiring.system.sites]
+    hearing = [one.size for one in wiring.hearing]
+    sizes, wides = ([maps[key] for key in keys] for maps in (size, wide))
+    return closing_errors(sizes, wides, hearing, wiring.system.layout, times=times)
 
 
 def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tuple[Floats, ...]:
@@ -410,79 +393,68 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
     """
     assert not evaluator.timed, "the errors of a step belong to its time"
     complex_values = values + (STEP * 1j) * along
-    large: dict[tuple[int, int], Lifted] = {}
-    wide: dict[tuple[int, int], Lifted] = {}
+    large: dict[tuple[int, int], FrameMap] = {}
+    wide: dict[tuple[int, int], FrameMap] = {}
     for group in evaluator.groups:
         built, schedule = group.jacobians, group.schedule
         rows = evaluator.rows(built, evaluator.vectors(group, complex_values))
         here = lift_rows(built, schedule, rows.real[:1])
-        value_errors = (here.p_error, here.q_error, here.s_error, here.d_error)
-        size, off = _moved_blocks(sites_of_rows(built, rows), schedule, evaluator.durations)
-        large[site_key(group)] = Lifted(*size)
-        wide[site_key(group)] = Lifted(
-            *(a + b + (STEP * 1j) * c for a, b, c in zip(size, value_errors, off, strict=True))
-        )
+        size, doubt = _moved_blocks(sites_of_rows(built, rows), schedule, evaluator.durations)
+        large[site_key(group)] = size
+        wide[site_key(group)] = size.mapped(lambda a, b, c: a + b + (STEP * 1j) * c, here.error, doubt)
     found = []
     errors, plain = matrix_errors(evaluator, values), evaluator.lifted(complex_values)
     for wiring, error in zip(evaluator.wirings, errors, strict=True):
-        whole = replace(wiring, now=tuple(map(np.abs, wiring.now)), before=tuple(map(np.abs, wiring.before)))
-        terms = max(len(group.lifted.z_names) for group in wiring.system.sites)
-        terms += sum(now.shape[0] + now.shape[1] for now in wiring.now)
-        bound, upper = (closed_loop(whole, one).imag / STEP for one in (large, wide))
-        off = (upper - bound) + 8 * (terms + 2) * (1 + len(wiring.now[0])) * UNIT * upper
-        rest, held = wiring.rest, wiring.held
-        own = off[:, rest[:, None], rest]
-        if len(held):
-            matrix = closed_loop(wiring, plain)
-            weights, _ = relative_weights(wiring, matrix)
-            moved, turned = np.abs(matrix.imag / STEP), np.abs(weights.imag / STEP)
-            below = off[:, held[:, None], rest] + 8 * (len(held) + 2) * UNIT * moved[:, held[:, None], rest]
-            own = own + np.abs(weights.real) @ below
-            if wiring.moving:
-                inverse = _inverse_size(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest])
-                heavy = np.abs(weights.real)
-                late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ heavy + error @ turned
-                late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ heavy)
-                own = own + (inverse @ late) @ np.abs(matrix.real[:, held[:, None], rest])
+        matrix = closed_loop(wiring, plain)
+        # Of each product the slope is a sum of two: twice the roundings.
+        off = _closing_errors(wiring, large, wide, times=2).matrix.imag / STEP
+        at = relative_at(wiring, matrix)[0]
+        turned = np.abs(at.weights.imag / STEP)
+        nothing = np.zeros((len(at.rest), len(at.held)))
+        steady = replace(at, weights=at.weights.real, doubt=nothing) if wiring.moving else at
+        _, own = relative_bounded(matrix.imag / STEP, off, steady)
+        if wiring.moving:
+            rest, held = at.rest, at.held
+            heavy, moved = np.abs(at.weights.real), np.abs(matrix.imag / STEP)
+            inverse = _inverse_size(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest])
+            late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ heavy + error @ turned
+            late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ heavy)
+            own = own + (inverse @ late) @ np.abs(matrix.real[:, held[:, None], rest])
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
 
 
 def _moved_blocks(
     site: LinearSite, schedule: Schedule, durations: Mapping[int, tuple[float, float]]
-) -> tuple[tuple[Matrices, ...], tuple[Floats, ...]]:
-    """Return the sizes of P, Q, S and D, of their slopes as a complex step, and the errors of the slopes."""
-    plain, steps, charges = {}, {}, {}
+) -> tuple[FrameMap, FrameMap]:
+    """Return the sizes of a frame and of its slopes as a complex step, and the errors of the slopes."""
+    plain, steps = {}, {}
     for quanta, (seconds, _) in durations.items():
-        plain[quanta] = exponential_rows(site.a * seconds, site.b * seconds, 1.0)[0]
-        steps[quanta], charges[quanta] = _large_step(site, seconds)
-    roundings = roundings_of(site, schedule, charges)
-    frame = compose_rows(site, schedule, plain)
-    bounds = compose_rows(every_matrix(site, _sized), schedule, steps)
-    errors = [(2 * roundings * UNIT / STEP) * one.imag for one in bounds]
-    slopes = [np.abs(one.imag) / STEP for one in frame]
-    if not all(
-        e.max(initial=0.0) <= HOPELESS * s.max(initial=0.0) for e, s in zip(errors, slopes, strict=True)
-    ):
+        plain[quanta] = exponential_rows(site.a * seconds, site.b * seconds, 1.0).matrix
+        steps[quanta] = _large_step(site, seconds)
+    roundings = roundings_of(site, schedule, steps)
+    frame = compose(site, schedule, plain)
+    bounds = compose(
+        every_matrix(site, _sized), schedule, {quanta: step.matrix for quanta, step in steps.items()}
+    )
+    error = bounds.mapped(lambda one: (2 * roundings * UNIT / STEP) * one.imag)
+    slope = frame.mapped(lambda one: np.abs(one.imag) / STEP)
+    if not (error.largest <= HOPELESS * slope.largest).all():
         random = np.random.default_rng(len(schedule.events))
 
         def moved(matrix: Matrices) -> Matrices:
             by = roundings * UNIT * random.uniform(-1, 1, (2, *matrix.shape))
             return np.asarray(matrix.real * (1 + by[0]) + 1j * (matrix.imag * (1 + by[1])))
 
-        errors = [roundings * UNIT * slope for slope in slopes]
+        error = slope.mapped(lambda one: roundings * UNIT * one)
         for _ in range(PERTURBED_FRAMES):
-            other = compose_rows(
+            other = compose(
                 every_matrix(site, moved), schedule, {quanta: moved(step) for quanta, step in plain.items()}
             )
-            apart = (SAFE * np.abs(one.imag - two.imag) / STEP for one, two in zip(frame, other, strict=True))
-            errors = [np.maximum(one, two) for one, two in zip(errors, apart, strict=True)]
-    n_z = frame[0].shape[1]
-    cut = [(block, columns) for block in (0, 1) for columns in (slice(None, n_z), slice(n_z, None))]
-    return (
-        tuple(_sized(frame[block])[..., columns] for block, columns in cut),
-        tuple(errors[block][..., columns] for block, columns in cut),
-    )
+            error = error.mapped(
+                lambda e, a, b: np.maximum(e, SAFE * np.abs(a.imag - b.imag) / STEP), frame, other
+            )
+    return frame.mapped(_sized), error
 
 
 def _sized(matrix: Matrices) -> Matrices:
@@ -490,20 +462,21 @@ def _sized(matrix: Matrices) -> Matrices:
     return np.asarray(np.abs(matrix.real) + 1j * np.abs(matrix.imag))
 
 
-def _large_step(site: LinearSite, seconds: float) -> tuple[Matrices, float]:
-    """Return the magnitudes of a step and of its slope, and its roundings.
+def _large_step(site: LinearSite, seconds: float) -> Step:
+    """Return the magnitudes of a step and of its slope, with its roundings.
 
     [F G]′ is the integral of F(T − s) [A′ B′] [F(s) G(s); 0 1] over s from 0 to T; what F reaches in between
     is taken from both ends and the middle.
     """
     a, b = np.abs(site.a.imag), np.abs(site.b.imag)
-    step, size, charge = exponential_rows(site.a.real, site.b.real, seconds)
-    half, _, _ = exponential_rows(site.a.real, site.b.real, seconds / 2)
+    step = exponential_rows(site.a.real, site.b.real, seconds)
+    half = exponential_rows(site.a.real, site.b.real, seconds / 2).matrix
     n_x, n_u = b.shape[-2:]
-    whole = np.maximum(np.maximum(size, np.abs(half)), np.eye(n_x, n_x + n_u))
+    whole = np.maximum(np.maximum(step.size, np.abs(half)), np.eye(n_x, n_x + n_u))
     below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (*whole.shape[:-2], n_u, n_x + n_u))
     slope = whole[..., :n_x] @ np.concatenate([a, b], axis=-1) @ np.concatenate([whole, below], axis=-2)
-    return np.maximum(np.abs(step), size) + 1j * seconds * slope, charge
+    large = np.maximum(np.abs(step.matrix), step.size)
+    return Step(large + 1j * seconds * slope, large, step.roundings)
 
 
 def _inverse_size(matrices: Floats) -> Floats:
@@ -514,20 +487,19 @@ def _inverse_size(matrices: Floats) -> Floats:
         return np.full(matrices.shape, NO_USE)
 
 
-def _relative_errors(wiring: Wiring, matrix: Floats, error: Floats) -> tuple[Floats, Floats]:
-    """Return W at each point and a bound on its error, to first order where the directions follow.
+def _relative_here(wiring: Wiring, matrix: Floats, error: Floats) -> Relative:
+    """Return the relative coordinates at each point, with a bound on W to first order where it follows.
 
     (1 − M_rr) W = M_rp: W is off by (1 − M_rr)⁻¹ times what the errors of M leave, and the solution's own.
     """
-    weights, _ = relative_weights(wiring, matrix)
+    at, _ = relative_at(wiring, matrix)
     if not wiring.moving:
-        return weights, 8 * (len(wiring.held) + 2) * UNIT * np.abs(weights)[None]
-    rest, held = wiring.rest, wiring.held
+        return at
+    rest, held, size = at.rest, at.held, np.abs(at.weights)
     system = np.eye(len(rest)) - matrix[:, rest[:, None], rest]
-    size = _inverse_size(system)
-    left = error[:, rest[:, None], held] + error[:, rest[:, None], rest] @ np.abs(weights)
-    left = left + 8 * (len(rest) + 2) * UNIT * (np.abs(system) @ np.abs(weights))
-    return weights, size @ left
+    left = error[:, rest[:, None], held] + error[:, rest[:, None], rest] @ size
+    left = left + 8 * (len(rest) + 2) * UNIT * (np.abs(system) @ size)
+    return replace(at, doubt=_inverse_size(system) @ left)
 
 
 def _moved(group: PeerGroup, vector: Floats) -> PeerGroup:

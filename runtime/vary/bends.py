@@ -15,19 +15,17 @@ import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi
 import flint
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.plain import symbolic
 from apc.frame.exact import evaluate_exact
-from apc.frame.rows import free_values
+from apc.frame.parameters import free_values
 from apc.vary.batch import BatchEvaluator
-
-if TYPE_CHECKING:
-    from apc.compiler.language.expression import Expr
 
 Floats = NDArray[np.float64]
 
@@ -142,7 +140,7 @@ def bends(family: BatchEvaluator, base: Floats, column: int) -> Bends | None:
         if not built.walkable:
             return None
         place, peer = family.first_peer(group)
-        vector = free_values(family.system, family.system.groups[place], peer, free, _symbolic)
+        vector = free_values(family.system, family.system.groups[place], peer, free, symbolic)
         key = (built.kind.name, tuple(one if isinstance(one, float) else None for one in vector))
         if key not in functions:
             functions[key] = _bending(built.function, value, casadi.vertcat(*vector))
@@ -166,13 +164,6 @@ def _bending(function: Any, value: Any, vector: Any) -> Any:
             return None
         whole = casadi.Function("coefficients", [value], [flat[bent]])
     return whole
-
-
-def _symbolic(tree: Expr, value_of: Callable[[str], Any]) -> Any:
-    """Return the value of an expression of parameters, some of which are CasADi's symbols."""
-    from apc.vary.symbols import compute_symbols  # few parameters follow from others
-
-    return compute_symbols(tree, value_of)
 
 
 # ---- Taylor series with balls for coefficients, as numbers ----
@@ -222,23 +213,23 @@ def _truth(condition: Callable[[int], bool]) -> Callable[[Any, Any], Any]:
     return lambda a, b: _constant(float(condition(_sign(a - b))))
 
 
-_RULES: dict[int, Callable[..., Any]] = {
-    casadi.OP_POW: _power,
-    casadi.OP_CONSTPOW: _power,
-    casadi.OP_FABS: lambda a: a if _sign(a) >= 0 else -a,
-    casadi.OP_SIGN: lambda a: _constant(_sign(a)),
-    casadi.OP_FLOOR: _floor,
-    casadi.OP_CEIL: lambda a: -_floor(-a),
-    casadi.OP_FMIN: lambda a, b: a if _sign(a - b) <= 0 else b,
-    casadi.OP_FMAX: lambda a, b: a if _sign(a - b) >= 0 else b,
-    casadi.OP_LT: _truth(lambda sign: sign < 0),
-    casadi.OP_LE: _truth(lambda sign: sign <= 0),
-    casadi.OP_EQ: _truth(lambda sign: sign == 0),
-    casadi.OP_NE: _truth(lambda sign: sign != 0),
-    casadi.OP_NOT: lambda a: _constant(float(_sign(a) == 0)),
-    casadi.OP_AND: lambda a, b: _constant(float(_sign(a) != 0 and _sign(b) != 0)),
-    casadi.OP_OR: lambda a, b: _constant(float(_sign(a) != 0 or _sign(b) != 0)),
-    casadi.OP_IF_ELSE_ZERO: lambda a, b: b if _sign(a) else _constant(0.0),
+_RULES: dict[str, Callable[..., Any]] = {
+    "pow": _power,
+    "constpow": _power,
+    "fabs": lambda a: a if _sign(a) >= 0 else -a,
+    "sign": lambda a: _constant(_sign(a)),
+    "floor": _floor,
+    "ceil": lambda a: -_floor(-a),
+    "fmin": lambda a, b: a if _sign(a - b) <= 0 else b,
+    "fmax": lambda a, b: a if _sign(a - b) >= 0 else b,
+    "lt": _truth(lambda sign: sign < 0),
+    "le": _truth(lambda sign: sign <= 0),
+    "eq": _truth(lambda sign: sign == 0),
+    "ne": _truth(lambda sign: sign != 0),
+    "not": lambda a: _constant(float(_sign(a) == 0)),
+    "and": lambda a, b: _constant(float(_sign(a) != 0 and _sign(b) != 0)),
+    "or": lambda a, b: _constant(float(_sign(a) != 0 or _sign(b) != 0)),
+    "if_else_zero": lambda a, b: b if _sign(a) else _constant(0.0),
 }
 
 

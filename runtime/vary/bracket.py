@@ -20,7 +20,8 @@ import numpy as np
 from apc.eigen.balls import frame_balls, precision, reduced_balls, unprovable
 from apc.eigen.certify import MOST_PROVED, schur_cohn
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.rigid import RigidModes, relative_places
+from apc.eigen.relative import relative_places
+from apc.eigen.rigid import RigidModes
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, solve_spectrum
 from apc.vary.crossings import Root
 
@@ -146,7 +147,7 @@ def _inside(system: ClosedSystem, free: RigidModes) -> tuple[bool | None, int]:
     held, rest = (places.tolist() for places in relative_places(free.basis))
     for bits in PRECISIONS:
         with precision(bits):
-            reduced = reduced_balls(frame_balls(system), free.exact, held, rest)[0]
+            reduced = reduced_balls(frame_balls(system), free.exact, held, rest)
             square = flint.arb_mat(len(rest), len(rest), [flint.arb(entry) for entry in reduced.ravel()])
             inside = schur_cohn(square.charpoly().coeffs())
         if inside is not None:

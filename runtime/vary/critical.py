@@ -12,17 +12,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
 from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import counted, in_hertz, measured, with_unit, wrapped
+from apc.compiler.words import with_unit
 from apc.frame.names import Free, find, parameter_of, unit_of
 from apc.given import given
 from apc.network.nominal import left_out, refuse_channel_number
+from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 from apc.vary.crossings import CELL
@@ -34,7 +34,7 @@ _PLACE = Place("critical value")
 
 
 @dataclass(frozen=True, slots=True)
-class Critical:
+class Critical(Result):
     """Where a scene's verdict changes with one parameter, all else as it is.
 
     `crossings` are all that were found from `scanned[0]` to `scanned[1]`, in order. `value` is the one that
@@ -48,6 +48,8 @@ class Critical:
     (None where their peers differ) of a parameter that is set for all groups though they have not all the
     same.
     """
+
+    shown_by = "vary:critical"
 
     topology: str
     parameter: str
@@ -66,66 +68,6 @@ class Critical:
     verdict: str
     left_out: tuple[str, ...] = ()
     groups: tuple[tuple[str, float | None], ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the answer as plain data, ready for JSON."""
-        return {
-            "topology": self.topology,
-            "parameter": self.parameter,
-            "unit": self.unit,
-            "present": self.present,
-            "value": self.value,
-            "error": self.error,
-            "stable_side": self.stable_side,
-            "crossings": [one.to_dict() for one in self.crossings],
-            "scanned": list(self.scanned),
-            "cell": self.cell,
-            "whole": self.whole,
-            "known": self.known,
-            "looked": self.looked,
-            "enters": self.enters,
-            "verdict": self.verdict,
-            "left_out": list(self.left_out),
-            "groups": dict(self.groups),
-        }
-
-    def __str__(self) -> str:
-        """Return the answer in words."""
-        low, high = (with_unit(f"{one:.6g}", self.unit) for one in self.scanned)
-        present = with_unit(f"{self.present:.6g}", self.unit)
-        lines = [f"{self.topology}: {self.parameter} is {present}"]
-        if self.groups:
-            own = [
-                f"{'several values' if value is None else with_unit(f'{value:.6g}', self.unit)} at {group}"
-                for group, value in self.groups
-            ]
-            whom = "groups" if len(self.groups) > 1 else "its peers"
-            lines = [f"{self.topology}: {self.parameter}, one value for all {whom}"]
-            lines += wrapped(f"now {', '.join(own)}", "  ", "    ")
-        for note in self.left_out:
-            lines += wrapped(note, "  ", "    ")
-        lines.append("")
-        if self.value is None:
-            lines += wrapped(self.verdict, "  ", "  ")
-        if not self.enters:
-            return "\n".join(lines)
-        for one in self.crossings:
-            mark = "→" if one.value == self.value else " "
-            exact = f"{with_unit(f'{one.value:.15g}', self.unit)}, exact"
-            value = measured(one.value, one.error, self.unit) if one.error else exact
-            lines.append(f"{mark} {value}")
-            kind = "jump, " if one.kind == "jump" else ""
-            lines.append(f"    {kind}stable {one.stable_side} it, {in_hertz(one.frequency_hz)}, {one.proof}")
-        lines += ["", f"  scanned from {low} to {high}"]
-        if self.known:
-            lines.append(f"  two crossings nearer than {self.cell:.0e} of the value could hide")
-        else:
-            values = counted(self.looked, "value")
-            what = f"{values} were looked at; what the equations do between two of them is not known: "
-            lines += wrapped(f"{what}a narrow change of the verdict could hide there", "  ", "  ")
-        if not self.whole:
-            lines.append("  an eigenvalue keeps near to the boundary: more of them could")
-        return "\n".join(lines)
 
 
 def critical(

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.vary.eigenvalues import eigenvalues
+from apc.eigen.eigenpairs import eigenvalues
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

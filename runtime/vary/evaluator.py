@@ -20,11 +20,12 @@ from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
-from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+from apc.eigen.relative import relative_bounded, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
-from apc.frame.rows import free_rows
+from apc.frame.parameters import free_rows, scope_of
 from apc.vary.batch import BatchEvaluator, batch_evaluator
 
 Floats = NDArray[np.float64]
@@ -187,14 +188,9 @@ def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
 
 
 def _reduced(system: ClosedSystem, free: RigidModes) -> tuple[Floats, Floats]:
-    """Return the frame matrix of the coordinates relative to the rigid motions, see `spectrum`; its error."""
-    held, rest, weights = relative_coordinates(free.basis)
-    moved = system.matrix[np.ix_(held, rest)]
-    found = system.matrix[np.ix_(rest, rest)] - weights @ moved
+    """Return the frame matrix of the coordinates relative to the rigid motions; its error."""
     error = system.error + (JACOBIAN_ROUNDINGS * UNIT) * np.abs(system.matrix)
-    size = np.abs(weights)
-    off = error[np.ix_(rest, rest)] + size @ error[np.ix_(held, rest)]
-    return found, off + (8 * (len(held) + 2) * UNIT) * (size @ np.abs(moved))
+    return relative_bounded(system.matrix, error, relative_coordinates(free.basis))
 
 
 def _filled_up_pairs(pairs: Sequence[Sequence[tuple[Floats, Floats]]]) -> tuple[Floats, Floats]:
@@ -267,11 +263,11 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
     """
     listed = []
     for one in system.parameters:
-        if one.expression is not None or not is_named(one.name) or reaches_time(system, Free(one.name)):
+        if one.formula is not None or not is_named(one.name) or reaches_time(system, Free(one.name)):
             continue
         several = {
             group.name: any(column.name == one.name for column in group.columns)
-            or any(own.name == one.name and own.expression for own in group.values)
+            or any(own.name == one.name and own.formula for own in group.values)
             for group in system.groups
         }
         own = any(own.name == one.name for group in system.groups for own in group.values)
@@ -297,6 +293,4 @@ def reaches_time(system: CompiledSystem, free: Free) -> bool:
     """Say whether a period, phase or delay is, or depends on, this parameter."""
     if any(timing.name == free.name for timing in system.timings):
         return True
-    if not any(timing.expression for timing in system.timings):
-        return False
-    return generic(system, (free,)).timings != system.timings
+    return free.name in scope_of(system).needed([timing.name for timing in system.timings])

@@ -15,7 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates
+from apc.eigen.eigenpairs import eigenpairs
+from apc.eigen.relative import relative, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import angles_in_frame, whole_vectors
 
 # An eigenvalue of 1 leaves open how far the peers stand aside together; next to the boundary, where it is
@@ -57,22 +59,17 @@ def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenval
     """
     best: tuple[float, Marginal] | None = None
     for system, free in systems:
-        held, rest, weights = relative_coordinates(free.basis)
-        if not len(rest):
+        reduced = relative(system.matrix, relative_coordinates(free.basis))
+        if not len(reduced):
             continue
-        driven = system.matrix[np.ix_(held, rest)]
-        reduced = system.matrix[np.ix_(rest, rest)] - weights @ driven
-        values, vectors = np.linalg.eig(reduced)
-        place = int(np.argmin(np.abs(values - eigenvalue)))
-        off = float(np.abs(values[place] - eigenvalue))
+        pairs = eigenpairs(reduced)
+        place = int(np.argmin(np.abs(pairs.values - eigenvalue)))
+        off = float(np.abs(pairs.values[place] - eigenvalue))
         if best is not None and off >= best[0]:
             continue
-        value = complex(values[place])
-        found, covectors = np.linalg.eig(reduced.T)
-        covector = covectors[:, int(np.argmin(np.abs(found - value)))]
-        one = np.array([value])
-        vector, shares = whole_vectors(system, free, one, vectors[:, [place]], covector[None], aside=ASIDE)
-        turn = float(angles_in_frame(system, one, vector, shares)[0])
+        one = pairs.at(np.array([place]))
+        vector, shares = whole_vectors(system, free, one, aside=ASIDE)
+        turn = float(angles_in_frame(system, one.values, vector, shares)[0])
         best = off, Marginal(system.name, turn, system.frame_s)
     assert best is not None, "something moves where something neither grows nor dies out"
     return best[1]

@@ -1,7 +1,7 @@
 """How much each coupler's stiffness and damping, and each delay, may grow before the boundary.
 
 Takes: a `CompiledSystem`.
-Gives: `Margin`, `Margins`, `margins`, `margins_report`; `coupler_parameters`.
+Gives: `Margin`, `Margins`, `margins`; `coupler_parameters`.
 Guarantees: a margin is the next crossing above the present value, with its error; none is said together with
 how far was looked.
 Does not: look below the present value (see `critical`), or vary two at once (see `box`).
@@ -14,16 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import in_hertz, known_digits, wrapped
 from apc.eigen.spectrum import finite
 from apc.frame.names import Free, named_times, parameter_of
+from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator
@@ -75,25 +74,15 @@ class Margin:
     scanned: float
     note: str = ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the margin as plain data, ready for JSON."""
-        return {name: getattr(self, name) for name in self.__slots__}
-
 
 @dataclass(frozen=True, slots=True)
-class Margins:
+class Margins(Result):
     """The margins that were found; `note` says why there are none."""
+
+    shown_by = "vary:margins"
 
     rows: tuple[Margin, ...]
     note: str
-
-    def __str__(self) -> str:
-        """Return the table of the margins."""
-        return margins_report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the margins as plain data, ready for JSON."""
-        return {"margins": [one.to_dict() for one in self.rows], "note": self.note}
 
 
 def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Margins:
@@ -135,7 +124,7 @@ def _delays(system: CompiledSystem) -> list[Free]:
     waited = [hold.delay for kind in system.kinds for hold in kind.holds]
     for link in system.links:
         waited += [link.delay, *(pair.delay for pair in link.delays)]
-    free = {timing.name for timing in named_times(system) if timing.expression is None}
+    free = {timing.name for timing in named_times(system) if timing.formula is None}
     return [Free(name) for name in dict.fromkeys(waited) if name in free]
 
 
@@ -247,29 +236,3 @@ def _margin(name: str, unit: str, present: float, crossing: Crossing | None, sca
         crossing.kind,
         scanned,
     )
-
-
-def margins_report(found: Margins) -> str:
-    """Return the table of the margins, of at most 80 columns."""
-    if not found.rows:
-        text = f"margins {found.note or 'none: there is nothing to vary'}"
-        return "\n".join(wrapped(text, "  ", "    "))
-    width = max(len(one.parameter) for one in found.rows)
-    lines = [f"  {'may grow':<{width}}  from           to               times  at"]
-    for one in found.rows:
-        name, unit = f"  {one.parameter:<{width}}  ", one.unit
-        start = f"{one.present:.5g} {unit}"
-        if one.note:
-            lines.append(f"{name}{start:<14} not looked for: {one.note}")
-            continue
-        if one.value is None:
-            lines.append(f"{name}{start:<14} no limit up to {one.scanned:.5g} {unit}")
-            continue
-        end = f"{known_digits(one.value, one.error or 0.0, 7)} {unit}"
-        times = f"{one.factor:.4g}" if one.factor is not None else "–"
-        jump = ", jump" if one.kind == "jump" else ""
-        at = "–" if one.frequency_hz is None else in_hertz(one.frequency_hz)
-        lines.append(f"{name}{start:<14} {end:<16} {times:>5}  {at}{jump}")
-    if found.note:
-        lines += wrapped(found.note, "  ", "    ")
-    return "\n".join(lines)

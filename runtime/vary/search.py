@@ -15,7 +15,6 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +24,16 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
 from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
+from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
 from apc.eigen.rigid import RigidModes, find_rigid_modes
-from apc.eigen.spectrum import DRIFTS, finite, solve_spectrum
+from apc.eigen.spectrum import DRIFTS, solve_spectrum
 from apc.frame.names import Free, parameter_of
 from apc.vary.batch import BatchEvaluator
 from apc.vary.bends import bends
 from apc.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.vary.crossings import Courses, Root, Scan, scan
 from apc.vary.delays import Piece, borders, delay_now, delay_pieces, system_with_delay
-from apc.vary.eigenvalues import eigenvalues
 from apc.vary.evaluator import PointEvaluator, evaluator
 from apc.vary.marginal import marginal_motion, with_rigid
 
@@ -83,17 +82,6 @@ class Crossing:
     frequency_hz: float
     kind: str
     proof: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the crossing as plain data, ready for JSON."""
-        return {
-            "value": self.value,
-            "error": self.error,
-            "stable_side": self.stable_side,
-            "frequency_hz": finite(self.frequency_hz),
-            "kind": self.kind,
-            "proof": self.proof,
-        }
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """What moves the spectral radius most: its derivative with respect to every parameter.
 
 Takes: a `CompiledSystem`.
-Gives: `Sensitivity`, `Sensitivities`, `sensitivities`, `sensitivity_report`.
+Gives: `Sensitivity`, `Sensitivities`, `sensitivities`.
 Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, with a bound on its
 error; each name can be set as it stands; where several eigenvalues share the radius, one row for each of them
 and no gradient that belongs to none.
@@ -13,28 +13,29 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.words import counted, with_unit, wrapped
+from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.rigid import find_rigid_modes, relative_coordinates
+from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
+from apc.eigen.relative import relative_bounded, relative_coordinates
+from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
+from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.batch import slope_errors as slope_errors_of
 from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters
-from apc.vary.wiring import NEAR_ONE, Wiring, relative_weights
+from apc.vary.wiring import NEAR_ONE, Wiring, relative_at
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -48,9 +49,6 @@ CLOSE = 1e-7
 
 # A cluster of vectors worse conditioned than this has no derivative worth the name.
 WORST = 1e8
-
-# Rows of the table.
-SHOWN = 6
 
 NO_MATRIX = "what moves it most: not looked for: the present values have no frame matrix of their own"
 
@@ -73,7 +71,7 @@ class Sensitivity:
 
 
 @dataclass(frozen=True, slots=True)
-class Sensitivities:
+class Sensitivities(Result):
     """All derivatives, those that move most first, and the eigenvalues they belong to.
 
     `active` are the eigenvalues that share the radius, each named by its system: more than one at a crossing,
@@ -81,36 +79,12 @@ class Sensitivities:
     there is none.
     """
 
+    shown_by = "vary:sensitivities"
+
     radius: float
     active: tuple[tuple[complex, str], ...]
     rows: tuple[Sensitivity, ...]
     note: str
-
-    def __str__(self) -> str:
-        """Return the table of what moves the radius most."""
-        return sensitivity_report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the derivatives as plain data, ready for JSON."""
-        return {
-            "spectral_radius": self.radius,
-            "active": [
-                {"eigenvalue": [value.real, value.imag], "system": name} for value, name in self.active
-            ],
-            "derivatives": [
-                {
-                    "parameter": row.parameter,
-                    "unit": row.unit,
-                    "value": row.value,
-                    "derivative": row.derivative,
-                    "relative": row.relative,
-                    "error": row.error,
-                    "mode": row.mode,
-                }
-                for row in self.rows
-            ],
-            "note": self.note,
-        }
 
 
 def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -> Sensitivities:
@@ -193,14 +167,14 @@ def _rigid_here(wiring: Wiring, system: ClosedSystem, matrix: Floats) -> Floats:
     at_one = int(np.sum(np.abs(values - 1) < NEAR_ONE))
     if at_one > free.directions.shape[1] - wiring.rigid.directions.shape[1]:
         free = find_rigid_modes(system)
-    more = free.basis.shape[1] - len(wiring.held)
+    more = free.basis.shape[1] - len(wiring.relative.held)
     if more <= 0:
         return np.zeros((len(matrix), 0))
-    weights, _ = relative_weights(wiring, system.matrix[None])
-    weights = weights if weights.ndim == 2 else weights[0]
+    at, _ = relative_at(wiring, system.matrix[None])
+    weights = at.weights if at.weights.ndim == 2 else at.weights[0]
     if not np.isfinite(weights).all():  # nor is the matrix: what follows the parameters has no one direction
         return np.zeros((len(matrix), 0))
-    relative = free.basis[wiring.rest] - weights @ free.basis[wiring.held]
+    relative = free.basis[at.rest] - weights @ free.basis[at.held]
     return np.linalg.svd(relative, full_matrices=False)[0][:, :more]
 
 
@@ -269,12 +243,6 @@ def _defective(one: _Cluster) -> str:
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
 
-NONE_TOLD = "what moves the radius most: no change of it can be told from rounding"
-
-# Digits of a change.
-DIGITS = 3
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cluster:
     """Eigenvalues (c,) that are one within rounding, of a system without its rigid motions V.
@@ -292,15 +260,14 @@ class _Cluster:
 
 def _clusters(moved: _Moved) -> list[_Cluster]:
     """Return the largest eigenvalues, of each pair one, those that are one within rounding together."""
-    held, rest, weights = relative_coordinates(moved.rigid)
-    below = moved.matrix[np.ix_(held, rest)]
-    matrix = moved.matrix[np.ix_(rest, rest)] - weights @ below
+    at = relative_coordinates(moved.rigid)
+    held, rest, weights = at.held, at.rest, at.weights
+    matrix, error = relative_bounded(moved.matrix, moved.error, at)
     if not len(matrix):
         return []
-    error = moved.error[np.ix_(rest, rest)] + np.abs(weights) @ moved.error[np.ix_(held, rest)]
-    size = error + (8 * len(matrix) * UNIT) * (np.abs(matrix) + np.abs(weights) @ np.abs(below))
-    values, right = (one.astype(np.complex128) for one in np.linalg.eig(matrix))
-    found, left = (one.astype(np.complex128) for one in np.linalg.eig(matrix.T))
+    size = error + (8 * len(matrix) * UNIT) * np.abs(matrix)
+    pairs = eigenpairs(matrix)
+    values = pairs.values
     largest = float(np.abs(values).max())
     clusters = []
     seen = (values.imag < 0) | (np.abs(values) < largest - SHARED - 2 * CLOSE * max(largest, CLOSE))
@@ -308,29 +275,26 @@ def _clusters(moved: _Moved) -> list[_Cluster]:
         if seen[place]:
             continue
         near = np.flatnonzero(np.abs(values - values[place]) <= CLOSE * max(abs(values[place]), CLOSE))
-        if len(near) > 1 and _resolved(values[near], right[:, near], found, left, size):
+        if len(near) > 1 and _resolved(pairs.at(near), size):
             near = np.array([place])
         seen[near] = True
-        partners = np.argsort(np.abs(found - values[place]), kind="stable")[: len(near)]
-        rows, columns = left[:, partners].T, right[:, near]
+        rows, columns = pairs.left[near], pairs.right[:, near]
         product = rows @ columns
         least = float(np.linalg.svd(product, compute_uv=False)[-1])
         condition = (
             float(np.linalg.norm(rows, 2) * np.linalg.norm(columns, 2) / least) if least > 0 else np.inf
         )
-        rows = np.linalg.solve(product, rows) if condition < WORST else rows
+        rows = np.linalg.solve(product, rows).astype(np.complex128) if condition < WORST else rows
         whole, covector = np.zeros((2, len(moved.matrix), len(near)), np.complex128)
         whole[rest], covector[rest], covector[held] = columns, rows.T, -(rows @ weights).T
         clusters.append(_Cluster(moved, values[near], whole, covector.T, condition))
     return clusters
 
 
-def _resolved(values: Complexes, right: Complexes, found: Complexes, left: Complexes, size: Floats) -> bool:
+def _resolved(near: Eigenpairs, size: Floats) -> bool:
     """Say whether eigenvalues near to one another differ by more than the errors of all of them."""
-    rows = left[:, [int(np.argmin(np.abs(found - value))) for value in values]].T
-    scale = np.abs(np.einsum("ij,ji->i", rows, right))
-    off = np.einsum("ij,jk,ki->i", np.abs(rows), size, np.abs(right)) / scale
-    apart = np.abs(values[:, None] - values) + np.diag(np.full(len(values), np.inf))
+    off = near.errors(size)
+    apart = np.abs(near.values[:, None] - near.values) + np.diag(np.full(len(near.values), np.inf))
     return bool((apart > 4 * (off[:, None] + off)).all())
 
 
@@ -387,32 +351,3 @@ def _rates(one: _Cluster) -> Iterator[tuple[Floats | None, float]]:
 def _without(vectors: Complexes, rigid: Floats) -> Complexes:
     """Return what of vectors is no rigid motion (of orthonormal ones)."""
     return vectors - rigid @ (rigid.T @ vectors)
-
-
-def sensitivity_report(found: Sensitivities) -> str:
-    """Return the table "what moves it most", of at most 80 columns."""
-    # Eigenvalues that share the radius often change alike, and then one row tells it.
-    alike: dict[tuple[str, str], list[Sensitivity]] = {}
-    for row in found.rows:
-        if abs(row.derivative) > row.error and row.relative:  # else it can't be told from 0
-            change = _change(row.relative / 100, row.error * abs(row.value) / 100)
-            alike.setdefault((row.parameter, change), []).append(row)
-    shown = list(alike.items())[:SHOWN]
-    if not shown:
-        note = found.note if len(found.active) < 2 else ""
-        return "\n".join(wrapped(note or NONE_TOLD, "  ", "    "))
-    width = max(len(name) for (name, _), _ in shown)
-    lines = ["  what moves it most" + " " * max(width - 16, 2) + "value            per percent"]
-    for (name, change), rows in shown:
-        some = ", ".join(str(row.mode + 1) for row in rows) if len(rows) < len(found.active) else ""
-        value = with_unit(f"{rows[0].value:.6g}", rows[0].unit)
-        lines.append(f"  {name:<{width}}  {value:<16} {change}{f'  mode {some}' if some else ''}")
-    if found.note:
-        lines += wrapped(found.note, "  ", "    ")
-    return "\n".join(lines)
-
-
-def _change(value: float, error: float) -> str:
-    """Return a change to three digits, fewer where its error leaves them open."""
-    known = math.floor(math.log10(abs(value) / error)) if error else DIGITS
-    return f"{value:+.{min(max(known, 1), DIGITS) - 1}e}"

@@ -1,9 +1,9 @@
 """Closing the loop of one system for many points at once, and taking its rigid motions out.
 
 Takes: a `ClosedSystem` that stands for all points, and the one-frame maps of its sites at each.
-Gives: `Lifted`, `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_weights`,
+Gives: `Wiring`, `wire`, `told_by_constants`, `closed_loop`, `reduced`, `relative_at`,
 `are_rigid`, `site_key`.
-Guarantees: the matrices are those of `modes.close_loop` in relative coordinates, to rounding; where the
+Guarantees: the matrices are those of `closing.close_loop` in relative coordinates, to rounding; where the
 directions are not those of a rigid motion they are NaN.
 Does not: lift a site (see `batch`).
 """
@@ -11,17 +11,18 @@ Does not: lift a site (see `batch`).
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem
-from apc.eigen.loop import Packet, packet_places
+from apc.eigen.closing import ClosedSystem, Hearing, close, hearing_of
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.rigid import RigidModes, find_rigid_modes, relative_coordinates, relative_places
+from apc.eigen.relative import Relative, relative, relative_coordinates, relative_places
+from apc.eigen.rigid import RigidModes, find_rigid_modes
+from apc.frame.lift import FrameMap
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
@@ -36,33 +37,16 @@ NEAR_ONE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Lifted:
-    """The one-frame maps of one group of peers at k points: z⁺ = P z + Q r, s = S z + D r."""
-
-    p: Matrices  # (k, n_z, n_z)
-    q: Matrices  # (k, n_z, n_r)
-    s: Matrices  # (k, n_s, n_z)
-    d: Matrices  # (k, n_s, n_r)
-
-
-@dataclass(frozen=True, slots=True)
 class Wiring:
     """How a closed system's sites hear each other, and which of its coordinates are left.
 
-    `now` and `before` are what each site hears, over all packets sent this frame and over the state; `loop`
-    says that something is heard in the frame it is sent in. `rigid` are the rigid motions, `held` as many
-    places that are given up for them, `rest` all others, and `weights` W of the relative coordinates
-    x_rest − W x_held.
+    `rigid` are the rigid motions, `relative` the coordinates that are left.
     """
 
     system: ClosedSystem
-    now: tuple[Floats, ...]  # (n_r, n_s of all sites), one a site
-    before: tuple[Floats, ...]  # (n_r, n), one a site
-    loop: bool
+    hearing: tuple[Hearing, ...]  # one a site
     rigid: RigidModes
-    held: NDArray[np.intp]
-    rest: NDArray[np.intp]
-    weights: Floats  # (len(rest), len(held))
+    relative: Relative
     moving: bool  # the directions follow the free parameters, and W with them
 
 
@@ -73,43 +57,18 @@ def site_key(group: PeerGroup) -> tuple[int, int]:
 
 def wire(system: ClosedSystem) -> Wiring:
     """Take down who hears whom in a closed system, and its rigid motions."""
-    n = len(system.names)
-    place_of = packet_places(system.sites, system.packets, system.offsets)
-    row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
-    starts = np.cumsum([0] + [len(group.schedule.sent) for group in system.sites])
-    listed = []
-    for g, group in enumerate(system.sites):
-        now = np.zeros((len(group.schedule.heard), starts[-1]))
-        before = np.zeros((len(group.schedule.heard), n))
-        for line, one in enumerate(group.schedule.heard):
-            for h, weight in enumerate(system.coupling[one.way][g]):
-                if weight and one.lag:
-                    before[line, place_of[Packet(h, row_of[h][one.sent], one.lag)]] = float(weight)
-                elif weight:
-                    now[line, starts[h] + row_of[h][one.sent]] = float(weight)
-        listed.append((now, before))
+    hearing = tuple(hearing_of(system, system.layout, lambda weight, _: float(weight)))
     rigid = find_rigid_modes(system, with_drifts=False)
-    wiring = _without(system, listed, rigid)
+    wiring = _without(system, hearing, rigid)
     if rigid.names:
         values = np.linalg.eigvals(reduced(wiring, system.matrix[None], 1)[0])
         if np.any(np.abs(values - 1) < NEAR_ONE):
-            wiring = _without(system, listed, find_rigid_modes(system))
+            wiring = _without(system, hearing, find_rigid_modes(system))
     return wiring
 
 
-def _without(system: ClosedSystem, listed: Sequence[tuple[Floats, Floats]], rigid: RigidModes) -> Wiring:
-    held, rest, weights = relative_coordinates(rigid.basis)
-    return Wiring(
-        system=system,
-        now=tuple(now for now, _ in listed),
-        before=tuple(before for _, before in listed),
-        loop=any(now.any() for now, _ in listed),
-        rigid=rigid,
-        held=held,
-        rest=rest,
-        weights=weights,
-        moving=False,
-    )
+def _without(system: ClosedSystem, hearing: tuple[Hearing, ...], rigid: RigidModes) -> Wiring:
+    return Wiring(system, hearing, rigid, relative_coordinates(rigid.basis), moving=False)
 
 
 def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
@@ -133,72 +92,36 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
     constant = np.where(np.array(same)[:, None], basis, 0.0)
     if np.linalg.matrix_rank(constant) < basis.shape[1]:
         return replace(wiring, moving=True)
-    held, rest = relative_places(constant)
-    return replace(
-        wiring, held=held, rest=rest, weights=basis[rest] @ np.linalg.inv(basis[held]), moving=True
-    )
+    return replace(wiring, relative=relative_coordinates(basis, relative_places(constant)), moving=True)
 
 
-def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], Lifted]) -> Matrices:
-    """Close the loop of one system at all points: its matrices (k, n, n), see `modes.close_loop`."""
-    system = wiring.system
-    n = len(system.names)
-    own = [lifted[site_key(group)] for group in system.sites]
-    count = max(len(one.p) for one in own)
-    kind_of_number = np.result_type(*(one.p for one in own))
-    source = np.zeros((count, wiring.now[0].shape[1], n), dtype=kind_of_number)
-    row = 0
-    for one, before, offset in zip(own, wiring.before, system.offsets, strict=True):
-        rows = slice(row, row + one.s.shape[1])
-        source[:, rows, offset : offset + one.p.shape[1]] = one.s
-        source[:, rows] += one.d @ before
-        row = rows.stop
-    sent = source
-    if wiring.loop:
-        term = source
-        parts = [one.d @ now for one, now in zip(own, wiring.now, strict=True)]
-        back = np.concatenate([np.broadcast_to(part, (count, *part.shape[1:])) for part in parts], axis=1)
-        for _ in range(back.shape[1]):
-            term = back @ term
-            if not term.any():
-                break
-            sent = sent + term
-    matrix = np.zeros((count, n, n), dtype=kind_of_number)
-    for one, now, before, offset in zip(own, wiring.now, wiring.before, system.offsets, strict=True):
-        rows = slice(offset, offset + one.p.shape[1])
-        matrix[:, rows, rows] += one.p
-        matrix[:, rows] += one.q @ (now @ sent + before if wiring.loop else before)
-    place_of = packet_places(system.sites, system.packets, system.offsets)
-    starts = np.cumsum([0] + [one.s.shape[1] for one in own])
-    for packet, place in place_of.items():
-        if packet.lag == 1:
-            matrix[:, place] = sent[:, starts[packet.site] + packet.row]
-        else:
-            matrix[:, place, place_of[Packet(packet.site, packet.row, packet.lag - 1)]] = 1.0
-    return matrix
+def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
+    """Close the loop of one system at all points: its matrices (k, n, n), see `closing.close`."""
+    maps = [lifted[site_key(group)] for group in wiring.system.sites]
+    return close(maps, wiring.hearing, wiring.system.layout).matrix
 
 
 def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
-    """Take the rigid motions out: M_rr − W M_pr, NaN where the directions are not rigid."""
-    rest, held = wiring.rest, wiring.held
-    within = matrix[:, rest[:, None], rest]
-    if len(held):
-        weights, sound = relative_weights(wiring, matrix)
-        within = within - weights @ matrix[:, held[:, None], rest]
-        within[~sound] = np.nan
+    """Take the rigid motions out; NaN where the directions are not rigid."""
+    at, sound = relative_at(wiring, matrix)
+    within = relative(matrix, at)
+    within[~sound] = np.nan
     within[~np.isfinite(within).all(axis=(1, 2))] = np.nan
     return np.broadcast_to(within, (count, *within.shape[1:])).copy() if len(within) < count else within
 
 
-def relative_weights(wiring: Wiring, matrix: Matrices) -> tuple[Matrices, NDArray[np.bool_]]:
-    """Return W of the relative coordinates at each point, and whether it is of rigid motions.
+def relative_at(wiring: Wiring, matrix: Matrices) -> tuple[Relative, NDArray[np.bool_]]:
+    """Return the relative coordinates at each point, and whether they are relative to rigid motions.
 
     Directions that follow the parameters, as where two forces hold each other, solve M V = V with V_p = 1:
-    (1 − M_rr) W = M_rp, and M_pp + M_pr W = 1.
+    (1 − M_rr) W = M_rp, and M_pp + M_pr W = 1. How far W is off is not said then.
     """
-    rest, held = wiring.rest, wiring.held
+    at = wiring.relative
+    rest, held = at.rest, at.held
+    if not len(held):
+        return at, np.ones(len(matrix), dtype=np.bool_)
     if not wiring.moving:
-        return wiring.weights, are_rigid(wiring, matrix.real)
+        return at, are_rigid(wiring, matrix.real)
     unit = np.eye(len(rest))
     weights = np.full((len(matrix), len(rest), len(held)), np.nan, dtype=matrix.dtype)
     for k, one in enumerate(matrix):
@@ -208,16 +131,18 @@ def relative_weights(wiring: Wiring, matrix: Matrices) -> tuple[Matrices, NDArra
     own = matrix[:, held[:, None], held] + matrix[:, held[:, None], rest] @ weights
     size = 1 + np.abs(matrix[:, held[:, None], rest].real) @ np.abs(weights.real)
     still = np.abs(own.real - np.eye(len(held))) <= RIGID * size
-    return weights, np.asarray(still.all(axis=(1, 2)))
+    nothing = np.full(weights.shape, np.nan)
+    return Relative(held, rest, weights, nothing), np.asarray(still.all(axis=(1, 2)))
 
 
 def are_rigid(wiring: Wiring, matrix: Floats) -> NDArray[np.bool_]:
     """Say of each matrix (k, n, n) whether the rigid motions V move by themselves, M V = V C, C_ii = 1."""
     basis = wiring.rigid.basis
-    inverse = np.linalg.inv(basis[wiring.held])
+    held = wiring.relative.held
+    inverse = np.linalg.inv(basis[held])
     moved, size = matrix @ basis, np.abs(matrix) @ np.abs(basis)
-    own = inverse @ moved[:, wiring.held]
-    own_size = np.abs(inverse) @ size[:, wiring.held]
+    own = inverse @ moved[:, held]
+    own_size = np.abs(inverse) @ size[:, held]
     span = np.abs(moved - basis @ own) <= RIGID * (1 + size + np.abs(basis) @ own_size)
     still = np.abs(np.diagonal(own, axis1=1, axis2=2) - 1) <= RIGID * (
         1 + np.diagonal(own_size, axis1=1, axis2=2)

@@ -22,7 +22,7 @@ from pathlib import Path
 import flint
 
 from apc.analysis.analysis import Analysis, analyze, prepare
-from apc.answers.answer import sensitivities_of
+from apc.answer import sensitivities_of
 from apc.benchmark.reference import RIGID, classes_of, eigenvalues, frame_matrices
 from apc.benchmark.timing import timed
 from apc.compiler.compiled import CompiledSystem

@@ -150,7 +150,7 @@ def draw(results: dict[str, dict[Method, Point]], path: Path) -> None:
     """Draw a panel a scene."""
     from matplotlib.figure import Figure
 
-    from apc.simulation.figures import write_figure
+    from apc.present.pictures import write_figure
 
     figure = Figure(figsize=(11, 4), layout="constrained")
     axes = figure.subplots(1, len(results), sharey=True)

@@ -61,7 +61,7 @@ peers:
 masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}, cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}}
 couplers:
   contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic, delay: 1 ms}
-  coordination: {type: SaturatedMesh, object: cube, stiffness: kt, limit: 1 N, clock: haptic, link: lan}
+  coordination: {type: SaturatedMesh, object: cube, stiffness: "max(kt, 0.3*kt)/(peers - 1)", limit: 1 N, clock: haptic, link: lan}
 links: {lan: {graph: {edges: [[1, 2], [2, 3], [3, 1]]}, clock: network, delay: 8 ms, loss: 10 %, jitter: 1 ms}}
 hands: {hand: {type: ConstantForce, flange: device, force: 1 N, at: [one]}}
 experiment: {duration: 20 ms}

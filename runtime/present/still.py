@@ -26,7 +26,7 @@ from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.optional import need
-from apc.simulation.figures import check_format, write_figure
+from apc.present.pictures import check_format, write_figure
 from apc.simulation.signals import sent_states
 
 Floats = NDArray[np.float64]

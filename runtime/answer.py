@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.analysis.contact_modes import ContactModes, contact_modes
 from apc.analysis.conventions import Conventions, conventions
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.result import Result
 from apc.vary.margins import Margins, margins
 from apc.vary.sensitivity import Sensitivities, sensitivities
 
@@ -31,15 +32,21 @@ SAME_RADIUS = 1e-11
 # More peers than this, that differ or stand on a graph, are more than can be differentiated in passing.
 FEW_PEERS = 100
 
+# What is varied is composed hundreds of times, tick by tick: with more ticks in a frame for over ten seconds.
+# A number's effect on the exponentials has as many entries as these, a few hundred megabytes for all numbers.
+MOST_TICKS, MOST_ENTRIES = 500, 2_000_000
+
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(Result):
     """An analysis with what moves its spectral radius most, its margins, and its modes of contact.
 
     `conventions` holds the analyses under every order of coincident events, or under those that could be had
     in passing; `detailed` says that they were asked for. `box` is the proof over a box of parameters, where
     one was asked for.
     """
+
+    shown_by = "analysis:answer"
 
     analysis: Analysis
     sensitivities: Sensitivities
@@ -48,27 +55,6 @@ class Answer:
     conventions: Conventions
     detailed: bool
     box: BoxProof | None
-
-    def __str__(self) -> str:
-        """Return the answer as text of at most 80 columns."""
-        from apc.answers.report import answer_report  # it needs this module
-
-        return answer_report(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the answer as plain data, ready for JSON: the analysis with more keys."""
-        found = self.analysis.to_dict() | {
-            "sensitivities": self.sensitivities.to_dict(),
-            "margins": [one.to_dict() for one in self.margins.rows],
-            "margins_note": self.margins.note,
-            "contact_modes": self.contact_modes.to_dict() if self.contact_modes else None,
-            "warnings": [self.conventions.warning] if self.conventions.warning else [],
-        }
-        if self.detailed:
-            found["conventions"] = self.conventions.to_dict()
-        if self.box is not None:
-            found["box"] = self.box.to_dict()
-        return found
 
 
 def judge(
@@ -159,9 +145,8 @@ def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis
     found
         Its analysis.
     """
-    if _is_large(system, found):
-        note = "what moves it most: not looked for in so large a population"
-        return Sensitivities(found.spectral_radius, (), (), note)
+    if why := _too_large(system, prepared, found):
+        return Sensitivities(found.spectral_radius, (), (), f"what moves it most: {why}")
     try:
         told = sensitivities(system, prepared=prepared)
     except ApcError as error:
@@ -175,17 +160,26 @@ def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis
     return told
 
 
-def _is_large(system: CompiledSystem, found: Analysis) -> bool:
-    """Say whether the population is more than few small matrices, which are what is differentiated."""
+def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> str:
+    """Return why nothing is varied, "" unless the scene is more than few small matrices and short frames."""
     complete = all(link.graph.shape == "complete" for link in system.links)
     apart = found.method in ("determinant", "krylov") or not complete
-    return apart and system.peers > FEW_PEERS
+    if apart and system.peers > FEW_PEERS:
+        return "not looked for in so large a population"
+    ticks = max(sum(schedule.ticks) for schedule in prepared.schedules)
+    if ticks > MOST_TICKS:
+        return f"not looked for: {ticks:,} ticks in a frame take too long"
+    for kind in system.kinds:
+        if len(kind.parameters) * len(kind.states) ** 2 > MOST_ENTRIES:
+            what = f"{len(kind.parameters):,} numbers of {len(kind.states):,} states take too long"
+            return f"not looked for: {what}"
+    return ""
 
 
 def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Margins:
     """Return the margins, or only why they couldn't be had."""
-    if _is_large(system, found):
-        return Margins((), "not looked for in so large a population")
+    if why := _too_large(system, prepared, found):
+        return Margins((), why)
     try:
         return margins(system, prepared=prepared)
     except ApcError as error:

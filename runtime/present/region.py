@@ -1,8 +1,10 @@
-"""Pictures of stable regions, as papers print them.
+"""Stable regions as text, plain data, tables, pictures as papers print them, and files.
 
-Takes: a `Region`, or `Panels` of them. Gives: `draw_region`, `draw_panels`.
-Guarantees: curves can be told apart without colour; the stable side is hatched and named; the legend stands
-below the axes, over nothing.
+Takes: a `Region`, or `Panels` of them, and a path.
+Gives: their texts, documents, tables and pictures; `check_region_path`, `write_panels`; `stable_outlines`.
+Guarantees: a text says what was not looked for. In a picture curves can be told apart without colour; the
+stable side is hatched and named; the legend stands below the axes, over nothing. A file that can't be written
+is refused before anything is computed, as far as that can be known, and written whole or not at all.
 Does not: compute, or need a display.
 
 matplotlib is loaded when something is drawn and not before.
@@ -11,19 +13,38 @@ matplotlib is loaded when something is drawn and not before.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from math import isnan
+from pathlib import Path
+from string import ascii_lowercase
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.ranges import Range
+from apc.compiler.files import check_target, write_text
+from apc.compiler.words import known_digits, measured, with_unit
+from apc.distribution import program_version
 from apc.optional import need
+from apc.present.analysis import range_document
+from apc.present.forms import document, json_text, note
+from apc.present.pictures import FORMATS, write_figure
 from apc.regions.curves import between
-from apc.regions.panels import Panel, Panels, panel_letter
-from apc.regions.region import Region, side_of_curves
+from apc.regions.region import side_of_curves
+from apc.suffixes import check_suffix
+from apc.tables import SUFFIXES, Column, Row, check_table_path, write_table
+
+if TYPE_CHECKING:
+    import pandas
+
+    from apc.analysis.ranges import Range
+    from apc.regions.panels import Panel, Panels
+    from apc.regions.region import Curve, Region
 
 Floats = NDArray[np.float64]
+
+# Curves listed; a boundary in more pieces is told by their number.
+MOST_CURVES = 12
 
 # Of each region: its line, its colour (distinct in print and for colour-blind eyes: Okabe and Ito, 2008), and
 # how its stable side is hatched.
@@ -41,7 +62,141 @@ SEARCHED = 48  # points along each side among which the widest place for a word 
 NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
-def draw_region(found: Region, ax: Any = None) -> Any:
+def region_text(found: Region) -> str:
+    """Return what `apc region` prints of one region."""
+    width = max(len(found.x.label), len(found.y.label))
+    lines = [f"{found.topology}: {_words(found)}"]
+    for text in found.left_out:
+        lines += note(text)
+    lines.append("")
+    for letter, axis in (("x", found.x), ("y", found.y)):
+        span = with_unit(f"{float(axis.low):.6g} to {float(axis.high):.6g}", axis.unit)
+        lines.append(f"  {letter}  {axis.label:<{width}}  {span}")
+    whole = float(found.rectangle.width.prod())
+    share = 100 * found.stable_area / whole
+    off = found.stable_area_error
+    area = measured(found.stable_area, off) if off else f"{found.stable_area:.9g}"
+    lines += ["", f"  stable area  {area} in SI, {share:.4g} % of the rectangle"]
+    if found.curves:
+        lines += ["", "  boundary     frequency [Hz]   from (x, y)         to (x, y)           error"]
+        lines += [_row(curve) for curve in found.curves[:MOST_CURVES]]
+        left = len(found.curves) - MOST_CURVES
+        if left > 0:
+            lines.append(f"  and {left} more (--json lists all)")
+    cell = " × ".join(
+        with_unit(f"{size:.4g}", axis.unit) for size, axis in zip(found.cell, (found.x, found.y), strict=True)
+    )
+    lines += ["", f"  Looked at in cells of {cell}, and finer where the"]
+    lines.append("  eigenvalues hint at more; an island inside one cell could be missed.")
+    if found.stepped:
+        lines.append("  Along these times the boundary has steps: it is right to a cell only.")
+    return "\n".join(lines)
+
+
+def _words(found: Region) -> str:
+    if found.curves:
+        closed = sum(curve.closed for curve in found.curves)
+        pieces = "one piece" if len(found.curves) == 1 else f"{len(found.curves)} pieces"
+        return f"the stable region has a boundary in {pieces}" + (f", {closed} closed" if closed else "")
+    return "stable in the whole rectangle" if found.corner else "stable nowhere in the rectangle"
+
+
+def _row(curve: Curve) -> str:
+    low, high = curve.frequency_hz
+    span = (
+        "–" if isnan(low) else f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
+    )
+    start = _point(curve, 0)
+    end = "closed" if curve.closed else _point(curve, -1)
+    return f"  {curve.mode:<11.11}  {span:<15}  {start:<18}  {end:<18}  {curve.error:.0e}"
+
+
+def _point(curve: Curve, place: int) -> str:
+    """Return a point of a curve, whose error is relative to each coordinate."""
+    return "({}, {})".format(*(known_digits(one, curve.error * abs(one), 6) for one in curve.points[place]))
+
+
+def region_document(found: Region) -> dict[str, Any]:
+    """Return what `apc region --json` prints of one region."""
+    return {
+        "topology": found.topology,
+        "x": range_document(found.x),
+        "y": range_document(found.y),
+        "boundary": [_curve_document(curve) for curve in found.curves],
+        "stable_area": found.stable_area,
+        "stable_area_error": found.stable_area_error,
+        "area_unit": _product(found.x.unit, found.y.unit),
+        "cell": list(found.cell),
+        "finest_cell": found.finest,
+        "left_out": list(found.left_out),
+        "origin": dict(found.system.origin.texts),
+    }
+
+
+def _curve_document(curve: Curve) -> dict[str, Any]:
+    return {
+        "points": curve.points.tolist(),
+        "tangents": curve.tangents.tolist(),
+        "error": curve.error,
+        "mode": curve.mode,
+        "frequency_hz": document(curve.frequency_hz),
+        "closed": curve.closed,
+        "smooth": curve.smooth,
+        "stable_side": "left",
+    }
+
+
+def _product(x: str, y: str) -> str:
+    """Return the unit of an area."""
+    units = [unit for unit in (x, y) if unit != "1"]
+    return "*".join(f"({unit})" if "/" in unit or "*" in unit else unit for unit in units) or "1"
+
+
+def region_table(found: Region) -> pandas.DataFrame:
+    """Return the points of all curves of a region."""
+    return need("pandas", "data").DataFrame(
+        list(_rows(found)), columns=[one.heading for one in _columns(found)]
+    )
+
+
+def panels_text(found: Panels) -> str:
+    """Return what `apc region` prints of several regions."""
+    lines: list[str] = []
+    for place, panel in enumerate(found.panels):
+        if panel.title:
+            lines += [f"({panel_letter(place)}) {panel.title}", ""]
+        for region, gain in zip(panel.regions, panel.gains, strict=True):
+            lines.append(region_text(region))
+            if gain != 1:
+                lines.append(f"  Compared at equal effective gain: y counts {gain} times, once an other.")
+            lines.append("")
+    return "\n".join(lines).rstrip("\n")
+
+
+def panel_letter(place: int) -> str:
+    """Return the letter of a panel, "a" for the first; after "z" they begin anew."""
+    return ascii_lowercase[place % len(ascii_lowercase)]
+
+
+def panels_document(found: Panels) -> dict[str, Any]:
+    """Return what `apc region --json` prints: the region itself if it is alone, else the panels."""
+    if found.alone is not None:
+        return found.alone.to_dict()
+    return {"normalized": found.normalized, "panels": [_panel_document(one) for one in found.panels]}
+
+
+def _panel_document(panel: Panel) -> dict[str, Any]:
+    return {
+        "panel": panel.title,
+        "regions": [
+            {**one.to_dict(), "y_multiplied_by": gain}
+            for one, gain in zip(panel.regions, panel.gains, strict=True)
+        ],
+        "overlays": [{"label": label, "points": points.tolist()} for label, points in panel.overlays],
+    }
+
+
+def region_picture(found: Region, ax: Any = None) -> Any:
     """Draw one region into a matplotlib Axes, or into a figure of its own; return the Axes.
 
     Raises
@@ -59,7 +214,7 @@ def draw_region(found: Region, ax: Any = None) -> Any:
     return ax
 
 
-def draw_panels(found: Panels) -> Any:
+def panels_picture(found: Panels) -> Any:
     """Draw all panels side by side; return the matplotlib Figure.
 
     Raises
@@ -269,3 +424,59 @@ def _name_stable_side(ax: Any, regions: Sequence[Region], gains: Sequence[int]) 
         x, y = first.values(points[np.argmax(room)]) * [1.0, gains[0]]
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9}
         ax.text(x, y, "stable", ha="center", va="center", fontsize=9, bbox=box)
+
+
+def check_region_path(path: Path) -> str:
+    """Refuse a file that can't be written here, or of no known format; return the suffix of its format.
+
+    Raises
+    ------
+    ApcError
+        E878 the suffix, E601 the place, E887 or E875 a library that is missing.
+    """
+    suffix = check_suffix(path, (*FORMATS, *SUFFIXES, ".json"), "--out")
+    check_target(path)
+    if suffix in SUFFIXES:
+        check_table_path(path, "--out")
+    elif suffix in FORMATS:
+        need("matplotlib.figure", "plot")
+    return suffix
+
+
+def write_panels(path: Path, found: Panels) -> None:
+    """Write regions to a file, its format chosen by the suffix. Raises ApcError E601 if it can't."""
+    suffix = check_region_path(path)
+    if suffix in FORMATS:
+        write_figure(found.plot(), path)
+    elif suffix in SUFFIXES:
+        first = found.panels[0].regions[0]
+        rows = (row for panel in found.panels for one in panel.regions for row in _rows(one, panel.title))
+        made = {
+            "axes": [range_document(first.x), range_document(first.y)],
+            "apc": program_version(),
+            "left_out": {one.topology: list(one.left_out) for panel in found.panels for one in panel.regions},
+            "origin": _origins(found),
+        }
+        write_table(path, _columns(first), rows, made)
+    else:
+        write_text(path, json_text(found.to_dict()))
+
+
+def _origins(found: Panels) -> dict[str, Any]:
+    return {one.topology: dict(one.system.origin.texts) for panel in found.panels for one in panel.regions}
+
+
+def _columns(found: Region) -> list[Column]:
+    """Return the columns of a table of boundary points."""
+    x, y = (Column(one.label, "" if one.unit == "1" else one.unit) for one in (found.x, found.y))
+    words = (Column("panel", kind="text"), Column("topology", kind="text"))
+    curve = (Column("curve", kind="count"), Column("mode", kind="text"))
+    return [*words, *curve, x, y, Column("tangent x"), Column("tangent y"), Column("error")]
+
+
+def _rows(found: Region, panel: str = "") -> Iterator[Row]:
+    """Yield a row a point of every curve, in the order of `_columns`."""
+    for number, curve in enumerate(found.curves):
+        mode = curve.mode
+        for point, tangent in zip(curve.points.tolist(), curve.tangents.tolist(), strict=True):
+            yield (panel, found.topology, number, mode, *point, *tangent, curve.error)

@@ -1,1 +1,0 @@
-"""Everything `apc analyze` answers, put together and printed."""

@@ -1,0 +1,109 @@
+"""Rigid motions taken out of a matrix: the map of relative coordinates, in floats, at many points, in balls.
+
+Takes: rigid motions V, and matrices M whose invariant space they span.
+Gives: `Relative`, `relative_coordinates`; `relative`, `relative_bounded`; `relative_places`,
+`independent_places`.
+Guarantees: the bounds hold for all matrices within their errors, V itself rounded once.
+Does not: find the motions (see `rigid`).
+
+With V = [V_p; V_r], p as many places as there are motions, and W = V_r V_p⁻¹, the relative coordinates
+x_r − W x_p move by themselves, by M_rr − W M_pr: that map has all other eigenvalues.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
+from apc.frame.discretize import UNIT
+
+Floats = NDArray[np.float64]
+Places = NDArray[np.intp]
+Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
+
+
+@dataclass(frozen=True, slots=True)
+class Relative:
+    """The coordinates x_r − W x_p: `held` are the places p, `rest` all others, `weights` is W.
+
+    `doubt` bounds what W is off by, entry by entry. Where W follows a parameter, both are those of many
+    points (k, …).
+    """
+
+    held: Places
+    rest: Places
+    weights: Matrix  # (len(rest), len(held))
+    doubt: Floats
+
+
+def relative(
+    matrix: Matrix, at: Relative, *, multiply: Callable[[Matrix, Matrix], Matrix] = np.matmul
+) -> Matrix:
+    """Return M_rr − W M_pr of matrices (…, n, n) over any kind of number that `multiply` multiplies."""
+    within = matrix[..., at.rest[:, None], at.rest]
+    return within - multiply(at.weights, matrix[..., at.held[:, None], at.rest]) if len(at.held) else within
+
+
+def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matrix, Floats]:
+    """Return M_rr − W M_pr of matrices (…, n, n) known up to an error, and a bound on what that is off by."""
+    found = relative(matrix, at)
+    within = error[..., at.rest[:, None], at.rest]
+    count = len(at.held)
+    if not count:
+        return found, within
+    below, size = error[..., at.held[:, None], at.rest], np.abs(at.weights)
+    large = np.abs(matrix[..., at.held[:, None], at.rest]) + below
+    off = within + at.doubt @ large + size @ below
+    return found, off + (PRODUCT_ROUNDINGS * (count + 2) * UNIT) * (size @ large + np.abs(found))
+
+
+def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
+    """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
+    left = np.array(rows)
+    places: list[int] = []
+    for _ in range(len(rows)):
+        scaled = np.abs(left) / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        line, place = divmod(int(np.argmax(scaled)), rows.shape[1])
+        places.append(place)
+        if left[line, place] != 0:
+            pivot = left[line] / left[line, place]
+            left = left - left[:, [place]] * pivot
+            left[line] = 0.0
+    return np.array(sorted(places), dtype=np.intp)
+
+
+def relative_places(basis: Floats) -> tuple[Places, Places]:
+    """Return the places p whose coordinates rigid motions V (n, d) take away, d of them, and all others r."""
+    held = independent_places(basis.T)
+    return held, np.delete(np.arange(len(basis)), held)  # np.setdiff1d imports numpy.ma, 10 ms
+
+
+def relative_coordinates(basis: Floats, places: tuple[Places, Places] | None = None) -> Relative:
+    """Return the coordinates relative to rigid motions V (n, d), each entry rounded once.
+
+    Notes
+    -----
+    The places p and r are those of `relative_places` unless given.
+    W − W* = (V_r − W V_p + a rounding of either) V_p*⁻¹ up to sign.
+    """
+    held, rest = relative_places(basis) if places is None else places
+    count = len(held)
+    if not count:
+        nothing = np.zeros((len(rest), 0))
+        return Relative(held, rest, nothing, nothing)
+    above, below = basis[held], basis[rest]
+    inverse = np.linalg.inv(above)
+    weights = below @ inverse
+    charge = PRODUCT_ROUNDINGS * (count + 2) * UNIT
+    left = np.abs(below - weights @ above) + charge * (np.abs(below) + np.abs(weights) @ np.abs(above))
+    size = np.abs(inverse)
+    wrong = np.abs(np.eye(count) - inverse @ above) + 2 * charge * (size @ np.abs(above))
+    assert float(wrong.sum(axis=1).max()) < 0.5, "rigid motions too alike to tell apart"
+    # V_p*⁻¹ = (I − F)⁻¹ Y, and |(I − F)⁻¹| ≤ I + |F| + …, at most doubling the largest.
+    size = size + 2 * wrong.sum(axis=1, keepdims=True) * size.max(axis=0, initial=0.0)
+    return Relative(held, rest, weights, left @ size)

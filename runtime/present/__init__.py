@@ -1,0 +1,1 @@
+"""What a person and a program see of results: text, plain data, tables and pictures."""

@@ -1,0 +1,440 @@
+"""Analyses as text and plain data: the verdict, what stands beside it, what a compiled scene needs.
+
+Takes: results of `analysis`, and the `Answer` they make together. Gives: their texts and documents;
+`compile_text`, `timings_text`.
+Guarantees: every number that decides something stands with its error.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from apc.compiler.words import WIDTH, counted, in_hertz, measured, with_unit, wrapped
+from apc.present.forms import document, note
+
+if TYPE_CHECKING:
+    from apc.analysis.analysis import Analysis
+    from apc.analysis.box_proof import BoxProof
+    from apc.analysis.contact_modes import ContactMode, ContactModes
+    from apc.analysis.conventions import Conventions, Outcome
+    from apc.analysis.needs import Needs, SiteNeeds
+    from apc.analysis.paper import NamedMatrix, PaperRoute
+    from apc.analysis.ranges import Range
+    from apc.answer import Answer
+    from apc.compiler.compiled import CompiledSystem
+    from apc.eigen.spectrum import Mode
+
+MOST_ROWS = 16
+DECIMALS = 6  # of a magnitude
+MOST_UNFELT = 4  # names of what is left out beside the translations
+LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
+LARGE = 1e4  # a larger magnitude needs another notation to fit its column
+MOVES_WIDTH = 30  # columns at most of what a mode moves, at least of what it is cut to
+LEAST_WIDTH = 12
+LEAST_SHARE = 0.005  # shows as zero
+HEADINGS = ("magnitude", "shape", "times", "frequency", "damping", "moves most")
+
+LINEARIZED = ", linearized at its start"
+
+MOST_NAMED = 30  # columns of a contact mode's name; a longer one has a line of its own
+SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
+
+_NOUNS = {"determinant": "determinant", "krylov": "sparse system"}
+
+_WORDS = {
+    "stable": "Every motion dies out.",
+    "stable up to a common translation": (
+        "Nothing ties the peers to the ground; moved together they stay where they are.\n"
+        "Every other motion dies out."
+    ),
+    "drifts": "Nothing slows a common motion down. Every other motion dies out.",
+    "unstable": "Some motion grows until the devices shake or hit their limits.",
+}
+
+
+def compile_text(system: CompiledSystem, needs: Needs, target: Path, difference: float) -> str:
+    """Return what `apc compile` prints.
+
+    Parameters
+    ----------
+    system, needs
+        The compiled scene and what it keeps.
+    target
+        The file written.
+    difference
+        The largest relative difference the self-check found.
+    """
+    ticks = ", ".join(
+        f"{name} ticks {count} times" if count != 1 else f"{name} once" for name, count in needs.ticks
+    )
+    lines = [
+        f"{system.name} → {target}",
+        *note(str(replace(needs, pairs=()))),  # they follow, with their reason
+        f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
+        *note(f"self-check: {_self_check(system, difference)}"),
+    ]
+    for text in (*_pairwise(system), *(f"left out: {name}, as {reason}" for name, reason in system.dropped)):
+        lines += note(text)
+    return "\n".join(lines)
+
+
+def _self_check(system: CompiledSystem, difference: float) -> str:
+    from apc.analysis.selfcheck import skipped  # an analysis checks nothing
+
+    left_out = skipped(system)
+    compared = f"one frame event by event and lifted differ by {difference:.0e}"
+    if not left_out:
+        return compared
+    if len(left_out) == len(system.kinds):
+        return "no frame is compared, as no peer here is linear"
+    return f"{compared} (not {' and '.join(left_out)}, which is not linear)"
+
+
+def _pairwise(system: CompiledSystem) -> Iterator[str]:
+    """Yield what is evaluated once a pair of peers, and why it can't be once a peer."""
+    found = {
+        receive.name: receive
+        for kind in system.kinds
+        for clock in kind.clocks
+        for receive in clock.receives
+        if receive.edge is not None or receive.operator in ("max", "min")
+    }
+    for name, receive in found.items():
+        why = (
+            f"what it runs over is not linear in what the others send over {receive.link}"
+            if receive.edge is not None and receive.operator in ("sum", "mean")
+            else f"a {receive.operator} can't be taken apart into one number a peer"
+        )
+        yield f"costs N²: {name} is evaluated once a pair of peers, as {why}"
+
+
+def timings_text(taken: Sequence[tuple[str, float]]) -> str:
+    """Return what `apc compile --timings` prints: stages and their seconds."""
+    total = sum(seconds for _, seconds in taken)
+    rows = [*taken, ("all", total)]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"  {name:<{width}}  {seconds * 1e3:8.1f} ms" for name, seconds in rows)
+
+
+def analysis_text(result: Analysis) -> str:
+    """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
+    lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"]
+    for text in result.left_out:
+        lines += note(text)
+    lines.append("")
+    words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
+    if result.linearized:
+        words = words.replace("Nothing ties", "To first order, nothing ties", 1)
+    if not result.states_per_peer:
+        words = "Nothing here is free to move."
+    lines += [f"  {line}" for line in words.splitlines()]
+    removed = ""
+    if result.translations:
+        removed = f", {counted(result.translations, 'translation')} left out"
+    lines += [
+        "",
+        f"  spectral radius  {measured(result.spectral_radius, result.spectral_radius_error)}"
+        f" per frame of {_time(result.frame_s)}",
+        f"  peers            {result.peers}, {result.states_per_peer} states each",
+        f"  method           {result.method}{removed}",
+    ]
+    if result.proof:
+        lines.append(f"  proof            {result.proof}")
+    if result.unfelt:
+        names = f"{', '.join(result.unfelt[:MOST_UNFELT])}{', …' if len(result.unfelt) > MOST_UNFELT else ''}"
+        told = f"{names}, which nothing that moves reads at these values"
+        lines += wrapped(told, "  left out         ", " " * 19)
+    lines += ["", _mode_table(result.modes)]
+    for text in result.notes:
+        lines += note(text)
+    return "\n".join(lines)
+
+
+def analysis_document(result: Analysis) -> dict[str, Any]:
+    """Return what `apc analyze --json` prints of the analysis itself."""
+    modes = [document(mode, {"participation": dict(mode.participation)}) for mode in result.modes]
+    found: dict[str, Any] = document(result, {"modes": modes})
+    return found
+
+
+def answer_text(found: Answer) -> str:
+    """Return what `apc analyze` prints: the analysis, and what stands beside it."""
+    parts = [analysis_text(found.analysis), str(found.sensitivities), str(found.margins)]
+    if found.contact_modes is not None:
+        parts.append(str(found.contact_modes))
+    if found.detailed:
+        parts.append(str(found.conventions))
+    elif found.conventions.warning:
+        parts.append("\n".join(wrapped(f"Warning: {found.conventions.warning}")))
+    if found.box is not None:
+        parts.append(str(found.box))
+    return "\n\n".join(parts)
+
+
+def answer_document(found: Answer) -> dict[str, Any]:
+    """Return what `apc analyze --json` prints: the analysis with more keys."""
+    told = found.analysis.to_dict() | {
+        "sensitivities": found.sensitivities.to_dict(),
+        "margins": document(found.margins.rows),
+        "margins_note": found.margins.note,
+        "contact_modes": found.contact_modes.to_dict() if found.contact_modes else None,
+        "warnings": [found.conventions.warning] if found.conventions.warning else [],
+    }
+    if found.detailed:
+        told["conventions"] = found.conventions.to_dict()
+    if found.box is not None:
+        told["box"] = found.box.to_dict()
+    return told
+
+
+def _mode_table(modes: tuple[Mode, ...]) -> str:
+    # What can't be told from zero is counted only: its rounding differs from machine to machine.
+    alive = [mode for mode in modes if _is_alive(mode)]
+    rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
+    shown = rows[:MOST_ROWS]
+    dead = [mode for mode in modes if not _is_alive(mode)]
+    rest = [*dead, *rows[MOST_ROWS:]]
+    # A mode not told from zero may be any size up to its error.
+    least = max(shown[-1].magnitude if shown else 0.0, 2 * LEAST_MAGNITUDE)
+    unsure = sum(not mode.magnitude + mode.error <= least for mode in dead)
+    text = "\n".join(_table_lines([HEADINGS, *(_cells(mode) for mode in shown)])) if shown else ""
+    if not rest:
+        return text or "  nothing moves but that"
+    if unsure:
+        many = "all" if unsure == len(rest) > 1 else str(unsure)
+        told = f"{counted(len(rest), 'mode')} {'more' if shown else ''} (--json lists all),"
+        told += (
+            f" {many} of them known too roughly to say how fast {'it dies' if unsure == 1 else 'they die'}"
+        )
+    elif shown:
+        told = f"{len(rest)} faster-dying {'one' if len(rest) == 1 else 'ones'} (--json lists all)"
+    else:
+        ends = "dies" if len(rest) == 1 else "die"
+        told = f"{counted(len(rest), 'mode')} {ends} out within a frame (--json lists all)"
+    return "\n".join([*text.splitlines(), *note(f"and {told}" if shown else told)])
+
+
+def _is_alive(mode: Mode) -> bool:
+    """Say whether a mode is told from zero."""
+    return mode.magnitude > max(mode.error, LEAST_MAGNITUDE)
+
+
+def _cells(mode: Mode) -> tuple[str, ...]:
+    return (
+        _magnitude(mode),
+        mode.shape,
+        str(mode.multiplicity),
+        in_hertz(mode.frequency_hz) if mode.frequency_hz else "–",
+        "–" if isnan(mode.damping_ratio) else f"{mode.damping_ratio:.3g}",
+        _leading(mode),
+    )
+
+
+def _magnitude(mode: Mode) -> str:
+    """Return a magnitude to six digits behind the point, fewer where its error leaves them open."""
+    if mode.magnitude >= LARGE:
+        return f"{mode.magnitude:.6e}"
+    known = -math.floor(math.log10(mode.error)) - 1 if 0 < mode.error < math.inf else DECIMALS
+    decimals = min(max(known, 0), DECIMALS)
+    return f"{mode.magnitude:.{decimals}f}" + " " * (DECIMALS - decimals)
+
+
+def _table_lines(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
+    """Yield the lines of a table: numbers to the right, words to the left, the last column wrapped."""
+    widths = [max(len(row[place]) for row in rows) for place in range(len(HEADINGS) - 1)]
+    room = WIDTH - 2 - sum(widths) - 2 * len(widths)
+    last = max(min(MOVES_WIDTH, room), LEAST_WIDTH)
+    for row in rows:
+        cells = [
+            f"{cell:<{width}}" if heading == "shape" else f"{cell:>{width}}"
+            for heading, cell, width in zip(HEADINGS, row, widths, strict=False)
+        ]
+        start = f"  {'  '.join(cells)}  "
+        for line in textwrap.wrap(row[-1], last, break_on_hyphens=False) or [""]:
+            yield f"{start}{line}".rstrip()
+            start = " " * len(start)
+
+
+def _leading(mode: Mode) -> str:
+    largest = sorted(mode.participation, key=lambda item: -item[1])[:2]
+    return ", ".join(f"{name} {share:.0%}" for name, share in largest if share >= LEAST_SHARE)
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds * 1e3:.6g} ms" if seconds < 1 else f"{seconds:.6g} s"
+
+
+def needs_text(found: Needs) -> str:
+    """Return what a scene needs in one sentence."""
+    several = len(found.sites) > 1
+    sites = "; ".join(f"{one.name}: {_site(one)}" if several else _site(one) for one in found.sites)
+    whole = found.peers > 1 and sum(count for count, _ in found.systems) == 1
+    noun = _NOUNS.get(found.method, "system" if whole else "mode")
+    systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in found.systems)
+    analysed = f"not analysed: {found.refused}" if found.refused else f"analysed as {systems}"
+    pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in found.pairs)
+    return f"{sites}, {counted(found.peers, 'peer')}; {analysed}{pairs}"
+
+
+def _site(found: SiteNeeds) -> str:
+    parts = [f"{found.motion} motion"]
+    if found.remembered:
+        parts.append(f"{found.remembered} delayed force")
+    if found.packets:
+        parts.append(f"{found.packets} network")
+    return f"{found.states} states a peer ({', '.join(parts)})"
+
+
+def box_proof_text(found: BoxProof) -> str:
+    """Return what was proved of a box."""
+    lines = [f"  {_range(one)}" for one in found.ranges]
+    where = [
+        f"  {one.label} = {with_unit(f'{value:.12g}', one.unit)}"
+        for one, value in zip(found.ranges, found.point, strict=False)  # a proved box has no point
+    ]
+    if found.stable:
+        said = f"proved {found.verdict} for every value in the box ({counted(found.cells, 'cell')})"
+    elif found.stable is False:
+        said = "not stable in all of the box"
+        lines += ["proved unstable at", *where]
+    else:
+        said = f"undecided, {found.open_share:.2g} of the box is left open ({counted(found.cells, 'cell')})"
+        lines += ["among others around", *where] if found.point else []
+    lines += [f"  {text}" for text in found.notes]
+    return "\n".join([f"{found.topology}:", *wrapped(said), *lines])
+
+
+def _range(found: Range) -> str:
+    low, high = (with_unit(f"{float(one):.9g}", found.unit) for one in (found.low, found.high))
+    return f"{found.label} from {low} to {high}"
+
+
+def range_document(found: Range) -> dict[str, Any]:
+    """Return a parameter and its range as plain data."""
+    return {"parameter": found.label, "unit": found.unit, "range": document((found.low, found.high))}
+
+
+def box_proof_document(found: BoxProof) -> dict[str, Any]:
+    """Return what was proved of a box as plain data."""
+    return {
+        "topology": found.topology,
+        "box": [range_document(one) for one in found.ranges],
+        "verdict": found.verdict,
+        "stable": found.stable,
+        "cells": found.cells,
+        "open_share": found.open_share,
+        "unstable_at": list(found.point) if found.stable is False else None,
+        "open_around": list(found.point) if found.stable is None and found.point else None,
+        "notes": list(found.notes),
+    }
+
+
+def contact_modes_text(found: ContactModes) -> str:
+    """Return the modes of contact as a table, and which is unstable in words."""
+    if not found.modes:
+        return "\n".join([f"{found.topology}: no part switches", *found.notes])
+    lines = [*wrapped(f"{found.topology}: {found.summary}"), ""]
+    lines += [f"  {name} on: it follows the motion; off: it does not" for name in found.parts]
+    width = min(MOST_NAMED, max(len(mode.name) for mode in found.modes))
+    lines += ["", f"  {'':<{width}}  {'spectral radius':<19}  {'frequency':>9}  verdict"]
+    for mode in found.modes:
+        if len(mode.name) > width:
+            lines.append(f"  {mode.name}")
+        head = f"  {mode.name if len(mode.name) <= width else '':<{width}}"
+        if mode.refusal:
+            lines += [f"{head}  not analysed:", *wrapped(mode.refusal, "    ", "    ")]
+            continue
+        radius = measured(mode.spectral_radius, max(mode.spectral_radius_error, SHOWN))
+        frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
+        verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
+        lines.append(f"{head}  {radius:<19}  {frequency:>9}  {verdict}{'*' if mode.linearized else ''}")
+    if any(mode.linearized for mode in found.modes):
+        lines += ["", "  * near the start values: this piece is not linear"]
+    return "\n".join([*lines, *(f"  {text}" for text in found.notes)])
+
+
+def contact_modes_document(found: ContactModes) -> dict[str, Any]:
+    """Return the modes of contact as plain data."""
+    return {
+        "topology": found.topology,
+        "parts": list(found.parts),
+        "unstable": list(found.unstable),
+        "modes": [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes],
+        "notes": list(found.notes),
+    }
+
+
+def _analysed(found: ContactMode | Outcome, instead: dict[str, Any], *more: str) -> dict[str, Any]:
+    """Return plain data of what may have been refused: then there are no numbers of an analysis."""
+    if not found.verdict:
+        instead |= dict.fromkeys(("verdict", "spectral_radius", "spectral_radius_error", *more))
+    told: dict[str, Any] = document(found, instead)
+    return told
+
+
+def conventions_text(found: Conventions) -> str:
+    """Return what every convention leads to."""
+    from apc.analysis.conventions import (  # loaded where there are outcomes, and else not needed
+        DEFAULT,
+        ORDERS,
+    )
+
+    if not found.repeated:
+        headline = found.not_repeated
+    elif found.flips:
+        headline = "the verdict depends on the conventions"
+    else:
+        headline = "the same verdict under every convention"
+    lines = [f"{found.topology}: {headline}", ""]
+    for number, one in enumerate(found.outcomes, 1):
+        radius = measured(one.spectral_radius, one.spectral_radius_error)
+        lines.append(f"  {number}  {one.verdict or 'not analysed'}")
+        lines.append(f"     spectral radius {radius}" if one.verdict else f"     {one.refusal}")
+        lines += [f"     {departure}" for departure in one.departures or (DEFAULT,)]
+        if one.start:
+            lines.append(f"     heard before the first packet: {one.start}")
+        shown = " < ".join(one.orders[0])
+        lines.append(f"     {len(one.orders)} of {ORDERS} orders, such as {shown}")
+    if found.repeated and not found.start_matters:
+        lines += ["", "  What is heard before the first packet can't change the verdict."]
+    return "\n".join(lines)
+
+
+def conventions_document(found: Conventions) -> dict[str, Any]:
+    """Return what every convention leads to as plain data."""
+    return {
+        "topology": found.topology,
+        "flips": found.flips,
+        "repeated": found.repeated,
+        "not_repeated": found.not_repeated,
+        "start_matters": found.start_matters,
+        "outcomes": [_analysed(one, {}) for one in found.outcomes],
+    }
+
+
+def paper_route_text(found: PaperRoute) -> str:
+    """Return the shapes of the paper's matrices, a line each."""
+    named = (
+        *(("A", found.a), ("B", found.b), ("C", found.c), ("A_D", found.a_d), ("B_D", found.b_d)),
+        *(("C_D", found.c_d), ("D_D", found.d_d), ("A_aug", found.a_aug), ("B_aug", found.b_aug)),
+        *(("C_aug", found.c_aug), ("D_aug", found.d_aug), ("F_D", found.f_d), ("A_cl", found.closed)),
+    )
+    lines = [f"  {name:<6} {len(one.rows):>4} × {len(one.columns)}" for name, one in named]
+    return "\n".join([f"ratio {found.ratio}, frame {found.frame_s * 1e3:.6g} ms", *lines])
+
+
+def matrix_text(found: NamedMatrix) -> str:
+    """Return the shape of a matrix and the ends of its names."""
+    rows, columns = found.rows, found.columns
+    shown = f"{len(rows)} × {len(columns)}"
+    return f"{shown}: {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if found.values.size else shown
+
+
+needs_document = paper_route_document = matrix_document = document

@@ -1,0 +1,56 @@
+"""The forms that all results share: plain data, JSON, indented notes.
+
+Takes: frozen values, texts. Gives: `document`, `json_text`, `note`.
+Guarantees: a document is made of what JSON has words for; the same value gives the same text.
+Does not: know a result.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from fractions import Fraction
+from typing import Any
+
+from apc.compiler.words import wrapped
+
+
+def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
+    """Return a value as plain data: a dataclass by its fields, a complex number as a pair, no NaN.
+
+    Parameters
+    ----------
+    value
+        Dataclasses, mappings, sequences and arrays of numbers, texts and None.
+    instead
+        What is taken in the place of fields of a dataclass.
+    """
+    if isinstance(value, str | int | None):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    if isinstance(value, Fraction):
+        return float(value)
+    if is_dataclass(value):
+        own = instead or {}
+        names = (one.name for one in fields(value))
+        return {name: document(own[name] if name in own else getattr(value, name)) for name in names}
+    if isinstance(value, Mapping):
+        return {key: document(one) for key, one in value.items()}
+    if isinstance(value, tuple | list):
+        return [document(one) for one in value]
+    return value.tolist()  # of an array
+
+
+def json_text(found: Any, *, indent: int | None = 2) -> str:
+    """Return plain data as one JSON document, on one line if `indent` is None."""
+    return json.dumps(found, ensure_ascii=False, allow_nan=False, indent=indent)
+
+
+def note(text: str) -> list[str]:
+    """Return a text as lines that stand a little to the right."""
+    return wrapped(text, "  ", "    ")

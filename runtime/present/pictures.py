@@ -1,0 +1,40 @@
+"""What all pictures share: their formats, and how a figure becomes a file.
+
+Takes: a matplotlib Figure and a path. Gives: `FORMATS`, `check_format`, `write_figure`.
+Guarantees: the same figure gives the same bytes; a file is there whole or not at all.
+Does not: draw, or need a display.
+
+matplotlib is loaded when something is drawn and not before.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from apc.compiler.files import write_file
+from apc.optional import need
+from apc.suffixes import check_suffix
+
+FORMATS = (".png", ".svg", ".pdf")
+DPI = 150
+
+
+def check_format(path: Path, option: str = "--plot") -> None:
+    """Refuse a picture that can't be drawn: E878 no such format, E875 matplotlib is not installed."""
+    check_suffix(path, FORMATS, option)
+    need("matplotlib", "plot")
+
+
+def write_figure(figure: Any, path: Path) -> None:
+    """Write a matplotlib Figure, its format chosen by the suffix; the same figure gives the same bytes."""
+    # No date in the file, and the same names inside it.
+    matplotlib = need("matplotlib", "plot")
+    dates: dict[str, dict[str, None]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    suffix = check_suffix(path, FORMATS, "--plot")
+
+    def write(temporary: Path) -> None:
+        with matplotlib.rc_context({"svg.hashsalt": "apc"}):
+            figure.savefig(temporary, format=suffix[1:], dpi=DPI, metadata=dates.get(suffix))
+
+    write_file(path, write)

@@ -1,0 +1,37 @@
+"""A result: data that other rooms compute with, and that a person can look at.
+
+Takes: nothing. Gives: `Result`.
+Guarantees: data know the name of what shows them and nothing of it: it is imported when it is asked for.
+Does not: show anything itself (see `present`).
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any, ClassVar
+
+
+class Result:
+    """What is found, abstract. `shown_by` names its module of `apc.present`, and it there: "vary:critical".
+
+    That module has a function for each form of it: `critical_text`, `critical_document`, and what it has
+    more, such as `critical_picture`.
+    """
+
+    __slots__ = ()
+    shown_by: ClassVar[str]
+
+    def __str__(self) -> str:
+        """Return the result as text of at most 80 columns."""
+        text: str = self._shown("text")
+        return text
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain data, ready for JSON."""
+        document: dict[str, Any] = self._shown("document")
+        return document
+
+    def _shown(self, form: str, *arguments: Any) -> Any:
+        """Return the result in another form."""
+        module, _, name = self.shown_by.partition(":")
+        return getattr(import_module(f"apc.present.{module}"), f"{name}_{form}")(self, *arguments)
