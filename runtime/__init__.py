@@ -8,7 +8,9 @@ Each function does what the command of its name does; results are frozen and pri
 
 compiler (YAML to CasADi), then a folder a subject: frame (one peer over one frame of time) → network (packets
 that get lost or come late) → eigen (all peers) and large (very many) → analysis → vary (many values of some
-parameters) → sweeps, simulation, regions → benchmark → present → cli. Each imports only what comes before it.
+parameters) → sweeps, simulation, regions → benchmark → present (text, JSON, tables and pictures of every
+result) → cli. Each imports only what comes before it: a result names what shows it, and that is found when it
+is asked for.
 """
 
 from typing import Any

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.analysis.contact_modes import ContactModes, contact_modes
 from apc.analysis.conventions import Conventions, conventions
+from apc.analysis.methods import PAPER
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.result import Result
@@ -73,7 +74,7 @@ def judge(
     prepared
         From `analysis.prepare`, of this system with any numbers.
     """
-    if method != "paper":
+    if method != PAPER:
         return analyze(system, method=method, certify=certify, prepared=prepared)
     if certify:
         what = "method paper gives no proof: its matrices hold every sample of a frame, rounded"

@@ -7,7 +7,6 @@ Does not: print.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
     from apc.analysis.contact_modes import ContactModes
     from apc.analysis.conventions import Conventions
+    from apc.analysis.methods import Method
     from apc.analysis.paper import PaperRoute
     from apc.benchmark.bench import Bench
     from apc.regions.region import Region
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
 
-Method = Literal["auto", "modes", "dense", "determinant", "krylov", "paper"]
 Format = Literal["text", "json", "dot", "svg"]
 
 
@@ -433,7 +432,8 @@ def show(path: str | Path, *, format: Format = "text") -> str:
     ApcError
         The file is at fault, or is a compiled model, which no longer has the equations as written.
     """
-    from apc.compiler.view import contents
+    from apc.compiler.view import listing
+    from apc.present.forms import json_text
 
     path = Path(path)
     if path.suffix == ".apc":
@@ -441,13 +441,13 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         raise ApcError(Mistake("E615", Place(str(path)), what, hint=f"apc show {path.with_suffix('.yaml')}"))
     match format:
         case "text":
-            return contents.show_text(path)
+            return listing.show_text(path)
         case "json":
-            return json.dumps(contents.show_document(path), ensure_ascii=False, allow_nan=False, indent=2)
+            return json_text(listing.show_document(path))
         case "dot":
-            return contents.show_dot(path)
+            return listing.show_dot(path)
         case "svg":
-            return contents.show_svg(path)
+            return listing.show_svg(path)
 
 
 def schema() -> dict[str, Any]:

@@ -13,17 +13,14 @@ DISTRIBUTION = "apc-haptics"
 
 def program_version() -> str:
     """Return the version of the program that is installed."""
-    # Imported here: it brings the whole of `email`, for which no command need wait.
-    from importlib.metadata import version
-
-    return version(DISTRIBUTION)
+    return versions()[0][1]
 
 
 def versions(*libraries: str) -> tuple[tuple[str, str], ...]:
     """Return the versions of the program and of libraries, each with its name."""
-    from importlib.metadata import version
+    from importlib.metadata import version  # it reads mail: most commands ask for no version
 
-    return (("apc", program_version()), *((name, version(name)) for name in libraries))
+    return (("apc", version(DISTRIBUTION)), *((name, version(name)) for name in libraries))
 
 
 def install_line(extra: str) -> str:

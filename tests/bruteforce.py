@@ -132,45 +132,51 @@ def _one_frame(
         }
         for user in (scene.users or ({},) * scene.peers)
     ]
-    haptic_0, network_0 = scene.haptic_phase % scene.haptic, scene.network_phase % scene.network
+    # Times in whole numbers of the unit that measures them all.
+    exact = (
+        frame, scene.haptic, scene.network, scene.haptic_phase % scene.haptic,
+        scene.network_phase % scene.network, scene.comp, scene.contact_delay, scene.comm,
+    )  # fmt: skip
+    per_second = math.lcm(*(time.denominator for time in (*exact, *scene.late.values())))
+    ending, haptic, network, haptic_0, network_0, comp, contact_comp, comm = (
+        int(time * per_second) for time in exact
+    )
+    late = {pair: int(time * per_second) for pair, time in scene.late.items()}
     motion = [part[:4] for part in parts]
     # forces[i] is a list of (time computed, contact, own part, heard part); packets likewise (time, x, v).
     forces, packets = [], []
     for part in parts:
         forces.append(
-            [(haptic_0 - (k + 1) * scene.haptic, *part[4 + 3 * k : 7 + 3 * k]) for k in range(force_depth)]
+            [(haptic_0 - (k + 1) * haptic, *part[4 + 3 * k : 7 + 3 * k]) for k in range(force_depth)]
         )
         at = 4 + 3 * force_depth
         packets.append(
-            [
-                (network_0 - (k + 1) * scene.network, *part[at + 2 * k : at + 2 * k + 2])
-                for k in range(packet_depth)
-            ]
+            [(network_0 - (k + 1) * network, *part[at + 2 * k : at + 2 * k + 2]) for k in range(packet_depth)]
         )
-    instants = {Fraction(0), frame}
+    instants = {0, ending}
     for start, period, delay in (
-        (haptic_0, scene.haptic, scene.comp),
-        (haptic_0, scene.haptic, scene.contact_delay),
-        (haptic_0, scene.haptic, Fraction(0)),
-        (network_0, scene.network, Fraction(0)),
+        (haptic_0, haptic, comp),
+        (haptic_0, haptic, contact_comp),
+        (haptic_0, haptic, 0),
+        (network_0, network, 0),
     ):
-        first = -math.ceil(delay / period) - 1
-        instants |= {start + k * period + delay for k in range(first, math.ceil(frame / period) + 1)}
-    times = sorted(time for time in instants if 0 <= time <= frame)
+        first = -(delay // period) - 2
+        instants |= {start + k * period + delay for k in range(first, ending // period + 2)}
+    times = sorted(time for time in instants if 0 <= time <= ending)
 
-    def newest(listed: Sequence[tuple[Any, ...]], now: Fraction, delay: Fraction) -> tuple[Any, ...]:
+    def newest(listed: Sequence[tuple[Any, ...]], now: int, delay: int) -> tuple[Any, ...]:
         return max((one for one in listed if one[0] + delay <= now), key=lambda one: one[0])
 
     for now, following in itertools.pairwise(times):
-        if (now - network_0) % scene.network == 0:
+        if (now - network_0) % network == 0:
             for i in range(scene.peers):
                 packets[i].append((now, motion[i][2], motion[i][3]))
-        if (now - haptic_0) % scene.haptic == 0:
+        if (now - haptic_0) % haptic == 0:
             for i, (x, v, x_o, v_o) in enumerate(motion):
                 p = value[i]
                 weights = scene.hears(i)
                 heard = [
-                    (number(weight), j, newest(packets[j], now, scene.late.get((j, i), scene.comm)))
+                    (number(weight), j, newest(packets[j], now, late.get((j, i), comm)))
                     for j, weight in weights
                 ]
                 total = sum((weight for weight, _, _ in heard), number(0))
@@ -194,12 +200,12 @@ def _one_frame(
                         others,
                     )
                 )
-        duration = following - now
+        duration = Fraction(following - now, per_second)
         for i in range(scene.peers):
             p = value[i]
-            delayed = newest(forces[i], now, scene.comp)
-            contact = newest(forces[i], now, scene.contact_delay)[1]
-            at_once = newest(forces[i], now, Fraction(0))
+            delayed = newest(forces[i], now, comp)
+            contact = newest(forces[i], now, contact_comp)[1]
+            at_once = newest(forces[i], now, 0)
             pull = delayed[2] + (at_once if scene.own_delay else delayed)[3]
             x, v, x_o, v_o = motion[i]
             x, v = _coast(x, v, -contact, p["device"], p["device_damping"], duration, number, exp)

@@ -26,9 +26,10 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
 
 # Waits once it has kept so many parts: however late it is stopped from outside, it has done no more.
 _WAITING = """\
-import sys, time
+import signal, sys, time
 from apc.__main__ import run
 from apc.sweeps.store import Parts
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell starts in the background
 kept, write = [], Parts.write
 
 def write_and_wait(*arguments):

@@ -14,11 +14,10 @@ from apc.eigen.modes import arrange, complete_loops, dense, split
 from apc.eigen.spectrum import Spectrum
 from apc.frame.overrides import apply, parse_override
 from apc.large.characteristic import characteristic_ball, refine
-from apc.large.circles import beyond
 from apc.large.determinant import of_crowds
 from apc.large.determinant_spectrum import solve_crowds, solve_loops
 from apc.large.translation import count_translations
-from apc.large.zeros import find_zeros, near_poles
+from apc.large.zeros import beyond, find_zeros, near_poles
 from tests.bruteforce import Scene, frame_matrix
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper

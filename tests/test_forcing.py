@@ -13,7 +13,6 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.benchmark.pushes import Push, impulse, push_of, switches
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
 from apc.frame.parameters import resolve
@@ -22,6 +21,7 @@ from apc.simulation.forcing import Forcing, SiteForcing, forcing_of, impulses
 from apc.simulation.propagate import rates, transitions
 from apc.simulation.quadrature import kernel_of
 from apc.simulation.trajectory import simulate
+from tests.fifty_digits.pushes import Push, impulse, push_of, switches
 from tests.topologies import ONE_MASS, SCENES
 
 CLOCK = "clocks: {haptic: 10 ms}\n"

@@ -63,7 +63,7 @@ def test_there_is_no_golden_file_besides() -> None:
 
 def test_the_same_scene_gives_the_same_bytes_whatever_the_order_of_hashes(tmp_path: Path) -> None:
     digests = set()
-    for seed in ("0", "1", "4242"):
+    for seed in ("0", "4242"):
         environment = {**os.environ, "PYTHONHASHSEED": seed}
         command = [sys.executable, "-c", DIGEST]
         ran = subprocess.run(

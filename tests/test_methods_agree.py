@@ -1,6 +1,6 @@
 """Every scene by every method: refused in words, or true within the bound that is printed.
 
-The truths are computed event by event in ball arithmetic (`bench.reference`); nothing of an analysis takes
+The truths are computed event by event in ball arithmetic (`fifty_digits.truth`); nothing of an analysis takes
 part in them. Those of tests/hard are stored with the script that made them.
 """
 
@@ -14,10 +14,10 @@ import flint
 import pytest
 
 from apc.analysis.analysis import analyze
-from apc.benchmark.reference import Truth, spectral_truth
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
+from tests.fifty_digits.truth import Truth, spectral_truth
 from tests.topologies import ROOT
 
 STORED = json.loads((ROOT / "tests" / "hard" / "truths.json").read_text(encoding="utf-8"))

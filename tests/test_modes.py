@@ -8,11 +8,90 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.modes import dense, split
+from apc.compiler.errors import ApcError
+from apc.eigen.closing import Coupling, close_loop
+from apc.eigen.modes import complete_degrees, couple, dense, dense_loop, split, split_twins
+from apc.frame.schedule import Way
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, columned, edged, grouped, linked, paper
+
+
+def _coupled(system: Any, weight: int = 1) -> Coupling:
+    groups, exchange = lifted_groups(system)
+    degrees = complete_degrees(groups, exchange)
+    return couple(groups, exchange, lambda way, g, h: Fraction(weight * groups[h].count - (g == h)), degrees)
+
+
+def _pair(operator: str, **values: Any) -> Any:
+    return grouped(paper(operator, **values), ("left", 2, {"device.mass": 0.2}), ("right", 3, {}))
+
+
+def test_a_sum_counts_the_others_and_a_mean_divides_by_them() -> None:
+    [total] = _coupled(_pair("sum")).values()
+    assert total == ((1, 3), (2, 2))
+    [mean] = _coupled(_pair("mean")).values()
+    assert mean == ((Fraction(1, 4), Fraction(3, 4)), (Fraction(2, 4), Fraction(2, 4)))
+
+
+def test_senders_of_another_delay_are_on_another_way() -> None:
+    found = _coupled(linked(_pair("sum"), delays={("left", "right"): 16 * MS}))
+    usual, late = (found[Way("sum", "lan", name)] for name in ("lan.delay", "lan.delay left right"))
+    assert usual == ((1, 3), (0, 2))
+    assert late == ((0, 0), (2, 0))
+
+
+def test_of_a_maximum_only_the_one_it_is_taken_from_counts_and_once() -> None:
+    system = columned(edged(paper(peers=3, kt=100.0), "max"), cube__x__start=[0.0, 0.01, 0.03])
+    position = next(rows for way, rows in _coupled(system).items() if way.channel == "coordination.x")
+    # All look at the first but the first, which looks at the second: there its distance is largest.
+    assert position == ((0, -100, 0), (-100, 0, 0), (-100, 0, 0))
+
+
+def test_a_mean_of_weights_that_add_up_to_nothing_is_refused() -> None:
+    groups, exchange = lifted_groups(paper())
+    with pytest.raises(ApcError, match="E802"):
+        couple(groups, exchange, lambda way, g, h: Fraction(1), {("lan", 0): Fraction(0)})
+
+
+# A path of four with a fork at either end: 0 and 1 are twins, and 4 and 5.
+FORKED = [(0, 2), (1, 2), (2, 3), (3, 4), (3, 5)]
+ARCS = [(a, b, 1.0) for pair in FORKED for a, b in (pair, pair[::-1])]
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize(
+    ("graph", "sizes"), [("star", [2, 1]), (ARCS, [4, 1, 1]), ("ring", [6]), ("complete", [2, 1])]
+)
+def test_the_loops_have_together_the_spectrum_of_the_whole(
+    operator: str, graph: Any, sizes: list[int]
+) -> None:
+    first = ("first", 1, {"device.mass": 0.25}) if graph in ("star", "complete") else ("first", 1, {})
+    base = grouped(paper(operator, kt=300.0, bt=1.0, kc=800.0), first, ("others", 5, {}))
+    groups, exchange = lifted_groups(linked(base, graph))
+    whole = dense_loop(groups, exchange)
+    loops = split_twins(whole, exchange)
+    assert [len(loop.sites) for loop in loops] == sizes
+    together = [
+        np.linalg.eigvals(close_loop(loop).matrix) for loop in loops for _ in range(loop.multiplicity)
+    ]
+    expected, found = np.linalg.eigvals(close_loop(whole).matrix), np.concatenate(together)
+    assert len(found) == len(expected)
+    for value in expected[np.abs(expected) > 0.1]:
+        near = np.abs(found - value) < 1e-9
+        assert near.sum() == (np.abs(expected - value) < 1e-9).sum()
+
+
+def test_a_star_of_many_equal_peers_is_two_small_determinants() -> None:
+    base = grouped(paper(kt=300.0, bt=1.0, kc=800.0), ("first", 1, {"device.mass": 0.25}), ("others", 19, {}))
+    system = linked(base, "star")
+    found, whole = analyze(system, method="determinant"), analyze(system, method="dense")
+    assert (found.verdict, found.rigid_modes) == (whole.verdict, whole.rigid_modes)
+    apart = abs(found.spectral_radius - whole.spectral_radius)
+    assert apart <= found.spectral_radius_error + whole.spectral_radius_error
+    assert found.spectral_radius_error < 1e-7
+
 
 # Queues that run empty make defective eigenvalues at zero, which rounding scatters by its n-th root: all that
 # is smaller than this per frame is compared by number only.

@@ -13,9 +13,8 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.view.diagram import Diagram, build_diagram
-from apc.compiler.view.marks import Box, Line, Picture, Text
 from apc.compiler.view.picture import place
-from apc.compiler.view.svg import draw_svg
+from apc.compiler.view.svg import Box, Line, Picture, Text, draw_svg
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, scene, told
 
 AVERAGE_FILE = SCENES / "three-users-average.yaml"
@@ -140,7 +139,7 @@ def test_every_link_is_reached_from_every_part_that_hears_over_it() -> None:
 
 
 def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
-    document = ET.fromstring(draw_svg(diagram(AVERAGE)))
+    document = ET.fromstring(draw_svg(place(diagram(AVERAGE))))
     words = [element.text for element in document.iter("{http://www.w3.org/2000/svg}text")]
     for word in (
         *("three-users-average", "one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
@@ -155,7 +154,7 @@ def test_text_of_a_scene_cannot_break_out_of_the_picture() -> None:
     text = replaced(
         AVERAGE, ("about: Three", 'about: "<script>alert(1)</script> & Three'), ("others.  ", 'others."  ')
     )
-    drawn = draw_svg(diagram(text))
+    drawn = draw_svg(place(diagram(text)))
     assert "<script>" not in drawn
     ET.fromstring(drawn)
 

@@ -11,6 +11,7 @@ import flint
 import mpmath
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import apc
 from apc.analysis.analysis import Analysis, analyze
@@ -40,13 +41,7 @@ def test_the_reference_radii_come_out(scheme: str, peers: int, delayed: bool, ra
 def _crossing(build: Any, low: float, high: float) -> float:
     """Return where the radius crosses 1 between two values, by bisection."""
     assert analyze(build(low)).spectral_radius < 1 < analyze(build(high)).spectral_radius
-    while high - low > 1e-5:
-        middle = (low + high) / 2
-        if analyze(build(middle)).spectral_radius < 1:
-            low = middle
-        else:
-            high = middle
-    return low
+    return float(brentq(lambda value: analyze(build(value)).spectral_radius - 1, low, high, xtol=1e-5))
 
 
 @pytest.mark.parametrize(("delayed", "delays", "damping", "kc", "average", "mesh"), LIMITS)
@@ -150,7 +145,8 @@ def _check_against_truth(values: dict) -> Analysis:
 
 def test_the_truth_at_120_digits_is_within_every_bound() -> None:
     generator = np.random.default_rng(0)
-    bounds = [_check_against_truth(_random(generator, number)).spectral_radius_error for number in range(200)]
+    # Every way of setting some of the gains and delays to zero: of 4, of 3, of 5.
+    bounds = [_check_against_truth(_random(generator, number)).spectral_radius_error for number in range(60)]
     assert np.median(bounds) < 1e-10
     assert max(bounds) < 1e-6
 
@@ -169,15 +165,13 @@ def test_next_to_the_boundary_every_verdict_is_decided_and_right() -> None:
     verdicts = set()
     for number in range(6):
         values = {**_random(generator, number), "bt": 1.0, "bc": 2.0, "kc": 500.0, "comp": MS}
-        low, high = 1.0, 20000.0
-        while np.nextafter(low, high) < high:
-            middle = (low + high) / 2
-            if analyze(paper(peers=2, **{**values, "kt": middle})).spectral_radius < 1:
-                low = middle
-            else:
-                high = middle
+
+        def beyond(kt: float, values: dict = values) -> float:
+            return analyze(paper(peers=2, **{**values, "kt": kt})).spectral_radius - 1
+
+        crossing = brentq(beyond, 1.0, 20000.0, xtol=1e-12)
         for step in (-1e-9, -1e-13, 0.0, 1e-13, 1e-9):
-            found = _check_against_truth({**values, "kt": low * (1 + step)})
+            found = _check_against_truth({**values, "kt": crossing * (1 + step)})
             verdicts.add(found.verdict)
     assert verdicts == {"stable up to a common translation", "unstable"}
 

@@ -109,7 +109,7 @@ def test_a_staircase_that_another_mode_takes_over_is_a_curve_a_mode(scene: Compi
     assert {curve.mode for curve in found.curves} == {"difference", "common"}
     for curve in found.curves:
         low, high = curve.frequency_hz
-        for delay, stiffness in curve.knots:
+        for delay, stiffness in curve.knots[::4]:
             beside = [
                 Override("lan.delay", None, Fraction(float(delay))),
                 Override("coordination.stiffness", None, Fraction(float(stiffness))),

@@ -179,7 +179,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 # A mass alone: the cheapest of scenes, as these are about processes.
-MANY = ("--over", "device.mass=1 kg:2 kg:500", "--over", "device.damping=1,2,3,4 N*s/m")
+MANY = ("--over", "device.mass=1 kg:2 kg:250", "--over", "device.damping=1,2,3,4 N*s/m")
 
 
 def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) -> None:
@@ -205,7 +205,7 @@ def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) ->
     assert f"note: {64 * len(before):,} points were there already" in out
     assert left_alone.communicate()[1] == ""
     assert target.read_bytes() == (folder / "alone.csv").read_bytes()
-    assert len(target.read_text(encoding="utf-8").splitlines()) == 2001
+    assert len(target.read_text(encoding="utf-8").splitlines()) == 1001
     assert not (folder / "r.csv.parts").exists()
 
 
@@ -217,7 +217,7 @@ def test_an_interrupt_ends_with_what_is_done_and_says_how_to_go_on(folder: Path)
     out, err = running.communicate()
     assert (running.returncode, out) == (130, "")
     first, second = (line for line in err.splitlines() if line)
-    assert first.endswith(" of 2,000 points are kept in r.csv.parts; the same command takes up from there")
+    assert first.endswith(" of 1,000 points are kept in r.csv.parts; the same command takes up from there")
     assert second == "stopped"
     assert not target.exists()
     assert len(parts(target)) == 2

@@ -23,7 +23,7 @@ from tests.topologies import compiled, told
 distributed = pytest.importorskip("distributed", reason="Dask's distributed is not installed: '.[cluster]'")
 
 MODEL = compiled(CHEAP)
-OVER = {"it.stiffness": "10 N/m:9000 N/m:100", "it.delay": "0,1,1.5 ms"}
+OVER = {"it.stiffness": "10 N/m:9000 N/m:50", "it.delay": "0,1,1.5 ms"}
 
 
 @pytest.fixture(autouse=True)
@@ -40,21 +40,27 @@ def cluster() -> Iterator[distributed.LocalCluster]:
         yield found
 
 
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Return the file that this process writes."""
+    path = tmp_path_factory.mktemp("here") / "here.csv"
+    sweep(MODEL, OVER, out=path, jobs=1)
+    return path.read_bytes()
+
+
 def test_a_cluster_gives_the_same_file_to_the_last_bit(
-    tmp_path: Path, cluster: distributed.LocalCluster
+    tmp_path: Path, cluster: distributed.LocalCluster, here: bytes
 ) -> None:
-    here, there = tmp_path / "here.csv", tmp_path / "there.csv"
-    sweep(MODEL, OVER, out=here, jobs=1)
+    there = tmp_path / "there.csv"
     sweep(MODEL, OVER, out=there, cluster=cluster.scheduler_address)
-    assert here.read_bytes() == there.read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["here.csv", "there.csv"]
+    assert there.read_bytes() == here
+    assert [path.name for path in tmp_path.iterdir()] == ["there.csv"]
 
 
 def test_what_was_begun_here_is_finished_on_the_cluster(
-    tmp_path: Path, cluster: distributed.LocalCluster
+    tmp_path: Path, cluster: distributed.LocalCluster, here: bytes
 ) -> None:
-    whole, target = tmp_path / "whole.csv", tmp_path / "r.csv"
-    sweep(MODEL, OVER, out=whole, jobs=1)
+    target = tmp_path / "r.csv"
 
     def stop(done: int, points: int) -> None:
         if done >= 128:
@@ -64,7 +70,7 @@ def test_what_was_begun_here_is_finished_on_the_cluster(
         sweep(MODEL, OVER, out=target, jobs=1, progress=stop)
     found = sweep(MODEL, OVER, out=target, cluster=cluster.scheduler_address)
     assert found.notes == ("128 points were there already",)
-    assert target.read_bytes() == whole.read_bytes()
+    assert target.read_bytes() == here
 
 
 def test_workers_with_other_versions_are_refused(

@@ -1,4 +1,4 @@
-"""Claims about `transfer` and `response`: what sites answer, within its bounds."""
+"""Claims about `transfer`: what sites answer, within its bounds."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.large.response import differentiate, respond
-from apc.large.transfer import StateSpace, build_transfer
+from apc.large.transfer import StateSpace, build_transfer, differentiate, respond
 
 
 def _sites(seed: int, *, error: float = 0.0, chain: int = 2) -> StateSpace:

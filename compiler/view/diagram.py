@@ -1,8 +1,8 @@
-"""A scene as a graph: parts joined within a peer, peers joined over links.
+"""A scene as a graph: parts joined within a peer, peers joined over links; as text for Graphviz.
 
-Takes: `Scene`. Gives: `Diagram`, `build_diagram`; `seconds`.
+Takes: `Scene`. Gives: `Diagram`, `build_diagram`; `draw_dot`; `one_of`, `seconds`.
 Guarantees: every part of the topology is in it, a long array as one node; the same scene gives the same text.
-Does not: place anything on a page (see `picture`, `graphviz`).
+Does not: place anything on a page: `picture` does, or Graphviz.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from apc.compiler.scene.instances import Part
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene
 from apc.compiler.scene.sections import DEFAULT_TYPES
+from apc.compiler.words import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
 STIFFNESS = Dimension((("kg", 1), ("s", -2)))
@@ -234,3 +235,47 @@ def _crowds(scene: Scene) -> Iterator[Crowd]:
 def one_of(diagram: Diagram) -> str:
     """Return what the peer drawn is, in words."""
     return "the only peer" if diagram.peers == 1 else f"one of {diagram.peers} peers"
+
+
+_SHAPES = {"mass": "box", "coupler": "box", "hand": "cds", "ground": "underline", "joint": "point"}
+
+
+def draw_dot(diagram: Diagram) -> str:
+    """Return a diagram in Graphviz's language."""
+    title = diagram.title if not diagram.about else f"{diagram.title}\n{diagram.about}"
+    lines = [
+        f"digraph {_quoted(diagram.title)} {{",
+        "  rankdir=LR",
+        '  node [fontname="Helvetica", fontsize=10]',
+        "  edge [dir=none]",
+        f'  label={_quoted(title)}; labelloc=t; fontname="Helvetica"',
+        "  subgraph cluster_peer {",
+        f"    label={_quoted(one_of(diagram))}; style=rounded",
+    ]
+    for node in diagram.nodes:
+        text = "\n".join((node.name, *node.lines, *([f"clock {node.clock}"] if node.clock else [])))
+        label = "ground" if node.role == GROUND else text
+        style = ', style="filled", fillcolor="#e8eff8"' if node.role == "mass" else ""
+        lines.append(f"    {_quoted(node.name)} [label={_quoted(label)}, shape={_SHAPES[node.role]}{style}]")
+    lines += [f"    {_quoted(one)} -> {_quoted(two)}" for one, two in diagram.joints]
+    lines.append("  }")
+    for net in diagram.nets:
+        text = "\n".join((net.name, f"graph {net.shape}", *net.lines))
+        lines.append(f"  {_quoted(net.name)} [label={_quoted(text)}, shape=ellipse, style=dashed]")
+        for crowd in diagram.crowds:
+            lines.append(
+                f"  {_quoted(net.name)} -> {_quoted(f'peers {crowd.name}')} [dir=both, style=dashed]"
+            )
+    for node in diagram.nodes:
+        lines += [
+            f"  {_quoted(node.name)} -> {_quoted(link)} [dir=both, style=dashed]" for link in node.links
+        ]
+    for crowd in diagram.crowds:
+        text = "\n".join((f"{crowd.name}: {counted(crowd.count, 'peer')}", *crowd.settings))
+        lines.append(f"  {_quoted(f'peers {crowd.name}')} [label={_quoted(text)}, shape=box3d]")
+    return "\n".join([*lines, "}"])
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    return f'"{escaped}"'

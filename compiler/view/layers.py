@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from apc.compiler.view.diagram import Diagram, Vertex
-from apc.compiler.view.marks import FAINT, INK, SIZE, SMALL, Line, text_width
+from apc.compiler.view.svg import FAINT, INK, SIZE, SMALL, Line, text_width
 
 LINE = 15.0  # from one line of text to the next
 PAD, GAP, BETWEEN = 10.0, 42.0, 20.0  # inside a box, between columns, between rows

@@ -24,7 +24,7 @@ from apc.compiler.view.layers import (
     link_ways,
     place_columns,
 )
-from apc.compiler.view.marks import (
+from apc.compiler.view.svg import (
     EDGE,
     FAINT,
     FILL,
@@ -81,7 +81,8 @@ def place(diagram: Diagram) -> Picture:
     width = max(right, net_right, legend_right, *(left + head for head in heads)) + 24
     about = _cut(diagram.about, width - 2 * left, SIZE)
     head = [Text(left, 32, diagram.title, TITLE, bold=True), Text(left, 52, about, SIZE, colour=FAINT)]
-    return Picture(width, end + 20, (frame, *marks, *net_marks, title, *head[: 2 if about else 1], *legend))
+    everything = (frame, *marks, *net_marks, title, *head[: 2 if about else 1], *legend)
+    return Picture(width, end + 20, everything, f"{diagram.title}. {diagram.about}".strip())
 
 
 def _cut(text: str, width: float, size: float) -> str:

@@ -1,34 +1,118 @@
-"""A picture written as SVG.
+"""What a picture is made of: texts, boxes, lines and dots on a page; and the picture written as SVG.
 
-Takes: a `Diagram`, which is placed first. Gives: `draw_svg`.
-Guarantees: the same picture gives the same bytes, on every machine: coordinates are in tenths.
-Does not: place anything.
+Takes: a `Picture`, placed elsewhere.
+Gives: `Text`, `Box`, `Line`, `Dot`, their union `Mark`; `Picture`; `text_width`; the sizes and colours they
+share; `draw_svg`.
+Guarantees: plain frozen data; a text's box is an upper bound, as fonts differ. The same picture gives the
+same bytes, on every machine: coordinates are in tenths.
+Does not: place anything (see `layers`, `picture`).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from html import escape
 
-from apc.compiler.view.diagram import Diagram
-from apc.compiler.view.marks import Box, Dot, Line, Mark, Text
-from apc.compiler.view.picture import place
+SIZE, SMALL, TITLE = 12.0, 10.5, 18.0
+INK, FAINT, FILL, EDGE = "#1f2933", "#6b7785", "#e8eff8", "#2b4a72"
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A line of text; (x, y) is where its baseline starts, or its middle with `middle`."""
+
+    x: float
+    y: float
+    text: str
+    size: float = SMALL
+    bold: bool = False
+    middle: bool = False
+    colour: str = INK
+
+    @property
+    def box(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom: an upper bound, as fonts differ."""
+        width = text_width(self.text, self.size, bold=self.bold)
+        left = self.x - width / 2 if self.middle else self.x
+        return left, self.y - 0.8 * self.size, left + width, self.y + 0.25 * self.size
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A rectangle with round corners."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    fill: str = "white"
+    stroke: str = INK
+    dashed: bool = False
+    round: float = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line through points, or with `curved` the curve from the first to the last, level at both ends."""
+
+    points: tuple[tuple[float, float], ...]
+    colour: str = INK
+    dashed: bool = False
+    arrows: bool = False
+    curved: bool = False
+    width: float = 1.4
+
+
+@dataclass(frozen=True, slots=True)
+class Dot:
+    """A circle."""
+
+    x: float
+    y: float
+    radius: float
+    fill: str = INK
+    stroke: str = INK
+
+
+Mark = Text | Box | Line | Dot
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """Marks on a page of `width` times `height`; `title` says what it is to who can't see it."""
+
+    width: float
+    height: float
+    marks: tuple[Mark, ...]
+    title: str
+
+
+def text_width(text: str, size: float, *, bold: bool = False) -> float:
+    """Return about how wide a text is, rather too wide: as in DejaVu Sans, the widest font.
+
+    `size` is the font's, in the units of the page; so is the width.
+    """
+    em = sum(
+        0.36 if c in "iljtfrI.,:;|!'()[]/ -" else 0.98 if c in "mwMW@%…" else 0.72 if c.isupper() else 0.64
+        for c in text
+    )
+    return em * size * (1.1 if bold else 1.0)
+
 
 FONT = "Helvetica, Arial, 'DejaVu Sans', sans-serif"
 
 
-def draw_svg(diagram: Diagram) -> str:
-    """Return a diagram as an SVG document."""
-    picture = place(diagram)
+def draw_svg(picture: Picture) -> str:
+    """Return a picture as an SVG document."""
     size = f"{_n(picture.width)} {_n(picture.height)}"
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" width="{_n(picture.width)}" '
         f'height="{_n(picture.height)}" font-family="{FONT}" role="img">'
     )
-    what = escape(f"{diagram.title}. {diagram.about}".strip())
+    title = f"<title>{escape(picture.title)}</title>"
     body = [_svg(mark) for mark in picture.marks]
-    return "\n".join(
-        [head, f"<title>{what}</title>", '<rect width="100%" height="100%" fill="white"/>', *body, "</svg>"]
-    )
+    page = '<rect width="100%" height="100%" fill="white"/>'
+    return "\n".join([head, title, page, *body, "</svg>"])
 
 
 def _svg(mark: Mark) -> str:

@@ -62,7 +62,7 @@ class Prepared:
 class Analysis(Result):
     """The answer of an analysis; `spectral_radius` is per frame, rigid modes removed.
 
-    `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `plan.METHODS`.
+    `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `methods.METHODS`.
     `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
     say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided;
     `left_out` says what of the scene the answer does not look at. Of the rigid modes `translations` move
@@ -143,7 +143,7 @@ def analyze(
     system
         The compiled scene, with the numbers to analyse (see `overrides.apply`).
     method
-        One of `plan.METHODS`. "modes": a few small systems, where equal peers and the graph allow that;
+        One of `methods.METHODS`. "modes": a few small systems, where equal peers and the graph allow that;
         "dense": all peers as one matrix, the check on all else, at the cost of N³; "determinant": the
         zeros of a small characteristic function, for peers that all differ on complete graphs and for delays
         of any length; "krylov": the largest eigenvalues of one sparse matrix, for peers that differ on sparse
@@ -275,7 +275,7 @@ def _solve_ring(
     system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, certify: bool
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve equal peers on a large ring: those of its loops that decide."""
-    from apc.large.graph import deciding_loops, with_the_rest
+    from apc.large.rings import deciding_loops, with_the_rest
 
     ring = deciding_loops(groups, exchange)
     spectrum = _solve_closed(system, ring.arrangement.loops, certify=certify)

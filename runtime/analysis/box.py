@@ -27,9 +27,8 @@ from apc.compiler.formula import FaultError, carrying, exactly
 from apc.compiler.plain import RULES
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peer_group import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios
-from apc.eigen.runs import Runs
 from apc.frame.exact import evaluate_exact
 from apc.frame.linearize import site_of_row
 from apc.frame.names import Free, find

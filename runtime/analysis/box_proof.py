@@ -29,16 +29,19 @@ from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import (
     Balls,
-    compose,
+    Dual,
+    closed_frame,
     frame_steps,
+    mapped,
     precision,
     rational_ball,
     reduced_balls,
+    slope_of,
     square,
+    step_duals,
 )
 from apc.eigen.certify import schur_cohn
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.duals import Dual, mapped, slope_of, step_duals
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import relative_places
@@ -221,7 +224,7 @@ def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
         frame_steps(site, group.schedule, step_duals)
         for site, group in zip(sites, question.system.sites, strict=True)
     ]
-    matrix = compose(question.system, sites, steps)
+    matrix = closed_frame(question.system, sites, steps)
     if by is not None:
         matrix = mapped(slope_of, matrix)
     return reduced_balls(matrix, question.vectors, question.held, question.rest)

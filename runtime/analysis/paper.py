@@ -27,9 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis
+from apc.analysis.methods import PAPER
 from apc.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import ClosedSystem, Hearing, StateLayout, close
+from apc.eigen.closing import ClosedSystem, Feedback, StateLayout, close
 from apc.eigen.relative import Relative, independent_places, relative_bounded
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
@@ -41,8 +42,6 @@ from apc.threads import single_threaded
 from apc.trouble import finite_equations
 
 Floats = NDArray[np.float64]
-
-METHOD = "paper"
 
 # Rounding of a standing state from exact numbers, of its pivots' inverse and of the product of both, in units
 # of UNIT: a few operations an entry, of as many terms as there are rigid motions.
@@ -140,7 +139,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
         peers=system.peers,
         frame_s=closed.frame_s,
         states_per_peer=-(-(size - dead) // system.peers),
-        method=METHOD,
+        method=PAPER,
         verdict=spectrum.verdict,
         stable=spectrum.stable,
         spectral_radius=spectrum.spectral_radius,
@@ -233,8 +232,8 @@ def _close(lifted: _Lifted) -> Floats:
     """Return A_cl of eq. (20): the loop u_D = F_D y_D closed; what is on its way is in the state."""
     one = FrameMap(*lifted.delayed)
     names = ("",) * len(one.p)
-    hearing = Hearing(lifted.f, np.zeros((len(lifted.f), len(one.p))))
-    return close([one], [hearing], StateLayout((0,), names, {})).matrix
+    feedback = Feedback(lifted.f, np.zeros((len(lifted.f), len(one.p))))
+    return close([one], [feedback], StateLayout((0,), names, {})).matrix
 
 
 def _acting(loop: OpenLoop) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
@@ -360,7 +359,7 @@ def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tu
         at = Relative(held, rest, weights, 2 * off + wrong * np.abs(weights))
         matrix, error = relative_bounded(matrix, error, at)
     system = ClosedSystem(
-        name=METHOD,
+        name=PAPER,
         multiplicity=1,
         sites=(),  # a matrix by itself, its rigid motions already out
         coupling={},

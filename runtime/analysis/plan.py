@@ -1,7 +1,7 @@
 """How a system is going to be analysed: by which method, as which systems.
 
 Takes: a `CompiledSystem` with its Jacobians, schedules and numbers, and the exchange between its peers.
-Gives: `Plan`, `make_plan`, `METHODS`; `refuse_varying`.
+Gives: `Plan`, `make_plan`; `refuse_varying`, `is_large_ring`.
 Guarantees: nothing is solved, and no matrix of a whole system is built.
 Does not: analyse (see `analysis`).
 """
@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from apc.analysis.methods import METHODS, PAPER
 from apc.analysis.switches import varying_slopes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
+from apc.eigen.graph_loops import common_graph
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
 from apc.eigen.peers import more_differ, peer_groups
@@ -22,9 +24,6 @@ from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.parameters import Numbers
 from apc.frame.schedule import Schedule
-from apc.large.graph import is_large_ring
-
-METHODS = ("auto", "modes", "dense", "determinant", "krylov")
 
 # Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
 # says more.
@@ -35,6 +34,9 @@ MOST_FULL = 500
 
 # Equal peers on a graph without a closed form: of so many, its eigenvalues are not computed.
 MANY_PEERS = 1500
+
+# Equal peers on a ring of so many eigenvalues: only of those that decide is a system solved.
+MANY_EIGENVALUES = 128
 
 # From so many packets on their way on, leaving them out of the state is quicker.
 LONG_LINES = 60
@@ -96,7 +98,7 @@ def make_plan(
     jacobians, schedules, numbers, exchange
         One a kind, one a group, and what they are evaluated with.
     method
-        One of `METHODS`.
+        One of `methods.METHODS`, not the paper's.
 
     Raises
     ------
@@ -104,7 +106,7 @@ def make_plan(
         E804 a system of too many states for its matrix, E850 a method that can't serve this scene; and those
         of `refuse_varying` and `peers.peer_groups`.
     """
-    assert method in METHODS, f"no such method: {method}"
+    assert method in METHODS and method != PAPER, f"no such method: {method}"
     refuse_varying(system, jacobians)
     if method in ("auto", "determinant", "krylov"):
         reason = _not_crowds(system, jacobians)
@@ -140,6 +142,15 @@ def make_plan(
             if loop.states > MOST_STATES:
                 raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
     return Plan(found, groups, loops, False, _sizes(loops, found), notes)
+
+
+def is_large_ring(groups: Sequence[PeerGroup], exchange: Exchange) -> bool:
+    """Say whether all peers are equal, on one ring of many."""
+    ways = used_ways(group.schedule for group in groups)
+    shapes = {exchange.links[way.link].graph.shape for way in ways}
+    if len(groups) > 1 or shapes != {"ring"} or exchange.peers <= 2 * MANY_EIGENVALUES:
+        return False
+    return not common_graph(ways, exchange)
 
 
 def cannot_serve(system: CompiledSystem, method: str, reason: str) -> ApcError:

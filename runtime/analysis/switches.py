@@ -16,6 +16,7 @@ With all d set, what is left has the slopes of one piece.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,16 +28,15 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.plain import straight, symbolic, walk
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.start import start_values
 
 # A part with more decisions than this is refused: its pieces are as many as 2 to that power.
 MOST_DECISIONS = 6
 
-_EXTREMES = (casadi.OP_FMIN, casadi.OP_FMAX)
-_COMPARISONS = (casadi.OP_LT, casadi.OP_LE)
 # Equal, not equal: of things that move they are so at an instant at most.
-_POINTS = {casadi.OP_EQ: 0.0, casadi.OP_NE: 1.0}
+_POINTS = {"eq": 0.0, "ne": 1.0}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,9 +101,9 @@ class _Walk:
     def number(self, key: Any) -> int:
         return self.numbers.setdefault(key, len(self.numbers))
 
-    def decide(self, code: int, operands: Sequence[_Step]) -> _Step:
+    def decide(self, word: str, operands: Sequence[_Step]) -> _Step:
         """Return the symbol of a decision between these operands."""
-        number = self.number(("decision", code, *(one.number for one in operands)))
+        number = self.number(("decision", word, *(one.number for one in operands)))
         if number not in self.symbols:
             self.symbols[number] = casadi.SX.sym(f"d{len(self.symbols)}")
             self.operands[number] = [one.expression for one in operands]
@@ -114,49 +114,42 @@ class _Walk:
 
         `names` are the arguments', "p" and "t" those that do not move.
         """
+        known = straight(function)
         inputs = tuple(casadi.SX.sym(name, function.sparsity_in(i)) for i, name in enumerate(names))
-        nonzeros = [casadi.vertsplit(one.nz[:]) if one.nnz() else [] for one in inputs]
-        results = [casadi.SX(0.0)] * function.nnz_out(0)
-        work: list[Any] = [None] * function.sz_w()
-        for index in range(function.n_instructions()):
-            code = function.instruction_id(index)
-            into, out = function.instruction_input(index), function.instruction_output(index)
-            if code == casadi.OP_INPUT:
-                name = names[into[0]]
-                number = self.number((name, into[1]))
-                moves = name not in ("p", "t")
-                work[out[0]] = _Step(nonzeros[into[0]][into[1]], number, moves, decided=False)
-            elif code == casadi.OP_OUTPUT:
-                results[out[1]] = work[into[0]].expression
-            elif code == casadi.OP_CONST:
-                value = function.instruction_constant(index)
-                work[out[0]] = _Step(casadi.SX(value), self.number(("constant", value)), False, False)
-            else:
-                work[out[0]] = self.apply(code, [work[place] for place in into])
+        steps = [
+            _Step(entry, self.number((name, place)), name not in ("p", "t"), decided=False)
+            for name, one in zip(names, inputs, strict=True)
+            for place, entry in enumerate(casadi.vertsplit(one.nz[:]) if one.nnz() else [])
+        ]
+        steps += [
+            _Step(casadi.SX(value), self.number(("constant", value)), False, False)
+            for value in known.constants
+        ]
+        found = walk(known, steps, lambda word: functools.partial(self.apply, word))
+        results = [found[place].expression for place in known.results[0]]
         column = casadi.SX(function.sparsity_out(0), casadi.vertcat(*results)) if results else casadi.SX(0, 1)
         return inputs, casadi.densify(column)
 
-    def apply(self, code: int, operands: Sequence[_Step]) -> _Step:
+    def apply(self, word: str, *operands: _Step) -> _Step:
         """Return an operation of the function, or what a decision makes of it."""
-        number = self.number((code, *(one.number for one in operands)))
+        number = self.number((word, *(one.number for one in operands)))
         moves = any(one.moves for one in operands)
         decided = any(one.decided for one in operands)
         values = [one.expression for one in operands]
-        if moves and code in _COMPARISONS:
-            return self.decide(code, operands)
-        if moves and code in _POINTS:
-            return _Step(casadi.SX(_POINTS[code]), number, False, False)
-        if moves and code in _EXTREMES:
-            d = self.decide(code, operands).expression
+        if moves and word in ("lt", "le"):
+            return self.decide(word, operands)
+        if moves and word in _POINTS:
+            return _Step(casadi.SX(_POINTS[word]), number, False, False)
+        if moves and word in ("fmin", "fmax"):
+            d = self.decide(word, operands).expression
             return _Step(d * values[0] + (1 - d) * values[1], number, True, True)
-        if moves and code in (casadi.OP_FABS, casadi.OP_SIGN):
-            d = self.decide(casadi.OP_SIGN, operands).expression
-            value = (2 * d - 1) * values[0] if code == casadi.OP_FABS else 2 * d - 1
-            return _Step(value, number, code == casadi.OP_FABS, True)
-        if code == casadi.OP_IF_ELSE_ZERO and operands[0].decided:
+        if moves and word in ("fabs", "sign"):
+            d = self.decide("sign", operands).expression
+            value = (2 * d - 1) * values[0] if word == "fabs" else 2 * d - 1
+            return _Step(value, number, word == "fabs", True)
+        if word == "if_else_zero" and operands[0].decided:
             return _Step(values[0] * values[1], number, moves, True)
-        one_or_two = casadi.SX.unary if len(values) == 1 else casadi.SX.binary
-        return _Step(one_or_two(code, *values), number, moves, decided)
+        return _Step(symbolic(word)(*values), number, moves, decided)
 
 
 def find_switches(kind: Kind) -> SwitchedKind:
@@ -164,14 +157,14 @@ def find_switches(kind: Kind) -> SwitchedKind:
     functions = _functions(kind)
     if not all(function.is_a("SXFunction") for _, function, _ in functions):
         return SwitchedKind(kind, (), (), walkable=False)
-    walk = _Walk()
-    opened = tuple(_Opened(where, *walk.open(function, names)) for where, function, names in functions)
+    opening = _Walk()
+    opened = tuple(_Opened(where, *opening.open(function, names)) for where, function, names in functions)
     decisions = []
-    for number, symbol in walk.symbols.items():
+    for number, symbol in opening.symbols.items():
         changed: dict[str, None] = {}
         for one in opened:
             if casadi.depends_on(one.output, symbol):
-                changed |= dict.fromkeys(_changed(kind, one, symbol, walk.operands[number]))
+                changed |= dict.fromkeys(_changed(kind, one, symbol, opening.operands[number]))
         decisions.append(Decision(symbol, tuple(changed)))
     return SwitchedKind(kind, tuple(decisions), opened, walkable=True)
 

@@ -3,7 +3,8 @@
 Takes: a `CompiledSystem`.
 Gives: `Measured`, `Comparison`, `Bench`, `bench`; `pareto_front`.
 Guarantees: times are the processor's, medians over rounds in which all methods take turns; an error is the
-distance from a reference of fifty digits, and is left out where there is none.
+distance from the same equations in balls (of a spectral radius) or from the exact transition (of a motion,
+whose own error is what one rounding of every coefficient makes), and is left out where there is none.
 Does not: draw (see `bench.figure`), or grow the scene (see `bench.scale`).
 """
 
@@ -18,27 +19,26 @@ from functools import partial
 from os import cpu_count
 from typing import Any
 
-import flint
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
+from apc.analysis.methods import AUTO, METHODS, PAPER
 from apc.analysis.needs import needs
 from apc.analysis.paper import analyze_paper
-from apc.benchmark.reference import PRECISIONS, Truth, exact_course, spectral_truth
 from apc.benchmark.timing import spread_of, take_turns, timed
+from apc.benchmark.truth import Truth, spectral_truth
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.words import with_unit
 from apc.distribution import versions
-from apc.eigen.balls import precision
 from apc.frame.discretize import UNIT
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.result import Result
 from apc.simulation.blocks import blocks
 from apc.simulation.flow import state_scales
-from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings
+from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings, finer
 from apc.simulation.simulation import Simulation, prepare
 from apc.threads import single_threaded
 
@@ -53,9 +53,8 @@ ROUNDS, ENOUGH = 15, 3.0
 # states and hundreds of ticks.
 SAME = 64 * UNIT
 
-# How long the scene is played: what balls can follow in a few seconds, and longer than any start-up.
+# How long the scene is played: longer than any start-up.
 DURATION = Fraction(1, 4)
-MOST_PLAYED = 30  # peers: each of them is followed in balls
 
 # States of the one sparse matrix of method krylov, which has no limit of its own: on a complete graph 2,424
 # took 19 s, 3,000 took 74 s. What is too large for another method is refused by that method itself.
@@ -64,8 +63,8 @@ MOST_SPARSE = 2500
 FAILED, WRONG = "FAILED, which is a bug", "WRONG"  # how what must not be is said
 
 # Of `analyze(method=…)`, and the two that are called otherwise.
-CERTIFIED, PAPER = "certified", "paper"
-ANALYSES = ("modes", "dense", "determinant", "krylov", CERTIFIED, PAPER)
+CERTIFIED = "certified"
+ANALYSES = (*(one for one in METHODS if one not in (AUTO, PAPER)), CERTIFIED, PAPER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,13 +220,14 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
         _measured(
             name,
             times[name],
-            error=_radius_error(found, truth) if isinstance(truth, Truth) else None,
+            error=truth.error_of(found.spectral_radius) if isinstance(truth, Truth) else None,
             bound=found.spectral_radius_error,
             chosen=name == default.method,
         )
         for name, found in results.items()
     ]
-    said = truth if isinstance(truth, str) else f"spectral radius {truth.digits} of the numbers as doubles"
+    balls = "the same equations in 512-bit balls, of the numbers as doubles: spectral radius"
+    said = truth if isinstance(truth, str) else f"{balls} {truth.digits}"
     notes = [
         f"{WRONG}: {name} says {found.verdict}, {default.method} {default.verdict}"
         for name, found in results.items()
@@ -262,42 +262,38 @@ def _not_proved(found: Analysis) -> str:
     return "; ".join(note for note in found.notes if "not proved" in note) or f"not proved: {found.proof}"
 
 
-def _radius_error(found: Analysis, truth: Truth) -> float:
-    with precision(PRECISIONS[0]):
-        return float(abs(truth.radius - flint.arb(found.spectral_radius)).mid())
-
-
 def bench_simulation(
     system: CompiledSystem, duration: Fraction = DURATION, *, rounds: int = ROUNDS
 ) -> Comparison:
     """Measure every method of simulation, from the first instant to the last.
 
-    The error is the largest of any continuous state at any tick, relative to the largest value that a state
-    of its unit takes.
+    The error is the largest distance of any continuous state at any tick from the exact transition, relative
+    to the largest value that a state of its unit takes. The exact transition itself is as far off as it moves
+    where every coefficient is off by one rounding (see `accuracy`).
     """
     notes = []
     if _rests(system, duration):
         system, how = _moved(system)
         notes.append(f"nothing moves in this scene: {how}")
-    if system.peers > MOST_PLAYED:
-        truth: tuple[tuple[str, ...], Any] | str = f"{system.peers:,} peers are too many to follow in balls"
-    else:
-        truth = exact_course(system, duration)
     calls = {str(method): partial(_ready, system, duration, method) for method in _methods(system)}
     ready, refused, _ = _first(calls)
     times = take_turns({name: partial(_play, one) for name, one in ready.items()}, rounds, enough=ENOUGH)
     chosen = prepare(system, Settings(duration)).how
+    exact = ready.get(EXACT)
+    rounded, _ = finer(Method(EXACT), all_linear=True)
     measured = [
         _measured(
             name,
             times[name],
-            error=None if isinstance(truth, str) else _course_error(one, truth),
+            error=exact and _distance(_ready(system, duration, rounded) if one is exact else one, exact),
             bound=None,
             chosen=name == chosen or (name == str(DEFAULT) and chosen != EXACT),
         )
         for name, one in ready.items()
     ]
-    said = truth if isinstance(truth, str) else f"{len(truth[1])} instants in ball arithmetic"
+    said = dict(refused).get(
+        EXACT, "the exact transition, itself off by what one rounding of each number makes"
+    )
     return _simulation(duration, pareto_front(measured), said, refused, tuple(notes))
 
 
@@ -368,19 +364,22 @@ def _play(simulation: Simulation) -> None:
         pass
 
 
-def _course_error(simulation: Simulation, truth: tuple[tuple[str, ...], Floats]) -> float:
-    """Return the largest error of any state, relative to the largest value of its unit."""
-    names, rows = truth
-    values = np.concatenate([block.values for block in blocks(simulation)])
-    place = {signal.name: number for number, signal in enumerate(simulation.signals)}
-    units = np.array([simulation.signals[place[name]].unit for name in names])
-    if len(values) < len(rows):
-        return np.inf  # it left the range of floats
-    apart = np.abs(values[:, [place[name] for name in names]] - rows)
+def _distance(simulation: Simulation, exact: Simulation) -> float:
+    """Return how far any state is from an exact run, relative to the largest value of its unit there."""
+    names = {state.name for kind in simulation.system.kinds for state in kind.states}
+    moving = [place for place, signal in enumerate(exact.signals) if signal.local in names]
+    rows = (row for block in blocks(simulation) for row in block.values)
+    apart, size = np.zeros(len(moving)), np.zeros(len(moving))
+    for block in blocks(exact):
+        for row in block.values[:, moving]:
+            other = next(rows, None)
+            if other is None:
+                return np.inf  # it left the range of floats
+            apart, size = np.maximum(apart, np.abs(other[moving] - row)), np.maximum(size, np.abs(row))
     worst = 0.0
+    units = np.array([exact.signals[place].unit for place in moving])
     for unit in dict.fromkeys(units.tolist()):
-        largest = float(np.abs(rows[:, units == unit]).max())
-        error = float(apart[:, units == unit].max())
+        error, largest = (float(one[units == unit].max()) for one in (apart, size))
         worst = max(worst, error / largest if largest else error)
     return worst
 

@@ -12,15 +12,14 @@ import resource
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from apc.analysis.analysis import analyze
 from apc.benchmark.bench import reason_of
-from apc.benchmark.reference import Truth, spectral_truth
 from apc.benchmark.timing import median_time, timed
+from apc.benchmark.truth import Truth, spectral_truth
 from apc.compiler.compiled import LARGEST_COUNT, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.pipeline import stages_of
@@ -152,16 +151,13 @@ def _measure(path: Path, count: int) -> ScaleRow:
     analyzed, found = median_time(partial(analyze, system), REPEATS)
     memory = _memory()
     truth = spectral_truth(system)
-    off = None
-    if isinstance(truth, Truth):
-        off = float(abs(Fraction(truth.digits) - Fraction(found.spectral_radius)))
     return ScaleRow(
         count=count,
         peers=system.peers,
         compile_s=compiled,
         analyze_s=analyzed,
         memory=memory,
-        error=off,
+        error=truth.error_of(found.spectral_radius) if isinstance(truth, Truth) else None,
         bound=found.spectral_radius_error,
         method=found.method,
         verdict=found.verdict,

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import click
 
+from apc.analysis.methods import AUTO, METHODS
 from apc.cli.options import json_option, print_result, set_option
 from apc.threads import start_single_threaded
-
-METHODS = ("auto", "modes", "dense", "determinant", "krylov", "paper")
 
 
 @click.command("analyze")
@@ -21,7 +20,7 @@ METHODS = ("auto", "modes", "dense", "determinant", "krylov", "paper")
 @click.option(
     "--method",
     type=click.Choice(METHODS),
-    default="auto",
+    default=AUTO,
     show_default=True,
     metavar="METHOD",
     help="auto: what serves the scene. modes: a few small systems. dense: all peers in one, to check. "

@@ -1,10 +1,10 @@
 """The frame of a closed system in ball arithmetic: every entry an interval that holds the true number.
 
 Takes: a `ClosedSystem`; its sites' matrices as exact rationals.
-Gives: `precision`, `unprovable`, `rational_ball`, `site_balls`, `frame_steps`, `compose`, `frame_balls`,
-`reduced_balls`, `square`.
+Gives: `precision`, `unprovable`, `rational_ball`, `site_balls`, `frame_steps`, `closed_frame`, `frame_balls`,
+`reduced_balls`, `square`; `Dual`, `slope_of`, `step_duals`: balls with a slope.
 Guarantees: the true matrix, of the numbers the sites hold, lies in the balls, whatever the number of bits;
-more bits make them smaller.
+more bits make them smaller. Where a parameter is a ball, value and slope hold those of every parameter in it.
 Does not: decide anything (see `certify`).
 
 The frame is followed event by event over the state of the closed system itself (`lift.follow`), all sites
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -99,10 +100,10 @@ def frame_balls(system: ClosedSystem) -> Balls:
         if key not in known:
             known[key] = frame_steps(site, group.schedule)
         steps.append(known[key])
-    return compose(system, sites, steps)
+    return closed_frame(system, sites, steps)
 
 
-def compose(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[Steps]) -> Balls:
+def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[Steps]) -> Balls:
     """Follow all sites of a closed system through one frame, over its state.
 
     Parameters
@@ -223,3 +224,68 @@ def reduced_balls(
     weights = weights.reshape(len(rest), count)
     places = np.array(held, dtype=np.intp), np.array(rest, dtype=np.intp)
     return relative(matrix, Relative(*places, weights, np.zeros(weights.shape)), multiply=_multiply)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dual:
+    """`value` and its derivative `slope`; adds and multiplies with whole numbers and balls, too."""
+
+    value: Any
+    slope: Any
+
+    def __add__(self, other: Any) -> Dual:
+        if isinstance(other, Dual):
+            return Dual(self.value + other.value, self.slope + other.slope)
+        return Dual(self.value + other, self.slope)
+
+    def __mul__(self, other: Any) -> Dual:
+        if isinstance(other, Dual):
+            return Dual(self.value * other.value, self.value * other.slope + self.slope * other.value)
+        return Dual(self.value * other, self.slope * other)
+
+    def __neg__(self) -> Dual:
+        return Dual(-self.value, -self.slope)
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+
+def value_of(entry: Any) -> Any:
+    """Return the value of a number with or without a slope."""
+    return entry.value if isinstance(entry, Dual) else entry
+
+
+def slope_of(entry: Any) -> Any:
+    """Return the slope of a number, 0 for one that has none."""
+    return entry.slope if isinstance(entry, Dual) else 0
+
+
+def mapped(change: Any, numbers: Balls) -> Balls:
+    """Return an array of changed numbers."""
+    entries = np.empty(numbers.size, dtype=object)
+    entries[:] = [change(entry) for entry in numbers.ravel()]
+    return entries.reshape(numbers.shape)
+
+
+def step_duals(a: Balls, b: Balls, duration: Fraction) -> Balls:
+    """Return [F G] (n_x, n_x + n_u) of one duration with its slope; see `discretize.step_balls`.
+
+    Notes
+    -----
+    y = ∂x/∂p moves by dy/dt = A y + A′ x + B′ u beside dx/dt = A x + B u, so that the rows of y in the step
+    of both are the slope.
+    """
+    steady_a, steady_b, slope_a, slope_b = (
+        mapped(part, matrix) for part in (value_of, slope_of) for matrix in (a, b)
+    )
+    n = len(a)
+    if all(isinstance(entry, int) for entry in (*slope_a.ravel(), *slope_b.ravel())):
+        return step_balls(steady_a, steady_b, duration)
+    nothing = np.zeros((n, n), dtype=object)
+    both = step_balls(
+        np.block([[steady_a, slope_a], [nothing, steady_a]]), np.vstack([slope_b, steady_b]), duration
+    )
+    values, slopes = both[n:, n:], both[:n, n:]
+    entries = np.empty(values.size, dtype=object)
+    entries[:] = [Dual(value, slope) for value, slope in zip(values.ravel(), slopes.ravel(), strict=True)]
+    return entries.reshape(values.shape)

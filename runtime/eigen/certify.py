@@ -6,9 +6,9 @@ Guarantees: a verdict True or False is proved: every rounding since the sites' e
 What is too near the circle for the last precision is left open, and so is what lies on it.
 Does not: prove what its numbers can't be had exactly for (see `balls.unprovable`).
 
-The characteristic polynomial of the relative coordinates comes in balls, for each part (see `components`) its
-own. Smith's discs enclose its roots (see `roots`); where one reaches over the circle, Schur and Cohn's
-recursion decides without an eigenvalue being known.
+The characteristic polynomial of the relative coordinates comes in balls, each part (see `enclosure`) its own.
+Smith's discs enclose its roots (see `roots`); where one reaches over the circle, Schur and Cohn's recursion
+decides without an eigenvalue being known.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.balls import Balls, frame_balls, precision, rational_ball, reduced_balls, square
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.components import components
-from apc.eigen.enclosure import discs
+from apc.eigen.enclosure import components, discs
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.roots import approach_roots, root_discs

@@ -1,8 +1,8 @@
 """Close a loop: what each site hears is what the others send, and one matrix moves them all.
 
 Takes: groups of equal peers, and what each weighs the packets of each other by.
-Gives: `Loop`, `Coupling`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`, `close_loop`; `Hearing`,
-`hearing_of`, `close`, `closing_errors`, `shift_packets`.
+Gives: `Loop`, `Coupling`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`, `close_loop`; `Feedback`,
+`feedback_of`, `close`, `closing_errors`, `shift_packets`.
 Guarantees: the state holds, site by site, z and then the packets on their way, in order of row and age. The
 matrix of `close_loop` comes with a bound on its rounding error, entry by entry; `close` takes one system or
 many (k, …), real or complex.
@@ -165,13 +165,13 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
     """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it."""
     lifted = [group.lifted for group in loop.sites]
     layout = lay_out_loop(loop)
-    closed = close(lifted, hearing_of(loop, layout, lambda weight, _: float(weight)), layout)
+    closed = close(lifted, feedback_of(loop, layout, lambda weight, _: float(weight)), layout)
     # The magnitudes, and these with their errors: those of the sites, and of the weights.
-    hearing = hearing_of(loop, layout, lambda weight, _: float(abs(weight)))
-    doubtful = hearing_of(loop, layout, lambda weight, doubt: float(abs(weight)) + doubt)
+    feedback = feedback_of(loop, layout, lambda weight, _: float(abs(weight)))
+    doubtful = feedback_of(loop, layout, lambda weight, doubt: float(abs(weight)) + doubt)
     sizes = [site.mapped(np.abs) for site in lifted]
     wide = [size.mapped(np.add, site.error) for size, site in zip(sizes, lifted, strict=True)]
-    error = closing_errors(sizes, wide, hearing, layout, doubtful=doubtful)
+    error = closing_errors(sizes, wide, feedback, layout, doubtful=doubtful)
     return ClosedSystem(
         name=loop.name,
         multiplicity=loop.multiplicity,
@@ -193,7 +193,7 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
 
 
 @dataclass(frozen=True, slots=True)
-class Hearing:
+class Feedback:
     """What a site hears, r = `now` s + `before` x.
 
     s are the packets that all sites send in this frame, site by site; x is the state, and behind it, if
@@ -204,9 +204,9 @@ class Hearing:
     before: Matrix  # (n_r, n)
 
     @property
-    def size(self) -> Hearing:
+    def size(self) -> Feedback:
         """The magnitudes of its weights."""
-        return Hearing(np.abs(self.now), np.abs(self.before))
+        return Feedback(np.abs(self.now), np.abs(self.before))
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,9 +222,9 @@ class Closed:
     turns: int
 
 
-def hearing_of(
+def feedback_of(
     loop: Loop | ClosedSystem, layout: StateLayout, weigh: Callable[[Fraction, float], float]
-) -> list[Hearing]:
+) -> list[Feedback]:
     """Return what each site hears.
 
     `weigh` makes a number of a weight and by how much it may be off.
@@ -245,16 +245,16 @@ def hearing_of(
                     now[line, starts[h] + row] = weigh(weight, doubt)
                 else:
                     before[line, layout.places[Packet(h, row, one.lag)]] = weigh(weight, doubt)
-        found.append(Hearing(now, before))
+        found.append(Feedback(now, before))
     return found
 
 
-def close(maps: Sequence[FrameMap], hearing: Sequence[Hearing], layout: StateLayout) -> Closed:
+def close(maps: Sequence[FrameMap], feedback: Sequence[Feedback], layout: StateLayout) -> Closed:
     """Close a loop, or many of one layout (k, …).
 
     Parameters
     ----------
-    maps, hearing
+    maps, feedback
         Each site's, over real or complex numbers.
     layout
         The state's.
@@ -264,26 +264,26 @@ def close(maps: Sequence[FrameMap], hearing: Sequence[Hearing], layout: StateLay
     Packets heard in the frame they are sent in make a loop within the frame, s = S z + D r and r = W₀ s + …,
     that time orders: D W₀ is nilpotent, and I − D W₀ is solved exactly by as many steps as there are packets.
     """
-    n, columns = len(layout.names), hearing[0].before.shape[-1]
-    parts = [block for one in maps for block in one.blocks] + [one.before for one in hearing]
+    n, columns = len(layout.names), feedback[0].before.shape[-1]
+    parts = [block for one in maps for block in one.blocks] + [one.before for one in feedback]
     many = np.broadcast_shapes(*(block.shape[:-2] for block in parts))
     number = np.result_type(*parts)
     starts = np.cumsum([0] + [one.s.shape[-2] for one in maps])
     rows = [slice(start, start + one.s.shape[-2]) for one, start in zip(maps, starts, strict=False)]
     z = [slice(offset, offset + one.p.shape[-1]) for one, offset in zip(maps, layout.offsets, strict=True)]
     sent = np.zeros((*many, starts[-1], columns), dtype=number)
-    for one, heard, own, place in zip(maps, hearing, rows, z, strict=True):
+    for one, heard, own, place in zip(maps, feedback, rows, z, strict=True):
         sent[..., own, place] = one.s
         sent[..., own, :] += one.d @ heard.before
-    turns, at_once = 0, any(heard.now.any() for heard in hearing)
+    turns, at_once = 0, any(heard.now.any() for heard in feedback)
     if at_once:
         within = np.zeros((*many, starts[-1], starts[-1]), dtype=number)
-        for one, heard, own in zip(maps, hearing, rows, strict=True):
+        for one, heard, own in zip(maps, feedback, rows, strict=True):
             within[..., own, :] = one.d @ heard.now
         sent, turns = _sent_in_turn(within, sent)
     matrix = np.zeros((*many, n, columns), dtype=number)
     received = []
-    for one, heard, place in zip(maps, hearing, z, strict=True):
+    for one, heard, place in zip(maps, feedback, z, strict=True):
         r = heard.now @ sent + heard.before if at_once else heard.before
         received.append(r)
         matrix[..., place, place] = one.p
@@ -330,10 +330,10 @@ def shift_packets(matrix: Matrix, layout: StateLayout, sent: Callable[[Packet], 
 def closing_errors(
     size: Sequence[FrameMap],
     wide: Sequence[FrameMap],
-    hearing: Sequence[Hearing],
+    feedback: Sequence[Feedback],
     layout: StateLayout,
     *,
-    doubtful: Sequence[Hearing] | None = None,
+    doubtful: Sequence[Feedback] | None = None,
     times: int = 1,
 ) -> Closed:
     """Bound the errors of a closed loop, entry by entry: those of its sites and weights, and its rounding.
@@ -343,7 +343,7 @@ def closing_errors(
     size, wide
         The magnitudes of the sites' maps, and these with their errors: what they close to differs by a bound
         on the errors to all orders.
-    hearing, doubtful
+    feedback, doubtful
         The magnitudes of what each weighs, and these with their errors where they have any.
     layout
         The state's.
@@ -354,8 +354,8 @@ def closing_errors(
     -------
     The bounds.
     """
-    doubtful = hearing if doubtful is None else doubtful
-    bound, upper = close(size, hearing, layout), close(wide, doubtful, layout)
+    doubtful = feedback if doubtful is None else doubtful
+    bound, upper = close(size, feedback, layout), close(wide, doubtful, layout)
     roundings = times * _closing_roundings(wide, doubtful, upper.turns)
 
     def off(large: Matrix, small: Matrix) -> Matrix:
@@ -365,13 +365,13 @@ def closing_errors(
     return Closed(off(upper.matrix, bound.matrix), heard, off(upper.sent, bound.sent), upper.turns)
 
 
-def _closing_roundings(maps: Sequence[FrameMap], hearing: Sequence[Hearing], turns: int) -> float:
+def _closing_roundings(maps: Sequence[FrameMap], feedback: Sequence[Feedback], turns: int) -> float:
     """Return how much closing a loop rounds, relative to its magnitudes.
 
     A sum rounds as often as it has terms that are not zero, whatever the size of the whole.
     """
-    listened = max(one.now.shape[-2] for one in hearing)
-    senders = max(int(np.count_nonzero(one.now, axis=-1).max(initial=0)) for one in hearing)
+    listened = max(one.now.shape[-2] for one in feedback)
+    senders = max(int(np.count_nonzero(one.now, axis=-1).max(initial=0)) for one in feedback)
     terms = max(one.p.shape[-1] for one in maps) + listened * (1 + senders)
     turns = max(turns, *(one.s.shape[-2] for one in maps))
     return float(4 * (terms + 2) * (1 + turns) * UNIT)

@@ -82,10 +82,12 @@ def left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
     """Return left vectors (…, n, n) as rows: those of Mᵀ, each to its nearest of the values (…, n)."""
     found, vectors = np.linalg.eig(matrix.swapaxes(-1, -2))
     distances = np.abs(values[..., :, None] - found[..., None, :])
-    nearest = np.empty(values.shape, dtype=np.intp)
-    for place in range(values.shape[-1]):
-        nearest[..., place] = np.argmin(distances[..., place, :], axis=-1)
-        np.put_along_axis(distances, nearest[..., None, place, None], np.inf, axis=-1)
+    nearest = np.argmin(distances, axis=-1)
+    for one in np.ndindex(*values.shape[:-1]):
+        if len(set(nearest[one].tolist())) < values.shape[-1]:  # each goes to one only, as they come
+            for place, line in enumerate(distances[one]):
+                nearest[one][place] = np.argmin(line)
+                distances[one][:, nearest[one][place]] = np.inf
     rows = np.take_along_axis(vectors.swapaxes(-1, -2), nearest[..., None], axis=-2)
     return np.asarray(rows.astype(np.complex128))
 

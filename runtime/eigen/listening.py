@@ -15,8 +15,7 @@ from typing import Any
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.weights import exact_weight
-from apc.eigen.peer_group import Gains
-from apc.eigen.runs import Peers
+from apc.eigen.peer_group import Gains, Peers
 from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.jacobians import SiteJacobians, edge_name

@@ -1,10 +1,13 @@
 """A whole system as few and small loops instead of one large one.
 
 Takes: the groups of equal peers of a scene, and the exchange between them.
-Gives: `Split`, `split`; `Arrangement`, `arrange`; `complete_loops`, `dense_loop`, `dense`.
+Gives: `Split`, `split`; `Arrangement`, `arrange`; `complete_loops`, `dense_loop`, `dense`, `split_twins`;
+`couple`, `complete_degrees`.
 Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
-`dense`, whatever the number of peers.
-Does not: compute eigenvalues (see `spectrum`).
+`dense`, whatever the number of peers. Weights are exact; a mean over nobody, or of weights that add up to 0,
+raises.
+Does not: compute eigenvalues (see `spectrum`); find symmetries of different peers other than of two that
+change places.
 
 On a complete graph a peer of group g hears r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and 1
 for a sum. K groups of n_1 … n_K equal peers then split exactly:
@@ -14,25 +17,27 @@ for a sum. K groups of n_1 … n_K equal peers then split exactly:
     times
 
 Equal peers on any other graph: see `graph_loops`. Different peers on such a graph are one whole system, less
-those that can change places: see `twins`.
+twins: g and h of equal dynamics that hear all others alike and are heard by them alike. A class c of n_c
+twins that weigh themselves by w_own and one another by w_other moves alike, as one site that hears
+w_own + (n_c − 1) w_other times itself and n_d W_cd times class d; or apart, its sum zero and all else at
+rest, each twin hearing w_own − w_other times itself, n_c − 1 times over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 
 from apc.compiler.weights import exact_weight
-from apc.eigen.closing import ClosedSystem, Loop, close_loop
-from apc.eigen.coupling import complete_degrees, couple
+from apc.eigen.closing import ClosedSystem, Coupling, Loop, close_loop
 from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale
 from apc.eigen.graph_modes import graph_modes
-from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
-from apc.eigen.twins import split_twins
-from apc.frame.exchange import Exchange
+from apc.eigen.peer_group import MOST_STATES, PeerGroup, group_name, states_of, too_large, used_ways
+from apc.frame.exchange import Exchange, check_mean
+from apc.frame.schedule import Way
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,3 +179,125 @@ def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
         everyone, exchange, lambda way, g, h: weights[way.link].get((g, h), Fraction(0)), degrees
     )
     return Loop("dense", 1, everyone, coupling)
+
+
+def split_twins(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
+    """Split a loop by its twins.
+
+    Parameters
+    ----------
+    loop
+        Of all peers, one a site, its weights exact; without twins it is returned as it is.
+    exchange
+        The links, for the names of the groups.
+    """
+    classes: list[list[int]] = []
+    for place in range(len(loop.sites)):
+        alike = (members for members in classes if _are_twins(loop, members[0], place))
+        found = next(alike, None)
+        if found is None:
+            classes.append([place])
+        else:
+            found.append(place)
+    if loop.doubts or len(classes) == len(loop.sites):
+        return (loop,)
+    sites = tuple(_together([loop.sites[place] for place in members], exchange) for members in classes)
+    coupling = {
+        way: tuple(tuple(_weight_of(loop, way, members, others) for others in classes) for members in classes)
+        for way in loop.coupling
+    }
+    loops = [replace(loop, name="common", sites=sites, coupling=coupling)]
+    for site, members in zip(sites, classes, strict=True):
+        if len(members) > 1:
+            first, second = members[:2]
+            apart = {
+                way: ((rows[first][first] - rows[first][second],),) for way, rows in loop.coupling.items()
+            }
+            many = loop.multiplicity * (len(members) - 1)
+            loops.append(Loop(f"difference {site.name}", many, (site,), apart))
+    return tuple(loops)
+
+
+def _are_twins(loop: Loop, g: int, h: int) -> bool:
+    """Say whether two sites can change places."""
+    one, other = loop.sites[g], loop.sites[h]
+    if one.lifted is not other.lifted or one.schedule is not other.schedule:
+        return False
+    rest = [place for place in range(len(loop.sites)) if place not in (g, h)]
+    return all(
+        rows[g][g] == rows[h][h]
+        and rows[g][h] == rows[h][g]
+        and all(rows[g][k] == rows[h][k] and rows[k][g] == rows[k][h] for k in rest)
+        for rows in loop.coupling.values()
+    )
+
+
+def _weight_of(loop: Loop, way: Way, members: Sequence[int], others: Sequence[int]) -> Fraction:
+    """Return what a site of one class hears of a class whose sites all move alike."""
+    row = loop.coupling[way][members[0]]
+    return sum((row[place] for place in others), Fraction(0))
+
+
+def _together(sites: Sequence[PeerGroup], exchange: Exchange) -> PeerGroup:
+    """Return equal sites as one group."""
+    peers = np.sort(np.concatenate([np.array(list(site.peers)) for site in sites]))
+    groups = np.searchsorted(exchange.starts, peers, side="right") - 1
+    parts = [(int(group), peers[groups == group] - exchange.starts[group]) for group in np.unique(groups)]
+    return replace(sites[0], name=group_name(parts, exchange), count=len(peers), peers=peers)
+
+
+def couple(
+    groups: Sequence[PeerGroup],
+    exchange: Exchange,
+    weigh: Callable[[Way, int, int], Fraction],
+    degrees: Mapping[tuple[str, int], Fraction],
+) -> Coupling:
+    """Weigh each site's packets at each other, way by way.
+
+    Parameters
+    ----------
+    groups
+        The sites.
+    exchange
+        The links.
+    weigh
+        The weight of a packet of site h at site g in a plain sum.
+    degrees
+        What a mean is divided by, by link and site; who hears nobody has no entry.
+    """
+    coupling = {}
+    for way in used_ways(group.schedule for group in groups):
+        rows = []
+        for g, group in enumerate(groups):
+            hears = any(one.way == way for one in group.schedule.heard)
+            if hears and way.operator == "mean":
+                total = degrees.get((way.link, g))
+                check_mean(
+                    exchange, int(group.peers[0]), way.link, "mean", total is not None, total or Fraction(0)
+                )
+            row = []
+            for h, sender in enumerate(groups):
+                weight = weigh(way, g, h) if hears and sender.sends(way.link) else Fraction(0)
+                if weight and exchange.delay(way.link, sender.role, group.role) == way.delay:
+                    if way.operator == "mean":
+                        weight /= degrees[way.link, g]
+                    elif way.operator in ("max", "min"):  # the one it is taken from counts once
+                        weight = Fraction(1 if weight > 0 else -1)
+                    row.append(weight * group.gain(way, sender))
+                else:
+                    row.append(Fraction(0))
+            rows.append(tuple(row))
+        coupling[way] = tuple(rows)
+    return coupling
+
+
+def complete_degrees(groups: Sequence[PeerGroup], exchange: Exchange) -> dict[tuple[str, int], Fraction]:
+    """Return how many others a peer of each group hears over each complete link."""
+    degrees = {}
+    for link in exchange.links:
+        total = sum(group.count for group in groups if group.sends(link))
+        for g, group in enumerate(groups):
+            number = total - (1 if group.sends(link) else 0)
+            if number:
+                degrees[link, g] = Fraction(number)
+    return degrees

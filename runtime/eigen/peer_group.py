@@ -1,22 +1,25 @@
 """Peers that move alike: one site, linearized and lifted once for all of them.
 
-Takes: a parameter vector of theirs, its matrices, its schedule, what it hears at the start.
-Gives: `PeerGroup`, `build_group`; `used_ways`, `states_of`; `check_size`, `too_large`.
-Guarantees: a group's matrices are at hand in exact rationals as well, wherever its functions can be walked.
+Takes: a parameter vector of theirs, its matrices, its schedule, what it hears at the start; their numbers.
+Gives: `PeerGroup`, `build_group`; `used_ways`, `states_of`; `check_size`, `too_large`; `Peers`, `Runs`,
+`shifted`, `joined`.
+Guarantees: a group's matrices are at hand in exact rationals as well, wherever its functions can be walked;
+peers that follow one another take no memory, however many they are.
 Does not: find out who is alike (see `peers`); close a loop (see `closing`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.runs import Peers, joined, shifted
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import LiftedSite, lift
@@ -26,6 +29,47 @@ from apc.frame.site import LinearSite, rational_floats
 from apc.frame.start import Listening
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """Peers by number, in runs that follow one another: a billion equal peers take no memory."""
+
+    ranges: tuple[range, ...]
+
+    def __len__(self) -> int:
+        return sum(len(one) for one in self.ranges)
+
+    def __iter__(self) -> Iterator[int]:
+        return itertools.chain.from_iterable(self.ranges)
+
+    def __getitem__(self, place: int | slice) -> Any:
+        if isinstance(place, slice):
+            return list(itertools.islice(self, place.start, place.stop, place.step))
+        return next(itertools.islice(self, place, None))
+
+    def shifted(self, by: int) -> Runs:
+        """Return the peers counted from another start."""
+        return Runs(tuple(range(one.start + by, one.stop + by) for one in self.ranges))
+
+
+# Some peers of a group, or of the scene, by number.
+Peers = Integers | Runs
+
+
+def shifted(peers: Peers, by: int) -> Peers:
+    """Return peers counted from another start."""
+    return peers.shifted(by) if isinstance(peers, Runs) else peers + by
+
+
+def joined(listed: Sequence[Peers]) -> Peers:
+    """Return peers together, in order."""
+    runs = [one for one in listed if isinstance(one, Runs)]
+    if len(runs) == len(listed):
+        return Runs(tuple(sorted((run for one in runs for run in one.ranges), key=lambda run: run.start)))
+    return np.sort(np.concatenate([np.fromiter(one, np.int64, len(one)) for one in listed]))
+
 
 # More states than this in one system are refused: at the cost of n³, its eigenvalues would take minutes, and
 # their error bounds would decide nothing.

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.listening import StartClasses
-from apc.eigen.peer_group import PeerGroup, build_group, check_size, used_ways
-from apc.eigen.runs import Peers, Runs, joined
+from apc.eigen.peer_group import PeerGroup, Peers, Runs, build_group, check_size, joined, used_ways
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import linearize, linearize_rows, site_of_row

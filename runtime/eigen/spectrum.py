@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.components import components
 from apc.eigen.eigenpairs import Eigenpairs
-from apc.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
+from apc.eigen.enclosure import SMALL, WIDE, components, discs, enclose_eigenvalues
 from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.course import turns

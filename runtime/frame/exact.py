@@ -119,7 +119,8 @@ def evaluate_exact(
         Evaluates a transcendental function, by its name in `math`, in the number type. Left out, its
         value is rounded to a double first.
     rules
-        Operations, by their names in `plain`, that this kind of number does in another way than Python's.
+        Operations, by their names in `plain`, that this kind of number does in another way than Python's;
+        `const` is what it makes of the function's constants, of NaN too.
 
     Returns
     -------
@@ -133,18 +134,18 @@ def evaluate_exact(
         A rational number takes more than BITS bits.
     """
     known = _operations(function)
-    if "const" not in (rules or {}) and any(math.isnan(constant) for constant in known.constants):
+    own = _rules_of(number, rounded)
+    if rules:
+        own = {**own, **rules}
+    if "const" not in own and any(map(math.isnan, known.constants)):
         raise ValueError("math domain error")  # of constants alone, which CasADi evaluates at once
     entries = [
         entry
         for (_, size), argument in zip(known.inputs, arguments, strict=True)
         for entry in _of_size(argument, size)
     ]
-    own: dict[str, Callable[..., Any]] = {**_SHORT, "pow": _power_of(number), "constpow": _power_of(number)}
-    for name, of_float in ROUNDED.items():
-        own[name] = _rounding(name, of_float, number, rounded)
-    own.update(rules or {})
-    found = walk(known, [*entries, *map(own.get("const", number), known.constants)], own.__getitem__)
+    constants = map(own.get("const", number), known.constants)
+    found = walk(known, [*entries, *constants], own.__getitem__)
     return [[found[place] for place in places] for places in known.results]
 
 
@@ -175,20 +176,21 @@ def _operations(function: Any) -> PlainFunction:
     return straight(function)
 
 
-def _rounding(
-    name: str,
-    of_float: Callable[[float], float],
-    number: Callable[[float], Any],
-    rounded: Callable[[str, Any], Any] | None,
-) -> Callable[[Any], Any]:
-    """Return a transcendental function of a kind of number."""
-    if rounded is not None:
-        return functools.partial(rounded, name)
-    return lambda a: number(of_float(float(a)))
+@functools.lru_cache(maxsize=KEPT)
+def _rules_of(
+    number: Callable[[float], Any], rounded: Callable[[str, Any], Any] | None
+) -> dict[str, Callable[..., Any]]:
+    """Return the operations of a kind of number that computes as Python's do."""
+    power = functools.partial(_power, number)
+    found: dict[str, Callable[..., Any]] = {**_SHORT, "pow": power, "constpow": power}
+    for name, of_float in ROUNDED.items():
+        own = functools.partial(_rounded, number, of_float)
+        found[name] = own if rounded is None else functools.partial(rounded, name)
+    return found
 
 
-def _power_of(number: Callable[[float], Any]) -> Callable[[Any, Any], Any]:
-    return lambda base, exponent: _power(base, exponent, number)
+def _rounded(number: Callable[[float], Any], of_float: Callable[[float], float], value: Any) -> Any:
+    return number(of_float(float(value)))
 
 
 def _short(value: Any) -> Any:
@@ -204,7 +206,7 @@ def _bits(value: Any) -> int:
     return max(value.numerator.bit_length(), value.denominator.bit_length())
 
 
-def _power(base: Any, exponent: Any, number: Callable[[float], Any]) -> Any:
+def _power(number: Callable[[float], Any], base: Any, exponent: Any) -> Any:
     """Return base**exponent, exactly when the exponent is whole."""
     if exponent == int(exponent):
         if _bits(base) * abs(int(exponent)) > BITS and abs(base) != 1:

@@ -15,8 +15,7 @@ from fractions import Fraction
 from apc.compiler.compiled import Clock, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.multiples import common_divisor, common_multiple
-from apc.frame.hearing import Hearing
-from apc.frame.liveness import live_holds
+from apc.frame.liveness import Hearing, live_holds
 from apc.frame.site import LinearSite
 
 MOST_TICKS = 20_000  # in a frame: each is a step of the lifting

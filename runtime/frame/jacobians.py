@@ -1,15 +1,16 @@
-"""The Jacobians of a kind, as one CasADi function of everything they may depend on.
+"""The Jacobians of a kind, as one CasADi function of everything they may depend on; where one is not smooth.
 
-Takes: a kind of a `CompiledSystem`.
+Takes: a kind of a `CompiledSystem`; CasADi expressions.
 Gives: `SiteJacobians` (built once a kind), `jacobians`; `Edge`, `edge_name`;
-`structural_pattern`.
+`structural_pattern`; `guards_of`.
 Guarantees: structural patterns come from CasADi, whatever the numbers; a kind that is called affine has the
-same Jacobians everywhere.
-Does not: evaluate them (see `linearize`).
+same Jacobians everywhere. Every comparison, max, min, abs, sign, floor and ceil that hangs on what moves is
+found, each once.
+Does not: evaluate Jacobians (see `linearize`); find when a guard changes sign (see `forcing`, `integrate`).
 
 A receive over an edge function, r = op_j e(x, u, m, s_j), is linear in what the site hears and in its own x,
 u and m: its own part, ∂r/∂x and so on, is part of the tick's X, U and M; ∂e/∂s weighs what it hears (see
-`coupling`).
+`modes.couple`).
 """
 
 from __future__ import annotations
@@ -24,8 +25,40 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import ClockPartition, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.guards import guards_of
 from apc.frame.site import LinearSite, Matrix, assemble, with_own_parts
+
+_BINARY = (casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, casadi.OP_FMIN, casadi.OP_FMAX)
+_UNARY = (casadi.OP_FABS, casadi.OP_SIGN)
+_STEPS = (casadi.OP_FLOOR, casadi.OP_CEIL)
+
+
+def guards_of(expression: Any, moving: Any) -> list[Any]:
+    """Return what changes sign where an expression is not smooth.
+
+    Parameters
+    ----------
+    expression
+        A column, `casadi.SX`.
+    moving
+        The symbols that change; what hangs on none of them is left out.
+    """
+    found, seen = [], set()
+    work = [expression[i] for i in range(expression.numel())]
+    while work:
+        node = work.pop()
+        if node.element_hash() in seen:
+            continue
+        seen.add(node.element_hash())
+        parts = [node.dep(i) for i in range(node.n_dep())]
+        work += parts
+        if any(node.is_op(code) for code in _BINARY):
+            found.append(parts[0] - parts[1])
+        elif any(node.is_op(code) for code in _UNARY):
+            found.append(parts[0])
+        elif any(node.is_op(code) for code in _STEPS):
+            # Changes sign at each whole number, and again half-way, where nothing is split in vain.
+            found.append(casadi.sin(np.pi * parts[0]))
+    return [one for one in found if casadi.depends_on(one, moving)]
 
 
 @dataclass(frozen=True, slots=True)

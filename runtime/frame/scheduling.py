@@ -18,9 +18,8 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange, build_exchange
-from apc.frame.hearing import Hearing, hearing_of
 from apc.frame.hyperperiod import ClockGrid, Times, times_in_use
-from apc.frame.liveness import live_holds, live_outputs, live_receives
+from apc.frame.liveness import Hearing, hearing_of, live_holds, live_outputs, live_receives
 from apc.frame.schedule import (
     ORDER,
     Act,

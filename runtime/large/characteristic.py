@@ -1,22 +1,28 @@
 """The characteristic function of a population: small, whatever the number of peers and the length of delays.
 
-Takes: the `Transfer`s of all sites, and how what they send comes back to them.
-Gives: `Characteristic`, `characteristic_ball`, `count_around`, `refine`, `null_vectors`,
-`weights_at`.
+Takes: the `Transfer`s of all sites, and how what they send comes back to them; circles.
+Gives: `Characteristic`, `characteristic_ball`, `refine`, `null_vectors`, `weights_at`; `Ball`, `Bounded`,
+`wind`, `count_around`.
 Guarantees: its value in a disc comes with a bound; an eigenvalue of the whole system is a zero of it, or a
-pole of a site that the zero would have to cancel.
-Does not: know who the sites are (see `determinant`).
+pole of a site that the zero would have to cancel. A count is right: no zero is missed between samples; None
+says that no cover was found, as when a zero lies on the circle.
+Does not: know who the sites are (see `determinant`), or where zeros may be (see `zeros`).
 
     f(ζ) = det(I − T(ζ) W(ζ)),   W(ζ) = Σ_l W_l ζ^(−l)
 
 The sites answer what they hear, s = T r, and hear what was sent l frames ago, r = W s. f has a zero where
 that holds without any cause, goes to 1 as ζ goes to infinity, and has the sites' poles: all zeros less all
 poles of the sites outside of a circle are the negative of how often f goes around 0 along it.
+
+How often that is, a cover of discs tells (`wind`). Each arc of the circle lies in a disc about its middle,
+and within the disc the function differs from its value at the middle, f₀, by less than |f₀|: it has no zero
+there, and its argument keeps within ±π/2 of that of f₀. Neighbouring arcs share a point, so their middles'
+arguments differ by less than π: the sum of these differences is the change of the argument along the circle.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,12 +30,106 @@ from numpy.typing import NDArray
 
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.frame.discretize import UNIT
-from apc.large.counting import Ball, wind
-from apc.large.response import differentiate, respond
-from apc.large.transfer import Transfer
+from apc.large.transfer import Transfer, differentiate, respond
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Ball:
+    """A function at points: `direction` f₀/|f₀| (z,) and `change` (z,), a bound on |f/f₀ − 1| in discs."""
+
+    direction: Complexes
+    change: Floats
+
+
+# A function of points (z,) and the radii of discs about them (z,).
+Bounded = Callable[[Complexes, Floats], Ball]
+
+# Arcs to begin with, all around.
+FIRST_ARCS = 32
+
+# Evaluations after which a cover is given up, beside those an arc: where rounding leaves f open along a
+# stretch of the circle, cutting the arcs there would never end. Zeros however near to the circle cost some
+# hundred.
+MOST_POINTS, POINTS_AN_ARC = 3000, 4
+
+# Arcs beside a zero grow by this factor from one to the next: each keeps clear of the zero by its own length.
+GRADING = 2.4
+
+# An arc narrower than this many radians has a zero as good as on it: given up.
+NARROWEST = 1e-14
+
+
+def _graded(edges: Floats, close: Complexes) -> Floats:
+    """Add edges about the angles of points near the unit circle, as dense as the points are near."""
+    whole = [edges]
+    for angle, size in zip(np.angle(close).tolist(), np.abs(close).tolist(), strict=True):
+        first, widest = max(abs(size - 1), NARROWEST * GRADING) / 2, float(edges[1])
+        steps = max(0, int(np.log(widest / first) / np.log(GRADING)) + 1)
+        aside = first * GRADING ** np.arange(steps)
+        whole.append(angle % (2 * np.pi) + np.concatenate([-aside, aside]))
+    found = np.unique(np.concatenate(whole))
+    return np.asarray(found[(found >= edges[0]) & (found <= edges[-1])])
+
+
+def wind(
+    function: Bounded,
+    centre: float | complex,
+    radius: float,
+    *,
+    arcs: int = FIRST_ARCS,
+    most: int | None = None,
+    close: Complexes | None = None,
+) -> int | None:
+    """Return how often a function goes around 0 along a circle, counter-clockwise; None if it can't be told.
+
+    Parameters
+    ----------
+    function
+        Bounded in discs. It is real on the real axis: about a real centre, half the circle tells all.
+    centre, radius
+        The circle.
+    arcs
+        How many arcs to begin with.
+    most
+        Evaluations after which to give up, or as many as serve.
+    close
+        Zeros (z,) that the circle passes closely: there arcs begin as short as they have to be.
+    """
+    half = not complex(centre).imag
+    most = MOST_POINTS + POINTS_AN_ARC * arcs if most is None else most
+    edges = np.linspace(0.0, np.pi if half else 2 * np.pi, (arcs // 2 if half else arcs) + 1)
+    if close is not None and len(close):
+        edges = _graded(edges, (close - centre) / radius)
+    starts, ends = edges[:-1], edges[1:]
+    settled: list[tuple[Floats, Complexes]] = []
+    spent = 0
+    while len(starts):
+        spent += len(starts)
+        if spent > most:
+            return None
+        middles = (starts + ends) / 2
+        # The far end of an arc is a chord away from its middle; the point itself is rounded.
+        reach = radius * (2 * np.sin((ends - starts) / 4) + 1e-15) + 4e-16 * abs(centre)
+        ball = function(centre + radius * np.exp(1j * middles), reach)
+        good = ball.change < 1
+        settled.append((middles[good], ball.direction[good]))
+        left, right = starts[~good], ends[~good]
+        if np.any(right - left < NARROWEST):
+            return None
+        cut = (left + right) / 2
+        starts, ends = np.concatenate([left, cut]), np.concatenate([cut, right])
+    order = np.argsort(np.concatenate([angles for angles, _ in settled]))
+    direction = np.concatenate([values for _, values in settled])[order]
+    turned = float(np.angle(direction[1:] / direction[:-1]).sum())
+    if half:  # the other half mirrors it; where they meet, the function is real
+        turned = 2 * turned + float(np.angle(direction[0] ** 2)) + float(np.angle(direction[-1].conj() ** 2))
+    else:
+        turned += float(np.angle(direction[0] / direction[-1]))
+    return round(turned / (2 * np.pi))
+
 
 # Steps of the power method for a scaling, and the least ratio of its entries.
 POWER_STEPS, FLOOR, TINY = 4, 1e-12, 1e-300

@@ -1,7 +1,8 @@
 """Peers by the thousand, all different: the matrices of every one, without an object for each.
 
 Takes: a `CompiledSystem`, its numbers, Jacobians and schedules.
-Gives: `Crowd`, `crowds`, `some_rows`, `site_one`; `hear_themselves`, `hear_roughly`.
+Gives: `Crowd`, `crowds`, `some_rows`, `site_one`; `hear_themselves`, `hear_roughly`, `lines_of`;
+`state_names`, `turned_by`, `mode_of`.
 Guarantees: a crowd costs what its different peers cost in one array operation each, not in one Python call
 each; equal peers of a crowd are counted.
 Does not: merge equal peers of different groups (see `peers`), or take sites that are not affine.
@@ -9,15 +10,17 @@ Does not: merge equal peers of different groups (see `peers`), or take sites tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Closed, Hearing, StateLayout, close, closing_errors, lay_out
+from apc.eigen.closing import Closed, Feedback, StateLayout, close, closing_errors, lay_out
+from apc.eigen.spectrum import Mode, oscillation
 from apc.frame.batch_lift import CHUNK, lift_rows
+from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import LiftedSite
 from apc.frame.linearize import linearize_rows, site_of_row
@@ -28,6 +31,7 @@ from apc.large.transfer import StateSpace
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Complexes = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,30 +137,30 @@ def hear_roughly(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return M, B, S and D as `hear_themselves` has them, without their errors."""
-    layout, hearing = _open_loop(lifted, schedule, own, others)
-    return _cut(close([lifted], [hearing], layout))
+    layout, feedback = _open_loop(lifted, schedule, own, others)
+    return _cut(close([lifted], [feedback], layout))
 
 
 def _hear_themselves(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
 ) -> tuple[Floats, ...]:
     """Close a chunk of sites, with the errors."""
-    layout, hearing = _open_loop(lifted, schedule, own, others)
+    layout, feedback = _open_loop(lifted, schedule, own, others)
     size = lifted.mapped(np.abs)
     wide = size.mapped(np.add, lifted.error)
-    error = closing_errors([size], [wide], [hearing.size], layout)
-    return (*_cut(close([lifted], [hearing], layout)), *_cut(error))
+    error = closing_errors([size], [wide], [feedback.size], layout)
+    return (*_cut(close([lifted], [feedback], layout)), *_cut(error))
 
 
 def _open_loop(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
-) -> tuple[StateLayout, Hearing]:
+) -> tuple[StateLayout, Feedback]:
     """Return the state of each site by itself, and what it hears of it and, behind it, of the others."""
     now, before, _ = lines_of(schedule)
     nothing = np.zeros((*own.shape, lifted.p.shape[-1]))
     outside = others[:, :, None] * np.eye(own.shape[1])
     heard = np.concatenate([nothing, own[:, :, None] * before, outside], axis=-1)
-    return lay_out([lifted.z_names], [schedule]), Hearing(own[:, :, None] * now, heard)
+    return lay_out([lifted.z_names], [schedule]), Feedback(own[:, :, None] * now, heard)
 
 
 def _cut(closed: Closed) -> tuple[Floats, Floats, Floats, Floats]:
@@ -179,3 +183,67 @@ def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:
         else:
             before[line, starts[place[one.sent]] + one.lag - 1] = 1.0
     return now, before, int(starts[-1])
+
+
+def state_names(crowd: Crowd) -> list[str]:
+    """Return the names of a peer's state, z and then the packets on their way."""
+    waiting = zip(crowd.schedule.sent_names, crowd.schedule.depths, strict=True)
+    return [*crowd.lifted.z_names, *(name for name, depth in waiting for _ in range(depth))]
+
+
+def turned_by(
+    site: LinearSite, schedule: Schedule, value: complex, z: Complexes, heard: Complexes, covector: Complexes
+) -> tuple[float, float]:
+    """Return the frequency and damping of a mode, whole turns counted on the state that takes most part.
+
+    Parameters
+    ----------
+    site, schedule
+        Of the peer that moves most.
+    value
+        The eigenvalue.
+    z, heard, covector
+        The peer's state (n,), what it hears (n_r,) and what weighs its state (n,).
+    """
+    count = len(site.kind.states)
+    if not count:
+        return 0.0, 1.0
+    state = np.array([int(np.argmax(np.abs(covector[:count] * z[:count])))])
+    start = z[: count + len(schedule.carried), None].astype(np.complex128)
+    angle = turns(site, schedule, start, heard[:, None].astype(np.complex128), state, np.array([value]))
+    return oscillation(abs(value), float(angle[0]), float(schedule.frame_s))
+
+
+def mode_of(
+    value: complex,
+    error: float,
+    turned: tuple[float, float],
+    shares: Mapping[str, float],
+    shape: str,
+    multiplicity: int,
+) -> Mode:
+    """Put a mode together.
+
+    Parameters
+    ----------
+    value, error
+        The eigenvalue and what it may be off by.
+    turned
+        From `turned_by`.
+    shares
+        How much each state takes part, in any unit.
+    shape, multiplicity
+        As in `Mode`.
+    """
+    frequency, damping = turned
+    total = sum(shares.values()) or 1.0
+    return Mode(
+        eigenvalue=value,
+        magnitude=abs(value),
+        multiplicity=multiplicity,
+        frequency_hz=frequency,
+        damping_ratio=damping,
+        shape=shape,
+        participation=tuple((name, share / total) for name, share in shares.items()),
+        error=error,
+    )

@@ -17,16 +17,21 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import Loop
 from apc.eigen.rigid import find_rigid_modes
-from apc.eigen.spectrum import Mode, Spectrum, judge, oscillation
-from apc.frame.course import turns
+from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.exchange import Exchange
-from apc.frame.schedule import Schedule
-from apc.frame.site import LinearSite
 from apc.large.characteristic import Characteristic, null_vectors, weights_at
-from apc.large.crowds import Crowd, hear_roughly, lines_of, site_one, some_rows
+from apc.large.crowds import (
+    Crowd,
+    hear_roughly,
+    lines_of,
+    mode_of,
+    site_one,
+    some_rows,
+    state_names,
+    turned_by,
+)
 from apc.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
-from apc.large.response import differentiate
-from apc.large.transfer import CHUNK
+from apc.large.transfer import CHUNK, differentiate
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]
@@ -198,8 +203,8 @@ def _loop_mode(function: Characteristic, loop: Loop, zero: Zero) -> Mode:
             place += 1
     dominant = max(range(len(motions)), key=lambda g: float(np.abs(motions[g].w * motions[g].z).max()))
     motion, own = motions[dominant], loop.sites[dominant]
-    turned = _turned(own.site, own.schedule, zero.value, motion.z[0], motion.r[0], motion.w[0])
-    return _mode(zero, turned, shares, loop.name, loop.multiplicity)
+    turned = turned_by(own.site, own.schedule, zero.value, motion.z[0], motion.r[0], motion.w[0])
+    return mode_of(zero.value, zero.error, turned, shares, loop.name, loop.multiplicity)
 
 
 def _nearly_free(function: Characteristic, loop: Loop, value: complex) -> tuple[list[_Motion], Complexes]:
@@ -258,13 +263,12 @@ def _crowd_mode(function: Characteristic, places: Places, listed: Sequence[Crowd
     for g, (crowd, motion) in enumerate(zip(listed, motions, strict=True)):
         n_z = len(crowd.lifted.z_names)
         covector = motion.w.copy()
-        names, place = list(crowd.lifted.z_names), n_z
+        place = n_z
         for row, depth in enumerate(crowd.schedule.depths):
             covector[:, place : place + depth] += waiting[:depth, places.sent[g][row]]
-            names += [crowd.schedule.sent_names[row]] * depth
             place += depth
         own = np.abs(covector * motion.z)
-        for name, share in zip(names, crowd.counts @ own, strict=True):
+        for name, share in zip(state_names(crowd), crowd.counts @ own, strict=True):
             name = f"{crowd.name}.{name}" if len(listed) > 1 else name
             shares[name] = shares.get(name, 0.0) + float(share)
         peer = int(np.argmax(own.sum(axis=1)))
@@ -272,8 +276,8 @@ def _crowd_mode(function: Characteristic, places: Places, listed: Sequence[Crowd
             most, dominant = float(own[peer].sum()), (g, peer)
     g, peer = dominant
     motion, site = motions[g], site_one(listed[g], peer)
-    turned = _turned(site, listed[g].schedule, zero.value, motion.z[peer], motion.r[peer], motion.w[peer])
-    return _mode(zero, turned, shares, "different peers", zero.multiplicity)
+    turned = turned_by(site, listed[g].schedule, zero.value, motion.z[peer], motion.r[peer], motion.w[peer])
+    return mode_of(zero.value, zero.error, turned, shares, "different peers", zero.multiplicity)
 
 
 def _own_mode(crowd: Crowd, places: Places, zero: Zero, site: tuple[int, int]) -> Mode:
@@ -289,13 +293,11 @@ def _own_mode(crowd: Crowd, places: Places, zero: Zero, site: tuple[int, int]) -
     now, before, _ = lines_of(crowd.schedule)
     n_z = some.p.shape[-1]
     received = own * (now @ (s[0] @ z) + before @ z[n_z:])
-    waiting = zip(crowd.schedule.sent_names, crowd.schedule.depths, strict=True)
-    names = [*some.z_names, *(name for name, depth in waiting for _ in range(depth))]
     shares: dict[str, float] = {}
-    for name, share in zip(names, np.abs(w * z).tolist(), strict=True):
+    for name, share in zip(state_names(crowd), np.abs(w * z).tolist(), strict=True):
         shares[name] = shares.get(name, 0.0) + share
-    turned = _turned(site_one(crowd, row), crowd.schedule, zero.value, z, received, w)
-    return _mode(zero, turned, shares, f"{crowd.name} by itself", zero.multiplicity)
+    turned = turned_by(site_one(crowd, row), crowd.schedule, zero.value, z, received, w)
+    return mode_of(zero.value, zero.error, turned, shares, f"{crowd.name} by itself", zero.multiplicity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,37 +358,6 @@ def _waiting(function: Characteristic, value: complex, felt: Complexes, depth: i
         ages = np.arange(1, lag + 1)
         found[:lag] += (value ** (ages - lag - 1).astype(np.float64))[:, None] * (felt @ weight)
     return found
-
-
-def _turned(
-    site: LinearSite, schedule: Schedule, value: complex, z: Complexes, heard: Complexes, covector: Complexes
-) -> tuple[float, float]:
-    """Return frequency and damping, whole turns counted on the continuous state that takes most part."""
-    count = len(site.kind.states)
-    if not count:
-        return 0.0, 1.0
-    state = np.array([int(np.argmax(np.abs(covector[:count] * z[:count])))])
-    start = z[: count + len(schedule.carried), None].astype(np.complex128)
-    angle = turns(site, schedule, start, heard[:, None].astype(np.complex128), state, np.array([value]))
-    return oscillation(abs(value), float(angle[0]), float(schedule.frame_s))
-
-
-def _mode(
-    zero: Zero, turned: tuple[float, float], shares: dict[str, float], shape: str, multiplicity: int
-) -> Mode:
-    """Put a mode together."""
-    frequency, damping = turned
-    total = sum(shares.values()) or 1.0
-    return Mode(
-        eigenvalue=zero.value,
-        magnitude=abs(zero.value),
-        multiplicity=multiplicity,
-        frequency_hz=frequency,
-        damping_ratio=damping,
-        shape=shape,
-        participation=tuple((name, share / total) for name, share in shares.items()),
-        error=zero.error,
-    )
 
 
 def _with_conjugates(modes: Iterable[Mode]) -> tuple[Mode, ...]:

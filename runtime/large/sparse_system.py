@@ -1,10 +1,17 @@
 """All peers of a sparse graph as one sparse matrix, each peer with numbers of its own.
 
-Takes: crowds, and the exchange between them.
-Gives: `SparseSystem`, `sparse_system`; `MatrixAt`, `small_matrix`.
+Takes: crowds, and the exchange between them; what nothing holds back of their peers.
+Gives: `SparseSystem`, `sparse_system`; `RigidSpace`, `rigid_space`, `nothing_rigid`, `without_rigid`;
+`small_matrix`.
 Guarantees: the matrix is that of `modes.dense`, in the same order of states, with a bound on its error entry
-by entry; its cost grows with peers and arcs.
-Does not: compute eigenvalues (see `krylov`).
+by entry; its cost grows with peers and arcs. Rigid motions are checked against it before they are taken out.
+Does not: compute eigenvalues (see `krylov`), find the motions (see `translation`), or chains that drift.
+
+With z of all peers below one another, s what they send and r what they hear in a frame, c_ℓ the packets that
+are ℓ frames old and somebody still hears, and E_ℓ the rows of s that grow so old,
+
+    r = H₀ s + Σ_ℓ H_ℓ E_ℓᵀ c_ℓ,    s = S z + D r
+    z⁺ = P z + Q r,    c_1⁺ = E_1 s,    c_ℓ⁺ = E_ℓ E_ℓ₋₁ᵀ c_ℓ₋₁
 """
 
 from __future__ import annotations
@@ -19,8 +26,8 @@ from numpy.typing import NDArray
 from apc.compiler.weights import sum_weights
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
-from apc.frame.schedule import Heard, Sent
 from apc.large.crowds import Crowd
+from apc.large.translation import FreeMotions
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -64,13 +71,12 @@ def sparse_system(listed: Sequence[Crowd], exchange: Exchange) -> SparseSystem:
     errors = [crowd.lifted.error.blocks for crowd in listed]
     large = [tuple(np.abs(block) for block in blocks) for blocks in exact]
     wide = [
-        tuple(block + error for block, error in zip(blocks, off, strict=True))
-        for blocks, off in zip(large, errors, strict=True)
+        tuple(block + error for block, error in zip(*both, strict=True))
+        for both in zip(large, errors, strict=True)
     ]
     sized = [abs(one) for one in hearing]
-    parts = (listed, crowd_of, row_of, starts, lags)
-    matrix = _assemble(exact, *parts, hearing)
-    upper, bound = _assemble(wide, *parts, sized), _assemble(large, *parts, sized)
+    matrix = _assemble(exact, listed, lags, hearing)
+    upper, bound = _assemble(wide, listed, lags, sized), _assemble(large, listed, lags, sized)
     most = max((int(np.diff(one.indptr).max(initial=0)) for one in hearing), default=0)
     terms = max(crowd.lifted.p.shape[-1] + len(crowd.schedule.heard) * (2 + most) for crowd in listed)
     rounds = 4 * (terms + 4) * (1 + max(len(crowd.schedule.sent) for crowd in listed)) * UNIT
@@ -87,7 +93,6 @@ def _hearing(
     n_r = np.array([len(crowd.schedule.heard) for crowd in listed])[crowd_of]
     s_start, r_start = np.concatenate([[0], np.cumsum(n_s)]), np.concatenate([[0], np.cumsum(n_r)])
     lags = tuple(sorted({one.lag for crowd in listed for one in crowd.schedule.heard}))
-    shape = (int(r_start[-1]), int(s_start[-1]))
     triplets: dict[int, list[tuple[Floats, Integers, Integers]]] = {lag: [] for lag in lags}
     for link in exchange.links:
         sends = np.array([crowd.sends(link) for crowd in listed])[crowd_of]
@@ -97,148 +102,199 @@ def _hearing(
         total = sum_weights(receiver, weight, exchange.peers).floats
         for g, crowd in enumerate(listed):
             for line, heard in enumerate(crowd.schedule.heard):
-                if heard.way.link == link:
-                    share = weight / total[receiver] if heard.way.operator == "mean" else weight
-                    for h, other in enumerate(listed):
-                        row = _row(other, heard)
-                        if row is None or exchange.delay(link, other.group, crowd.group) != heard.way.delay:
-                            continue
+                if heard.way.link != link:
+                    continue
+                share = weight / total[receiver] if heard.way.operator == "mean" else weight
+                for h, other in enumerate(listed):
+                    sent = other.schedule.sent
+                    late = exchange.delay(link, other.group, crowd.group)
+                    if heard.sent in sent and late == heard.way.delay:
                         pick = (crowd_of[receiver] == g) & (crowd_of[sender] == h)
-                        lines, rows = r_start[receiver[pick]] + line, s_start[sender[pick]] + row
-                        triplets[heard.lag].append((share[pick], lines, rows))
+                        rows = s_start[sender[pick]] + sent.index(heard.sent)
+                        triplets[heard.lag].append((share[pick], r_start[receiver[pick]] + line, rows))
     found = []
     for lag in lags:
         values, lines, rows = (np.concatenate(part) for part in zip(*triplets[lag], strict=True))
+        shape = (int(r_start[-1]), int(s_start[-1]))
         found.append(scipy.sparse.csr_matrix((values, (lines, rows)), shape=shape))
     return lags, tuple(found)
-
-
-def _row(crowd: Crowd, heard: Heard) -> int | None:
-    """Return the row of a crowd's s that is heard."""
-    sent: tuple[Sent, ...] = crowd.schedule.sent
-    return sent.index(heard.sent) if heard.sent in sent else None
 
 
 def _assemble(
     blocks: Sequence[tuple[Floats, ...]],
     listed: Sequence[Crowd],
-    crowd_of: Integers,
-    row_of: Integers,
-    starts: Integers,
     lags: Sequence[int],
     hearing: Sequence[Any],
 ) -> Any:
-    """Return the closed matrix: as `modes.close_loop`, sparse."""
+    """Return the closed matrix of peers with these P, Q, S and D, crowd by crowd (k, …)."""
     import scipy.sparse
 
-    n = int(starts[-1])
-    n_s = np.array([len(crowd.schedule.sent) for crowd in listed])[crowd_of]
-    n_r = np.array([len(crowd.schedule.heard) for crowd in listed])[crowd_of]
-    s_start, r_start = np.concatenate([[0], np.cumsum(n_s)]), np.concatenate([[0], np.cumsum(n_r)])
-    places = (starts[:-1], r_start[:-1], s_start[:-1])
-    shapes = ((n, n), (n, int(r_start[-1])), (int(s_start[-1]), n), (int(s_start[-1]), int(r_start[-1])))
-    own, q, s, d = (
-        _spread([one[k] for one in blocks], crowd_of, row_of, *corners, shape)
-        for k, (corners, shape) in enumerate(
-            zip(
-                (
-                    (places[0], places[0]),
-                    (places[0], places[1]),
-                    (places[2], places[0]),
-                    (places[2], places[1]),
-                ),
-                shapes,
-                strict=True,
-            )
-        )
-    )
-    _ = None
-    before, now = scipy.sparse.csr_matrix((int(r_start[-1]), n)), None
-    first, shift = _packets(listed, crowd_of, starts, s_start, n)
-    for lag, weights in zip(lags, hearing, strict=True):
-        if lag == 0:
-            now = weights
-        else:
-            before = before + weights @ _packet_of(listed, crowd_of, starts, s_start, lag, n)
-    sent = s + d @ before
-    if now is not None:
-        loop = d @ now
-        term = loop @ sent
+    p, q, s, d = (_beside([one[k] for one in blocks], listed) for k in range(4))
+    depth = _by_peer(listed, lambda crowd: crowd.schedule.depths)
+    kept = [np.flatnonzero(depth >= lag) for lag in range(1, int(depth.max(initial=0)) + 1)]
+    states = p.shape[0] + sum(map(len, kept))
+    weights, nobody = dict(zip(lags, hearing, strict=True)), scipy.sparse.csr_matrix(d.shape[::-1])
+    old = [weights.get(lag, nobody)[:, places] for lag, places in enumerate(kept, 1)]
+    heard = scipy.sparse.hstack([scipy.sparse.csr_matrix((d.shape[1], p.shape[0])), *old]).tocsr()
+    sent = _widened(s, states) + d @ heard
+    if 0 in weights:
+        within = d @ weights[0]
+        term = within @ sent
         while term.nnz and abs(term).max() > 0:  # time orders it: it ends
-            sent, term = sent + term, loop @ term
-    heard = before if now is None else before + now @ sent
-    return (own + q @ heard + first @ sent + shift).tocsr()
+            sent, term = sent + term, within @ term
+        heard = heard + weights[0] @ sent
+    rows, place = [_widened(p, states) + q @ heard], p.shape[0]
+    for lag, places in enumerate(kept, 1):
+        if lag == 1:
+            rows.append(sent[places])
+            continue
+        younger = kept[lag - 2]
+        ones = (np.ones(len(places)), (np.arange(len(places)), place + np.searchsorted(younger, places)))
+        rows.append(scipy.sparse.csr_matrix(ones, shape=(len(places), states)))
+        place += len(younger)
+    order = _peer_by_peer(listed, kept)
+    return scipy.sparse.vstack(rows).tocsr()[order][:, order]
 
 
-def _spread(
-    blocks: Sequence[Floats | Complexes],
-    crowd_of: Integers,
-    row_of: Integers,
-    top: Integers,
-    left: Integers,
-    shape: tuple[int, int],
-) -> Any:
-    """Return every peer's block at its place in a sparse matrix."""
+def _beside(blocks: Sequence[Floats | Complexes], listed: Sequence[Crowd]) -> Any:
+    """Return every peer's block, of its row in its crowd's (k, h, w), on the diagonal of a sparse matrix."""
     import scipy.sparse
 
-    values, lines, columns = [], [], []
-    for g, block in enumerate(blocks):
-        peers = np.flatnonzero(crowd_of == g)
-        own = block[row_of[peers]]
-        height, width = own.shape[1:]
-        values.append(own.ravel())
-        lines.append((top[peers][:, None, None] + np.arange(height)[:, None] + 0 * np.arange(width)).ravel())
-        columns.append(
-            (left[peers][:, None, None] + 0 * np.arange(height)[:, None] + np.arange(width)).ravel()
-        )
-    entries = (np.concatenate(values), (np.concatenate(lines), np.concatenate(columns)))
-    found = scipy.sparse.csr_matrix(entries, shape=shape)
-    found.eliminate_zeros()
-    return found
+    found = []
+    for block, crowd in zip(blocks, listed, strict=True):
+        own = block[np.asarray(crowd.rows)]
+        count, height, width = own.shape
+        shape = (count * height, count * width)
+        if own.size:
+            found.append(scipy.sparse.bsr_matrix((own, np.arange(count), np.arange(count + 1)), shape=shape))
+        else:
+            found.append(scipy.sparse.csr_matrix(shape))
+    whole = scipy.sparse.block_diag(found, format="csr")
+    whole.eliminate_zeros()
+    return whole
 
 
-def _packets(
-    listed: Sequence[Crowd], crowd_of: Integers, starts: Integers, s_start: Integers, n: int
-) -> tuple[Any, Any]:
-    """Return what puts rows of s into the youngest packets (n, rows), and what ages the packets (n, n)."""
+def _widened(matrix: Any, width: int) -> Any:
+    """Return a sparse matrix with zeros to its right."""
     import scipy.sparse
 
-    into, rows, old, young = [], [], [], []
-    for g, crowd in enumerate(listed):
-        peers = np.flatnonzero(crowd_of == g)
-        place = starts[peers] + crowd.lifted.p.shape[-1]
-        for row, depth in enumerate(crowd.schedule.depths):
-            if depth:
-                into.append(place)
-                rows.append(s_start[peers] + row)
-            for age in range(1, depth):
-                old.append(place + age)
-                young.append(place + age - 1)
-            place = place + depth
-    ones = [np.ones(sum(map(len, part))) for part in (into, old)]
-    flat = [np.concatenate(part) if part else np.zeros(0, np.int64) for part in (into, rows, old, young)]
-    first = scipy.sparse.csr_matrix((ones[0], (flat[0], flat[1])), shape=(n, int(s_start[-1])))
-    return first, scipy.sparse.csr_matrix((ones[1], (flat[2], flat[3])), shape=(n, n))
+    return scipy.sparse.csr_matrix((matrix.data, matrix.indices, matrix.indptr), (matrix.shape[0], width))
 
 
-def _packet_of(
-    listed: Sequence[Crowd], crowd_of: Integers, starts: Integers, s_start: Integers, lag: int, n: int
-) -> Any:
-    """Return what picks, for every row of s, its packet of `lag` frames ago from the state (rows, n)."""
+def _by_peer(listed: Sequence[Crowd], numbers: Callable[[Crowd], Sequence[int]]) -> Integers:
+    """Return what is listed of a crowd, peer after peer."""
+    found = [np.tile(np.array(numbers(crowd), dtype=np.int64), len(crowd.rows)) for crowd in listed]
+    return np.concatenate(found)
+
+
+def _peer_by_peer(listed: Sequence[Crowd], kept: Sequence[Integers]) -> Integers:
+    """Return the order of `modes.dense` of a state of all z and then all packets, the youngest first."""
+    peer = np.arange(sum(len(crowd.rows) for crowd in listed))
+    own = np.repeat(peer, _by_peer(listed, lambda crowd: [crowd.lifted.p.shape[-1]]))
+    sender = np.repeat(peer, _by_peer(listed, lambda crowd: [len(crowd.schedule.sent)]))
+    whose = np.concatenate([own, *(sender[places] for places in kept)])
+    row = np.concatenate([np.full(len(own), -1), *kept])
+    age = np.concatenate([np.arange(len(own)), *(np.full(len(one), lag) for lag, one in enumerate(kept))])
+    return np.lexsort((age, row, whose))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidSpace:
+    """Motions V of the whole that stand still, R V = V, and `held`, a place for each to be told by.
+
+    `motions` is V V_p⁻¹ (n, d), p the places held.
+    """
+
+    held: Integers
+    motions: Any  # scipy.sparse
+
+
+def nothing_rigid(system: SparseSystem) -> RigidSpace:
+    """Return the space of no motions."""
     import scipy.sparse
 
-    rows, places = [], []
-    for g, crowd in enumerate(listed):
-        peers = np.flatnonzero(crowd_of == g)
-        place = starts[peers] + crowd.lifted.p.shape[-1]
-        for row, depth in enumerate(crowd.schedule.depths):
-            if depth >= lag:
-                rows.append(s_start[peers] + row)
-                places.append(place + lag - 1)
-            place = place + depth
-    lines, columns = np.concatenate(rows), np.concatenate(places)
-    shape = (int(s_start[-1]), n)
-    return scipy.sparse.csr_matrix((np.ones(len(lines)), (lines, columns)), shape=shape)
+    return RigidSpace(np.zeros(0, np.int64), scipy.sparse.csr_matrix((int(system.starts[-1]), 0)))
+
+
+def rigid_space(system: SparseSystem, exchange: Exchange, free: FreeMotions) -> RigidSpace | None:
+    """Lay what nothing holds back out over all peers; None if it does not stand still in the whole.
+
+    Parameters
+    ----------
+    system
+        The whole.
+    exchange
+        The links, for the parts of the graph that hear nothing of each other.
+    free
+        What nothing holds back.
+    """
+    import scipy.sparse
+
+    columns: list[tuple[Floats, Integers, Integers]] = []  # entries, their places, their columns
+    held: list[int] = []
+
+    def add(motion: Floats, starts: Integers, numbers: Integers) -> None:
+        moving = np.flatnonzero(motion)
+        places = (starts[:, None] + moving).ravel()
+        columns.append((np.tile(motion[moving], len(starts)), places, np.repeat(numbers, len(moving))))
+
+    for g, (own, pivots) in enumerate(zip(free.own, free.pivots, strict=True)):
+        starts = system.starts[:-1][system.crowd_of == g]
+        for motion, pivot in zip(own.T, pivots, strict=True):
+            add(motion, starts, len(held) + np.arange(len(starts)))
+            held.extend((starts + pivot).tolist())
+    single = len(held)
+    for members in _parts(exchange):
+        crowd_of = system.crowd_of[members]
+        for (crowd, pivot), vectors in free.together(np.unique(crowd_of).tolist()):
+            for g, motion in vectors.items():
+                starts = system.starts[members[crowd_of == g]]
+                add(motion, starts, np.full(len(starts), len(held)))
+            held.append(int(system.starts[members[crowd_of == crowd][0]]) + pivot)
+    shape = (int(system.starts[-1]), len(held))
+    value, place, column = (
+        (np.concatenate(part) for part in zip(*columns, strict=True)) if columns else ([],) * 3
+    )
+    space = scipy.sparse.csr_matrix((value, (place, column)), shape=shape)
+    bound = (system.error + 4 * UNIT * abs(system.matrix)) @ abs(space)
+    off = abs(system.matrix @ space - space) - 2 * bound
+    if off.nnz and off.max() > 0:
+        return None
+    # V_p = [1 0; X 1], as common motions are 0 where those of single peers are held.
+    corner = space[held]
+    assert single == len(held) or not corner[:single, single:].count_nonzero(), "motions not told apart"
+    inverse = 2 * scipy.sparse.identity(len(held), format="csr") - corner
+    return RigidSpace(np.array(held, dtype=np.int64), (space @ inverse).tocsr())
+
+
+def _parts(exchange: Exchange) -> list[Integers]:
+    """Return the peers of each part of the graph that hears nothing of the others."""
+    import scipy.sparse
+
+    peers = exchange.peers
+    pairs = np.concatenate([exchange.arcs(link)[0] for link in exchange.links])
+    graph = scipy.sparse.csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(peers, peers))
+    parts, part_of = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    order = np.argsort(part_of, kind="stable")
+    return list(np.split(order, np.cumsum(np.bincount(part_of, minlength=parts))[:-1]))
+
+
+def without_rigid(system: SparseSystem, rigid: RigidSpace) -> tuple[Any, Any]:
+    """Return M − V V_p⁻¹ M_p (n, n), which takes rigid motions to 0 and has all other eigenvalues; its error.
+
+    Parameters
+    ----------
+    system
+        The whole.
+    rigid
+        Its rigid motions.
+    """
+    taken = rigid.motions @ system.matrix[rigid.held]
+    reduced = system.matrix - taken
+    off = system.error + abs(rigid.motions) @ (
+        system.error[rigid.held] + 8 * UNIT * abs(system.matrix[rigid.held])
+    )
+    return reduced.tocsc(), (off + 2 * UNIT * abs(reduced)).tocsr()
 
 
 # A matrix (rows of s, rows of s) at a point ζ.
@@ -260,18 +316,13 @@ def small_matrix(system: SparseSystem, listed: Sequence[Crowd]) -> MatrixAt:
     """
     import scipy.sparse
 
-    sent = np.array([len(one.schedule.sent) for one in listed])[system.crowd_of]
-    heard = np.array([len(one.schedule.heard) for one in listed])[system.crowd_of]
-    top, left = (np.concatenate([[0], np.cumsum(part)]) for part in (sent, heard))
-    shape = (int(top[-1]), int(left[-1]))
-
     def at(point: complex) -> Any:
         answers = []
         for one in (crowd.lifted for crowd in listed):
             shifted = point * np.eye(one.p.shape[-1]) - one.p
             answers.append(one.d + one.s @ np.linalg.solve(shifted, one.q.astype(np.complex128)))
-        answer = _spread(answers, system.crowd_of, system.row_of, top[:-1], left[:-1], shape)
         hearing = sum(weights * point**-lag for lag, weights in zip(system.lags, system.hearing, strict=True))
-        return (scipy.sparse.identity(shape[0]) - answer @ hearing).tocsc()
+        answer = _beside(answers, listed)
+        return (scipy.sparse.identity(answer.shape[0]) - answer @ hearing).tocsc()
 
     return at

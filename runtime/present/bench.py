@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from apc.benchmark.bench import SAME, Bench, Comparison, Measured
 from apc.compiler.words import counted, wrapped
 from apc.optional import need
-from apc.present.forms import document
+from apc.present.forms import document, note
 from apc.present.pictures import write_figure
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def bench_text(found: Bench) -> str:
 def _task(found: Comparison) -> str:
     title = f"apc {found.task}: time against error of the {found.quantity}"
     left_out = [_filled(f"{name} left out: {reason}") for name, reason in found.refused]
-    head = [title, *(_filled(note) for note in found.left_out), ""]
+    head = [title, *(_filled(text) for text in found.left_out), ""]
     if not found.measured:
         return "\n".join([*head, *left_out])
     lines = [
@@ -80,7 +80,7 @@ def _task(found: Comparison) -> str:
     lines.append(
         _filled(f"reference: {found.reference}" if _known(found) else f"no reference: {found.reference}")
     )
-    lines += [_filled(note) for note in found.notes]
+    lines += [_filled(text) for text in found.notes]
     return "\n".join([*lines, *left_out])
 
 
@@ -305,4 +305,4 @@ def _size(value: float | None) -> str:
 
 
 def _filled(text: str) -> str:
-    return "\n".join(wrapped(text, "  ", "    "))
+    return "\n".join(note(text))

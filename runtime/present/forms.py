@@ -7,6 +7,7 @@ Does not: know a result.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Mapping
@@ -15,6 +16,8 @@ from fractions import Fraction
 from typing import Any
 
 from apc.compiler.words import wrapped
+
+PLAIN = {str, int, bool, type(None)}
 
 
 def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
@@ -27,23 +30,29 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
     instead
         What is taken in the place of fields of a dataclass.
     """
-    if isinstance(value, str | int | None):
+    if type(value) in PLAIN:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, tuple | list):
+        return [document(one) for one in value]
     if isinstance(value, complex):
-        return [value.real, value.imag]
+        return document((value.real, value.imag))
     if isinstance(value, Fraction):
         return float(value)
     if is_dataclass(value):
+        kind: Any = type(value)
         own = instead or {}
-        names = (one.name for one in fields(value))
-        return {name: document(own[name] if name in own else getattr(value, name)) for name in names}
+        return {name: document(own[name] if name in own else getattr(value, name)) for name in _names(kind)}
     if isinstance(value, Mapping):
         return {key: document(one) for key, one in value.items()}
-    if isinstance(value, tuple | list):
-        return [document(one) for one in value]
     return value.tolist()  # of an array
+
+
+@functools.cache
+def _names(kind: Any) -> tuple[str, ...]:
+    """Return the names of a dataclass's fields: there are as many modes as states."""
+    return tuple(one.name for one in fields(kind))
 
 
 def json_text(found: Any, *, indent: int | None = 2) -> str:

@@ -334,7 +334,7 @@ def drawn_points(found: Region, number: int) -> Floats:
     if not curve.smooth:
         return curve.points
     rectangle = found.rectangle
-    knots = (curve.points - rectangle.low) / rectangle.width
+    knots = rectangle.points(curve.points)
     ends = (knots[:-1], knots[1:], curve.tangents[:-1], curve.tangents[1:])
     pieces = -(-DRAWN // (len(knots) - 1))
     parts = [between(*ends, share / pieces) for share in range(pieces)]
@@ -349,9 +349,7 @@ def stable_outlines(found: Region) -> list[Floats]:
     that starts there: the stable side is on the left all the way.
     """
     rectangle = found.rectangle
-    chains = _chains(
-        [(drawn_points(found, n) - rectangle.low) / rectangle.width for n in range(len(found.curves))]
-    )
+    chains = _chains([rectangle.points(drawn_points(found, n)) for n in range(len(found.curves))])
     closed = [one for one in chains if np.array_equal(one[0], one[-1])]
     left = [one for one in chains if not np.array_equal(one[0], one[-1])]
     outlines = [one[:-1] for one in closed]
@@ -414,10 +412,10 @@ def _name_stable_side(ax: Any, regions: Sequence[Region], gains: Sequence[int]) 
     for found, gain in zip(regions, gains, strict=True):
         # All in units of the first region's rectangle, as drawn.
         scale = np.array([1.0, gain / gains[0]])
-        own = (first.values(points) / scale - found.rectangle.low) / found.rectangle.width
+        own = found.rectangle.points(first.values(points) / scale)
         shared += side_of_curves(found, own)[0]
         for number in range(len(found.curves)):
-            drawn = (drawn_points(found, number)[::3] * scale - first.low) / first.width
+            drawn = first.points(drawn_points(found, number)[::3] * scale)
             room = np.minimum(room, np.sqrt(np.square(points[:, None] - drawn).sum(axis=2)).min(axis=1))
     if shared.any():
         room[shared < shared.max()] = -1

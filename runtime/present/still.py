@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.frame.guards import guards_of
-from apc.frame.jacobians import jacobians
+from apc.frame.jacobians import guards_of, jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.optional import need

@@ -1,10 +1,12 @@
 """Boundary curves of a stable region in the unit square, to a stated accuracy.
 
 Takes: a `Family` of closed systems and the `Survey` of its cells.
-Gives: `Arc`, `trace`.
+Gives: `Arc`, `trace`; `trace_steps` for a boundary that has steps; `stable_area`, `relative_to`.
 Guarantees: every point lies on the boundary to rounding; between its points a curve is the cubic Hermite
 interpolant through points and tangents, and that has been measured against the true boundary in the middle
-of every interval. Where one mode takes over from another the curve has a corner, solved for.
+of every interval. Where one mode takes over from another the curve has a corner, solved for. Steps are known
+along each cell's edge to `RESOLUTION` of the range. The area is exact for the curves as given; how far these
+are off the boundary bounds its error.
 Does not: find pieces the survey has not seen.
 
 On the boundary log|λ| = 0 for the deciding eigenvalue; its gradient gives Newton's step
@@ -17,6 +19,7 @@ have log|λ_a| = log|λ_b| = 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +28,7 @@ from numpy.typing import NDArray
 from apc.frame.discretize import UNIT
 from apc.regions.boundary_points import MOST_STEPS, SHORT, clear, cross, just_inside, moved, polish
 from apc.regions.cells import Survey
-from apc.regions.curves import between, fill, off_an_arc, stencils, through_four
+from apc.regions.curves import area_beside, between, fill, off_an_arc, stencils, through_four
 from apc.regions.eigenpairs import Family, Pairs, follow, join, log_magnitudes, value_errors
 
 Floats = NDArray[np.float64]
@@ -51,6 +54,9 @@ EXPLAINED = 0.25
 
 # The share of the tolerance that interpolation may take.
 FILLED = 0.75
+
+# Where on a cell's edge a step of the boundary is, in shares of the range: finer than any picture shows.
+RESOLUTION = 2.0**-24
 
 # Errors are relative to a coordinate, or to this share of its range where the coordinate is smaller.
 LEAST_COORDINATE = 1e-3
@@ -375,3 +381,82 @@ def _arc(family: Family, knots: _Knots, piece: Integers, chain: int, tolerance: 
         rounding=float(rounding.max()),
         chain=chain,
     )
+
+
+def trace_steps(
+    growth: Callable[[Floats], Floats], leading: Callable[[Floats], complex], found: Survey
+) -> tuple[Arc, ...]:
+    """Follow a boundary that has steps and no tangents: from cell edge to cell edge by straight lines.
+
+    Over a link a packet is read at ticks only: the radius is a step function of the delay, and the boundary a
+    staircase, which goes straight up wherever a packet comes a tick later. How it runs inside a cell is not
+    said: its error there is the size of the cell.
+
+    Parameters
+    ----------
+    growth
+        The log of the spectral radius (k,) at points (k, 2).
+    leading
+        The eigenvalue that decides at a point (2,).
+    found
+        Where the boundary crosses the cells' edges, and in what order.
+    """
+    if not found.crossings:
+        return ()
+    stable = np.array([one.stable for one in found.crossings])
+    unstable = np.array([one.unstable for one in found.crossings])
+    while float(np.abs(unstable - stable).max()) > RESOLUTION:
+        middle = (stable + unstable) / 2
+        out = growth(middle) >= 0
+        unstable, stable = np.where(out[:, None], middle, unstable), np.where(out[:, None], stable, middle)
+    points = (stable + unstable) / 2
+    arcs = []
+    for number, (chain, closed) in enumerate(zip(found.chains, found.closed, strict=True)):
+        members = [*chain, chain[0]] if closed else list(chain)
+        own = points[members]
+        chord = np.diff(own, axis=0)
+        length = np.linalg.norm(chord, axis=1)
+        direction = chord / np.maximum(length, RESOLUTION)[:, None]
+        middle = members[len(members) // 2]  # its unstable side has the motion that grows
+        arcs.append(
+            Arc(
+                points=own,
+                tangents=np.concatenate([direction, direction[-1:]]),
+                errors=np.maximum(length, RESOLUTION),
+                knots=unstable[middle][None],
+                values=np.array([leading(unstable[middle])], np.complex128),
+                system=0,
+                rounding=RESOLUTION,
+                chain=number,
+                smooth=False,
+            )
+        )
+    return tuple(arcs)
+
+
+def stable_area(arcs: Sequence[Arc], found: Survey) -> tuple[float, float]:
+    """Return the stable share of the unit square, by Green's theorem, and a bound on its error.
+
+    ∮ x dy around the stable side: along the curves, and up the right edge where that is stable.
+    """
+    area, off = 0.0, 0.0
+    ends: dict[int, list[Floats]] = {}
+    for arc in arcs:
+        area += area_beside(arc.points, arc.tangents) if arc.smooth else _polygon(arc.points)
+        length = np.linalg.norm(np.diff(arc.points, axis=0), axis=1)
+        off += float(length @ arc.errors) + float(length.sum()) * arc.rounding
+        ends.setdefault(arc.chain, []).append(arc.points)
+    turns = []
+    for chain, pieces in ends.items():
+        if not found.closed[chain]:
+            turns += [float(end[1]) for end in (pieces[0][0], pieces[-1][-1]) if end[0] == 1.0]
+    stable, below = found.corners[1], 0.0
+    for turn in [*sorted(turns), 1.0]:
+        area += (turn - below) if stable else 0.0
+        stable, below = not stable, turn
+    return min(max(area, 0.0), 1.0), off
+
+
+def _polygon(points: Floats) -> float:
+    """Return ∫ x dy along straight lines."""
+    return float(((points[:-1, 0] + points[1:, 0]) / 2) @ np.diff(points[:, 1]))

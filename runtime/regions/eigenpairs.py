@@ -1,7 +1,7 @@
 """The eigenvalues that decide, of families of matrices over a plane, with their slopes.
 
 Takes: a `Family`: the closed systems of a scene as matrices over the unit square, with their derivatives.
-Gives: `Family`, `Pairs`, `log_magnitudes`, `leading`, `follow`, `value_errors`.
+Gives: `Family`, `Pairs`, `log_magnitudes`, `largest`, `leading`, `follow`, `value_errors`.
 Guarantees: all points at once; what is small is computed in few calls. A complex pair is stood for by its
 eigenvalue of positive imaginary part.
 Does not: know what the two coordinates are.
@@ -11,6 +11,7 @@ Does not: know what the two coordinates are.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -81,6 +82,12 @@ def log_magnitudes(family: Family, points: Floats, count: int) -> Floats:
     largest = -np.sort(-found, axis=1)[:, :count]
     logarithms: Floats = np.log(np.maximum(largest, LEAST_MAGNITUDE))
     return logarithms
+
+
+def largest(matrices: Sequence[Floats]) -> complex:
+    """Return the eigenvalue of largest magnitude of all systems (1, n, n) at one point."""
+    values = np.concatenate([np.linalg.eigvals(one[0]) for one in matrices])
+    return complex(values[np.argmax(np.abs(values))])
 
 
 def leading(family: Family, points: Floats) -> Pairs:

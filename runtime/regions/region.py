@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,15 +26,13 @@ from apc.compiler.words import counted
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.network.nominal import left_out, refuse_channel_number
-from apc.regions.area import stable_area
 from apc.regions.axes import PLACE
-from apc.regions.boundary import Arc, relative_to, trace
+from apc.regions.boundary import Arc, relative_to, stable_area, trace, trace_steps
 from apc.regions.cells import survey
 from apc.regions.curves import between
-from apc.regions.eigenpairs import Family, log_magnitudes
-from apc.regions.staircase import trace_steps
+from apc.regions.eigenpairs import Family, largest, log_magnitudes
 from apc.regions.strips import BRANCHES, Striped, trace_strips
-from apc.regions.surrogate import Rectangle, point_errors, resolve_family
+from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
@@ -144,8 +143,7 @@ class Region(Result):
     @property
     def rectangle(self) -> Rectangle:
         """The ranges."""
-        low = np.array([float(self.x.low), float(self.y.low)])
-        return Rectangle(low, np.array([float(self.x.high), float(self.y.high)]) - low)
+        return rectangle_of(self.x, self.y)
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return the points of all curves as a table (needs pandas)."""
@@ -175,7 +173,7 @@ class Region(Result):
         """
         wide, high = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         values = np.stack([wide.ravel(), high.ravel()], axis=1)
-        points = (values - self.rectangle.low) / self.rectangle.width
+        points = self.rectangle.points(values)
         if not np.all((points >= 0) & (points <= 1)):
             ranges = " and ".join(
                 f"{axis.label} in {float(axis.low):g} to {float(axis.high):g} {axis.unit}"
@@ -229,8 +227,7 @@ def region(
     free = tuple(Free(axis.name, axis.group) for axis in axes)
     for one in free:
         refuse_channel_number(system, one, PLACE)
-    low = np.array([float(axis.low) for axis in axes])
-    rectangle = Rectangle(low, np.array([float(axis.high) for axis in axes]) - low)
+    rectangle = rectangle_of(*axes)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]
@@ -289,10 +286,12 @@ def _surveyed(
     found = survey(samples, cells=cells)
     if timed:
         arcs = trace_steps(
-            lambda points: samples(points)[:, 0], lambda point: _leading_value(family, point), found
+            lambda points: samples(points)[:, 0],
+            lambda point: largest(family.matrices(point[None])),
+            found,
         )
     else:
-        arcs = trace(family, found, tolerance=tolerance, offset=rectangle.low / rectangle.width)
+        arcs = trace(family, found, tolerance=tolerance, offset=rectangle.offset)
     area, off = stable_area(arcs, found)
     return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
 
@@ -300,26 +299,10 @@ def _surveyed(
 def _family(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
     if isinstance(source, BatchEvaluator):
-        return resolve_family(source, rectangle, lambda values: matrix_errors(source, values))
-    if timed:
-        return _Timed(source, rectangle)
-    return resolve_family(source, rectangle, lambda values: point_errors(source, values))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Timed:
-    """A `Family` without slopes: each point has its own schedule."""
-
-    evaluator: PointEvaluator
-    rectangle: Rectangle
-    sizes: tuple[int, ...] = ()
-    errors: tuple[Floats, ...] = ()
-
-    def matrices(self, points: Floats) -> tuple[Floats, ...]:
-        return self.evaluator.matrices(self.rectangle.values(points))
-
-    def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
-        raise AssertionError("a schedule that changes has no slope")
+        return resolve_family(source, rectangle, partial(matrix_errors, source))
+    if timed:  # each point has a schedule of its own: there are no slopes, and no one size
+        return DirectFamily(source, rectangle, (), ())
+    return resolve_family(source, rectangle, source.errors)
 
 
 def _samples(
@@ -342,18 +325,12 @@ def _samples(
     return log_magnitudes(family, points, BRANCHES)
 
 
-def _leading_value(family: Family, point: Floats) -> complex:
-    """Return the eigenvalue of largest magnitude at a point (2,)."""
-    values = np.concatenate([np.linalg.eigvals(one[0]) for one in family.matrices(point[None])])
-    return complex(values[np.argmax(np.abs(values))])
-
-
 def _curve(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, arc: Arc) -> Curve:
     """Return an arc in SI."""
     return Curve(
         points=rectangle.values(arc.points),
         tangents=arc.tangents,
-        error=_relative_error(arc, rectangle.low / rectangle.width),
+        error=_relative_error(arc, rectangle.offset),
         distance=float(arc.errors.max(initial=0.0)) + arc.rounding,
         closed=arc.closed,
         smooth=arc.smooth,
@@ -389,7 +366,7 @@ def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], ND
     stable = np.full(len(points), found.corner)
     near = np.zeros(len(points), dtype=bool)
     for curve in found.curves:
-        knots = (curve.points - rectangle.low) / rectangle.width
+        knots = rectangle.points(curve.points)
         a, b = knots[:-1], knots[1:]
         sagitta = np.zeros(len(a))
         if curve.smooth:

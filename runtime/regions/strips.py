@@ -4,7 +4,7 @@ Takes: a `CompiledSystem`, a delay's range and another parameter's.
 Gives: `Striped`, `trace_strips`.
 Guarantees: within a strip the order of events stays: curves there are as right as those of two parameters
 that reach no time; between strips, where events coincide, the boundary goes straight along the delay's value.
-Does not: take two times, or scenes linearized at their start (None: see `staircase`).
+Does not: take two times, or scenes linearized at their start (None: see `boundary.trace_steps`).
 
 Where no event moves within a strip, as over a link, whose packets are read at ticks only, nothing changes
 with the delay: the boundary is a straight line at a critical value of the other parameter.
@@ -22,13 +22,12 @@ from apc.analysis.analysis import Prepared
 from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.frame.names import Free, parameter_of
-from apc.regions.area import stable_area
 from apc.regions.axes import PLACE
-from apc.regions.boundary import Arc, relative_to, trace
+from apc.regions.boundary import Arc, relative_to, stable_area, trace
 from apc.regions.cells import HALVINGS, survey
 from apc.regions.curves import between, refined
-from apc.regions.eigenpairs import log_magnitudes
-from apc.regions.surrogate import DirectFamily, Rectangle, point_errors, resolve_family
+from apc.regions.eigenpairs import largest, log_magnitudes
+from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
 from apc.vary.crossings import scan
 from apc.vary.delays import Piece, delay_pieces
 from apc.vary.evaluator import PointEvaluator, evaluator
@@ -134,7 +133,7 @@ def trace_strips(
         strips.append(found)
     whole = PointEvaluator(system, free, prepared)
     arcs = [list(one.arcs) for one in strips]
-    rectangle = _rectangle(delay, other)
+    rectangle = rectangle_of(delay, other)
     edges = []
     for place in range(1, len(strips)):
         edges += _join(strips, arcs, place, SAME * tolerance, whole, rectangle)
@@ -154,11 +153,6 @@ def trace_strips(
         cell=cell[::-1] if axis else cell,
         finest=2.0**-HALVINGS,
     )
-
-
-def _rectangle(delay: Range, other: Range) -> Rectangle:
-    low = np.array([float(delay.low), float(other.low)])
-    return Rectangle(low, np.array([float(delay.high), float(other.high)]) - low)
 
 
 def _standing(
@@ -230,14 +224,14 @@ def _moving(
     low = np.array([float(piece.low), float(other.low)])
     high = np.array([float(min(piece.high, delay.high)), float(other.high)])
     rectangle = Rectangle(low, high - low)
-    family = resolve_family(source, rectangle, lambda values: point_errors(source, values))
+    family = resolve_family(source, rectangle, source.errors)
     if isinstance(family, DirectFamily):
         return None
     found = survey(lambda points: log_magnitudes(family, points, BRANCHES), cells=cells)
-    arcs = trace(family, found, tolerance=tolerance * (1 - RESTATED), offset=low / rectangle.width)
+    arcs = trace(family, found, tolerance=tolerance * (1 - RESTATED), offset=rectangle.offset)
     area, off = stable_area(arcs, found)
-    offset = _rectangle(delay, other)
-    restated = [_restated(arc, ends, tolerance, offset.low / offset.width) for arc in arcs]
+    offset = rectangle_of(delay, other).offset
+    restated = [_restated(arc, ends, tolerance, offset) for arc in arcs]
     if any(arc is None for arc in restated):
         return None
     kept = tuple(arc for arc in restated if arc is not None)
@@ -337,9 +331,8 @@ def _edge_piece(
     grows = strips[place] if stable_before else strips[place - 1]
     inside = (1 if stable_before else -1) * INSIDE * (grows.end - grows.start)
     knot = np.array([[edge + inside, (low + high) / 2]])
-    values = np.concatenate([np.linalg.eigvals(one[0]) for one in source.matrices(rectangle.values(knot))])
     points = np.array([[edge, low], [edge, high]])
-    leading = complex(values[np.argmax(np.abs(values))])
+    leading = largest(source.matrices(rectangle.values(knot)))
     # Upwards, the left-hand side is the strip before.
     return _straight(points if stable_before else points[::-1].copy(), knot, leading, float(np.spacing(1.0)))
 

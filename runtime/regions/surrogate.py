@@ -1,7 +1,7 @@
 """Frame matrices over a rectangle of two parameters, as Chebyshev series.
 
 Takes: an `Evaluator` of two free parameters and their ranges.
-Gives: `ChebyshevFamily`, `DirectFamily`, `resolve_family`; `point_errors`.
+Gives: `ChebyshevFamily`, `DirectFamily`, `resolve_family`; `Rectangle`, `rectangle_of`.
 Guarantees: a series stands for the matrices only when it has converged to rounding in both directions, as
 seen from its last coefficients; how far it may be off is told.
 Does not: resolve what jumps or bends in the rectangle (see `DirectFamily`, which computes every point anew).
@@ -20,13 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.ranges import Range
 from apc.eigen.pseudospectrum import balance
-from apc.eigen.relative import relative_bounded, relative_coordinates
-from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.regions.eigenpairs import Family
 from apc.vary.batch import Evaluator
-from apc.vary.evaluator import PointEvaluator
 
 Floats = NDArray[np.float64]
 
@@ -59,6 +57,21 @@ class Rectangle:
     def values(self, points: Floats) -> Floats:
         """Return parameter values (k, 2) at points of the unit square."""
         return self.low + points * self.width
+
+    def points(self, values: Floats) -> Floats:
+        """Return the points of the unit square (k, 2) of parameter values."""
+        return (values - self.low) / self.width
+
+    @property
+    def offset(self) -> Floats:
+        """What to add to points to have them count from a parameter's zero (2,)."""
+        return self.low / self.width
+
+
+def rectangle_of(x: Range, y: Range) -> Rectangle:
+    """Return the rectangle of two ranges."""
+    low = np.array([float(x.low), float(y.low)])
+    return Rectangle(low, np.array([float(x.high), float(y.high)]) - low)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,21 +239,3 @@ def _to_coefficients(nodes: Floats) -> Floats:
     transform: Floats = np.cos(np.outer(np.arange(count), np.arccos(2 * nodes - 1))) * (2 / count)
     transform[0] /= 2
     return transform
-
-
-def point_errors(source: PointEvaluator, values: Floats) -> tuple[Floats, ...]:
-    """Return bounds (1, n, n) on the errors of an evaluator's one matrix, amid some values (k, 2).
-
-    A block of relative coordinates x_rest − W x_held is off by what its rows and W times the others' are.
-    """
-    middle = values.mean(axis=0)
-    (matrix,) = source.matrices(middle[None])
-    found = np.zeros(matrix.shape)
-    start = 0
-    for system in source.closed_at(middle.tolist()):
-        free = find_rigid_modes(system, with_drifts=False)
-        _, error = relative_bounded(system.matrix, system.error, relative_coordinates(free.basis))
-        rows = slice(start, min(start + len(error), matrix.shape[-1]))
-        found[0, rows, rows] = error[: rows.stop - start, : rows.stop - start]
-        start = rows.stop
-    return (found,)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.frame.exact import ROWS, evaluate_exact
-from apc.frame.guards import guards_of
+from apc.frame.jacobians import guards_of
 from apc.simulation.propagate import Rates
 from apc.simulation.quadrature import AGREE, Kernel, Panels, integrate, magnitude, panels, whole
 

@@ -21,7 +21,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.guards import guards_of
+from apc.frame.jacobians import guards_of
 
 Floats = NDArray[np.float64]
 

@@ -23,8 +23,7 @@ from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import discretize
 from apc.frame.exact import evaluate_exact
-from apc.frame.guards import guards_of
-from apc.frame.jacobians import structural_pattern
+from apc.frame.jacobians import guards_of, structural_pattern
 from apc.frame.parameters import exact_numbers
 
 Floats = NDArray[np.float64]

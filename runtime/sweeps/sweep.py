@@ -26,15 +26,7 @@ from apc.compiler.files import is_special
 from apc.frame.jacobians import jacobians
 from apc.frame.names import Free
 from apc.network.nominal import left_out, refuse_channel_number
-from apc.processes import (
-    Patience,
-    Workers,
-    cores,
-    local_processes,
-    model_bytes,
-    results,
-    this_process,
-)
+from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
 from apc.sweeps.quantities import VERDICT, find_quantity

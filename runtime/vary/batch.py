@@ -370,9 +370,9 @@ def _closing_errors(
 ) -> Closed:
     """Return `closing.closing_errors` of a system, from the magnitudes of its sites and these with errors."""
     keys = [site_key(group) for group in wiring.system.sites]
-    hearing = [one.size for one in wiring.hearing]
+    feedback = [one.size for one in wiring.feedback]
     sizes, wides = ([maps[key] for key in keys] for maps in (size, wide))
-    return closing_errors(sizes, wides, hearing, wiring.system.layout, times=times)
+    return closing_errors(sizes, wides, feedback, wiring.system.layout, times=times)
 
 
 def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tuple[Floats, ...]:

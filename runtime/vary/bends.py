@@ -22,7 +22,7 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.plain import symbolic
+from apc.compiler.plain import straight, symbolic
 from apc.frame.exact import evaluate_exact
 from apc.frame.parameters import free_values
 from apc.vary.batch import BatchEvaluator
@@ -44,10 +44,7 @@ TERMS, BITS = 5, 64
 
 # Operations that may make a step, or a kink, of what is straight on either side.
 _STEPS = frozenset(
-    (
-        *(casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, casadi.OP_NOT, casadi.OP_IF_ELSE_ZERO),
-        *(casadi.OP_FABS, casadi.OP_SIGN, casadi.OP_FLOOR, casadi.OP_CEIL, casadi.OP_FMIN, casadi.OP_FMAX),
-    )
+    ["lt", "le", "eq", "ne", "not", "if_else_zero", "fabs", "sign", "floor", "ceil", "fmin", "fmax"]
 )
 
 
@@ -158,7 +155,7 @@ def _bending(function: Any, value: Any, vector: Any) -> Any:
         return None
     flat = flat[moved]
     whole = casadi.Function("coefficients", [value], [flat])
-    if not any(whole.instruction_id(place) in _STEPS for place in range(whole.n_instructions())):
+    if _STEPS.isdisjoint(word for word, *_ in straight(whole).operations):
         bent = [place for place, one in enumerate(casadi.which_depends(flat, value, 2, True)) if one]
         if not bent:
             return None

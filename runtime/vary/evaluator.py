@@ -111,6 +111,10 @@ class PointEvaluator:
         ]
         return split(*lifted_groups(apply(self.system, overrides), prepared=self.prepared)).systems
 
+    def errors(self, values: Floats) -> tuple[Floats, ...]:
+        """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
+        return (_filled_up_pairs([self._bounded(value) for value in values])[1],)
+
     def differences(self, value: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the matrix (n, n) at a point (m,) and its error, its derivatives (m, n, n) and theirs.
 

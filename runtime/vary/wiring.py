@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem, Hearing, close, hearing_of
+from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes
@@ -44,7 +44,7 @@ class Wiring:
     """
 
     system: ClosedSystem
-    hearing: tuple[Hearing, ...]  # one a site
+    feedback: tuple[Feedback, ...]  # one a site
     rigid: RigidModes
     relative: Relative
     moving: bool  # the directions follow the free parameters, and W with them
@@ -57,18 +57,18 @@ def site_key(group: PeerGroup) -> tuple[int, int]:
 
 def wire(system: ClosedSystem) -> Wiring:
     """Take down who hears whom in a closed system, and its rigid motions."""
-    hearing = tuple(hearing_of(system, system.layout, lambda weight, _: float(weight)))
+    feedback = tuple(feedback_of(system, system.layout, lambda weight, _: float(weight)))
     rigid = find_rigid_modes(system, with_drifts=False)
-    wiring = _without(system, hearing, rigid)
+    wiring = _without(system, feedback, rigid)
     if rigid.names:
         values = np.linalg.eigvals(reduced(wiring, system.matrix[None], 1)[0])
         if np.any(np.abs(values - 1) < NEAR_ONE):
-            wiring = _without(system, hearing, find_rigid_modes(system))
+            wiring = _without(system, feedback, find_rigid_modes(system))
     return wiring
 
 
-def _without(system: ClosedSystem, hearing: tuple[Hearing, ...], rigid: RigidModes) -> Wiring:
-    return Wiring(system, hearing, rigid, relative_coordinates(rigid.basis), moving=False)
+def _without(system: ClosedSystem, feedback: tuple[Feedback, ...], rigid: RigidModes) -> Wiring:
+    return Wiring(system, feedback, rigid, relative_coordinates(rigid.basis), moving=False)
 
 
 def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
@@ -98,7 +98,7 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
 def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
     """Close the loop of one system at all points: its matrices (k, n, n), see `closing.close`."""
     maps = [lifted[site_key(group)] for group in wiring.system.sites]
-    return close(maps, wiring.hearing, wiring.system.layout).matrix
+    return close(maps, wiring.feedback, wiring.system.layout).matrix
 
 
 def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:

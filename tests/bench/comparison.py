@@ -34,7 +34,6 @@ from scipy.linalg import expm
 
 import apc
 from apc.analysis.analysis import analyze
-from apc.benchmark.reference import Truth, exact_course, spectral_truth
 from apc.benchmark.timing import median_time, take_turns
 from apc.compiler.compiled import CompiledSystem
 from apc.simulation.blocks import blocks
@@ -57,6 +56,7 @@ from tests.bench.paper_scene import (
 )
 from tests.bench.pathsim import played_by_pathsim
 from tests.bench.simulate import MOVED, numpy_loop
+from tests.fifty_digits.truth import Truth, exact_course, spectral_truth
 from tests.topologies import AVERAGE, compiled
 
 ROUNDS = 15

@@ -2,7 +2,7 @@
 """Random scenes, each verdict and bound against 256-bit arithmetic: `python -m tests.bench.random_scenes`.
 
 Topologies of every shape are drawn (see `bench.shapes`), and for each of them numbers over many decades.
-The truth comes from the compiled functions alone, event by event (see `bench.reference`). A bound that does
+The truth comes from the compiled functions alone, event by event (see `fifty_digits.truth`). A bound that does
 not hold and a wrong verdict must be none, verdicts left open and scenes refused hardly any.
 """
 
@@ -23,7 +23,6 @@ import flint
 
 from apc.analysis.analysis import Analysis, analyze, prepare
 from apc.answer import sensitivities_of
-from apc.benchmark.reference import RIGID, classes_of, eigenvalues, frame_matrices
 from apc.benchmark.timing import timed
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library
@@ -35,6 +34,7 @@ from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
 from tests.bench.sensitivity_truth import check_frequencies, check_sensitivities
 from tests.bench.shapes import PARTS, Shape, draw_shape
+from tests.fifty_digits.truth import RIGID, classes_of, eigenvalues, frame_matrices
 from tests.topologies import compiled
 
 BITS = 256  # a chain of four equal eigenvalues still keeps 19 digits

@@ -20,8 +20,13 @@ import flint
 import numpy as np
 
 from apc.analysis.analysis import Analysis, analyze, prepare
-from apc.benchmark.events import Happening, Play, build_peers, refusal
-from apc.benchmark.reference import (
+from apc.compiler.compiled import CompiledSystem
+from apc.eigen.balls import precision
+from apc.frame.names import Free, find, parameter_of
+from apc.frame.overrides import Override, apply
+from apc.vary.sensitivity import Sensitivities, sensitivities
+from tests.fifty_digits.events import Happening, Play, build_peers, refusal
+from tests.fifty_digits.truth import (
     RIGID,
     _common_whom,
     _difference_whom,
@@ -29,11 +34,6 @@ from apc.benchmark.reference import (
     _to_state,
     classes_of,
 )
-from apc.compiler.compiled import CompiledSystem
-from apc.eigen.balls import precision
-from apc.frame.names import Free, find, parameter_of
-from apc.frame.overrides import Override, apply
-from apc.vary.sensitivity import Sensitivities, sensitivities
 from tests.topologies import compiled
 
 BITS = 320

@@ -7,9 +7,9 @@ Run it from the project's folder: `python -m tests.bench.work_precision [--plot 
     arm             an arm holds a device that pushes a tool by a spring, forces at ticks: linear
 
 The error is that of the positions, relative to the way they go, against programs that share no method with
-those compared: fifty digits event by event (`bench.reference`) for the arm, equations by hand and a method of
-order 8 (`tests.bench.contact_reference`) for the contacts. The time is that of the run, without preparing it,
-as a part of real time.
+those compared: fifty digits event by event (`tests.fifty_digits`) for the arm, equations by hand and a method
+of order 8 (`tests.bench.contact_reference`) for the contacts. The time is that of the run, without preparing
+it, as a part of real time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.benchmark.reference import exact_course
 from apc.benchmark.timing import median_time
 from apc.compiler.compiled import CompiledSystem
 from apc.simulation.blocks import blocks
@@ -32,6 +31,7 @@ from apc.simulation.simulation import Simulation, prepare
 from apc.threads import single_threaded
 from tests.bench.contact_reference import Bounce, reference
 from tests.bench.judge import Judge, parser_of
+from tests.fifty_digits.truth import exact_course
 from tests.topologies import compiled
 
 DURATION = Fraction(1, 2)

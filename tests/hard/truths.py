@@ -1,9 +1,9 @@
 """The truth about every scene here, to fifty digits: `python -m tests.hard.truths` writes truths.json.
 
 All peers (equal ones by a representative and the weights of its class) are followed event by event in ball
-arithmetic, see `bench.reference`; two precisions agree on every digit written. Nothing of the analysis takes
-part. A delay of a thousand frames comes as a polynomial, whose roots Arb encloses. The gains of the scenes
-`boundary-*` are found here by bisection and compared with those that stand in them.
+arithmetic, see `tests.fifty_digits`; two precisions agree on every digit written. Nothing of the analysis
+takes part. A delay of a thousand frames comes as a polynomial, whose roots Arb encloses. The gains of the
+scenes `boundary-*` are found here by bisection and compared with those that stand in them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ from typing import Any
 import flint
 
 import apc
-from apc.benchmark.reference import (
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.pipeline import compile_topology
+from apc.eigen.balls import precision
+from tests.fifty_digits.truth import (
     DIGITS,
     RIGID,
     Truth,
@@ -26,9 +29,6 @@ from apc.benchmark.reference import (
     frame_matrices,
     spectral_truth,
 )
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.pipeline import compile_topology
-from apc.eigen.balls import precision
 
 HERE = Path(__file__).resolve().parent
 TRUTHS = HERE / "truths.json"

@@ -30,7 +30,7 @@ import flint
 
 from apc.compiler.compiled import Kind
 from apc.frame.exact import evaluate_exact, is_rational
-from apc.frame.guards import guards_of
+from apc.frame.jacobians import guards_of
 
 # K. Of a sine the terms left out are 1e-56 where it makes a tenth of a turn within the interval.
 ORDER = 40

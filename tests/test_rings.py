@@ -1,4 +1,4 @@
-"""Claims about `extremes` and `graph`: few of many systems decide, and the others are shown not to."""
+"""Claims about `rings`: few of many systems decide, and the others are shown not to."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze, lifted_groups
+from apc.analysis.plan import is_large_ring
 from apc.eigen.closing import close_loop
 from apc.eigen.graph_loops import graph_loop, graph_scale
 from apc.eigen.graph_modes import ring_mode, ring_values
 from apc.eigen.peer_group import used_ways
-from apc.large.extremes import find_extremes
-from apc.large.graph import deciding_loops, is_large_ring
+from apc.large.rings import deciding_loops, find_extremes
 from tests.sites import MS, grouped, linked, paper
 
 VARIED: list[dict[str, Any]] = [

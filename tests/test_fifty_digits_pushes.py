@@ -12,12 +12,14 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.benchmark.bench import bench_simulation
-from apc.benchmark.events import refusal
-from apc.benchmark.reference import Truth, exact_course, spectral_truth
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
+from apc.simulation.blocks import blocks
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
+from tests.fifty_digits.events import refusal
+from tests.fifty_digits.truth import Truth, exact_course, spectral_truth
 from tests.topologies import SCENES, compiled, library
 
 MASS, DAMPING = 0.25, 2.0  # kg, N·s/m: numbers of a few bits, so that text and closed form mean the same
@@ -104,11 +106,15 @@ def test_a_force_of_time_moves_a_mass_as_its_integral_says(what: str, tmp_path: 
 
 def test_the_scene_whose_force_grows_is_followed_and_the_default_is_exact_on_it() -> None:
     """Two roads: balls from tick to tick, and the simulation's rules of Gauss and Legendre."""
-    found = bench_simulation(compile_topology(SCENES / "finger.yaml"), Fraction(1, 10), rounds=1)
-    assert found.reference == "101 instants in ball arithmetic"
-    assert found.chosen is not None
-    assert found.chosen.error is not None
-    assert found.chosen.error < 1e-13
+    system = compile_topology(SCENES / "finger.yaml")
+    followed = exact_course(system, Fraction(1, 10))
+    assert not isinstance(followed, str), followed
+    names, rows = followed
+    ready = prepare(system, Settings(Fraction(1, 10)), signals=names)
+    assert ready.how == "exact"
+    assert tuple(signal.name for signal in ready.signals) == names
+    played = np.concatenate([block.values for block in blocks(ready)])
+    assert np.all(np.abs(played - rows).max(axis=0) <= 1e-13 * np.abs(rows).max(axis=0))
 
 
 def test_a_scene_in_which_nothing_ticks_is_followed(tmp_path: Path) -> None:

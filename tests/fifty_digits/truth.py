@@ -16,7 +16,13 @@ from typing import Any
 import flint
 import numpy as np
 
-from apc.benchmark.events import (
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.weights import exact_weight
+from apc.eigen.balls import precision, rational_ball
+from apc.frame.exchange import arcs
+from apc.frame.parameters import resolve
+from apc.simulation.simulation import ROW
+from tests.fifty_digits.events import (
     Happening,
     Number,
     Peer,
@@ -26,12 +32,6 @@ from apc.benchmark.events import (
     refusal,
     ticks_between,
 )
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.weights import exact_weight
-from apc.eigen.balls import precision, rational_ball
-from apc.frame.exchange import arcs
-from apc.frame.parameters import resolve
-from apc.simulation.simulation import ROW
 
 # What is asked of a reference, relative to the largest: far beyond what floats can be wrong by.
 DIGITS = 50

@@ -1,8 +1,9 @@
-"""The reference of fifty digits, against computations that share nothing with it."""
+"""The independent engine of fifty digits against computations that share nothing with it, and balls."""
 
 from __future__ import annotations
 
 import ast
+import json
 import math
 from fractions import Fraction
 from pathlib import Path
@@ -12,17 +13,19 @@ import flint
 import numpy as np
 import pytest
 
-from apc.benchmark import events
-from apc.benchmark import reference as fifty_digits
-from apc.benchmark.events import refusal
-from apc.benchmark.reference import Truth, classes_of, exact_course, spectral_truth
+from apc.benchmark.truth import spectral_truth as of_balls
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
 from tests.bench.contact_reference import Bounce, positions, reference
 from tests.bruteforce import Scene, frame_matrix
 from tests.eventwise import experiment, play
+from tests.fifty_digits import events
+from tests.fifty_digits import truth as fifty_digits
+from tests.fifty_digits.events import refusal
+from tests.fifty_digits.truth import Truth, classes_of, exact_course, spectral_truth
 from tests.sites import MS, columned, edged, grouped, linked, paper
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
 
 
 def _arb(value: object) -> flint.arb:
@@ -38,6 +41,47 @@ def _radius(scene: Scene, rigid: int) -> flint.arb:
         values = flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
         values.sort(key=lambda value: float(abs(value - 1).mid()))
         return max(abs(value).mid() for value in values[rigid:])
+
+
+@pytest.mark.parametrize("name", ["ring-of-eight", "star-lecture", "mixed-clocks", "experiment-mesh"])
+def test_what_bench_compares_with_is_the_truth_of_the_independent_engine(name: str) -> None:
+    system = compile_topology(SCENES / f"{name}.yaml")
+    found = of_balls(system)
+    assert not isinstance(found, str), found
+    assert found.digits[:45] == _truth(system).digits[:45]
+
+
+def test_what_bench_compares_with_is_the_stored_truth_of_hard_cases() -> None:
+    folder = ROOT / "tests" / "hard"
+    stored = json.loads((folder / "truths.json").read_text(encoding="utf-8"))
+    for name in (
+        "boundary-inside-13",
+        "coasting",
+        "high-rate-ratio",
+        "nearly-defective",
+        "three-large-groups",
+    ):
+        found = of_balls(compile_topology(folder / f"{name}.yaml"))
+        assert not isinstance(found, str), found
+        assert found.digits[:45] == stored[name]["spectral_radius"][:45]
+
+
+def test_weights_known_as_floats_only_are_no_balls_truth() -> None:
+    """A graph whose eigenvalues are floats is one whole system; its truth is the engine's too."""
+    arcs = [(0, 1, 1.0), (1, 0, 0.5), (2, 1, 2.0), (1, 2, 0.25)]
+    system = linked(paper(peers=3), arcs)
+    found = of_balls(system)
+    assert not isinstance(found, str), found
+    assert found.digits[:45] == _truth(system).digits[:45]
+
+
+def test_what_is_too_large_for_balls_says_so() -> None:
+    many = columned(paper(peers=40), device__mass=[0.1 + 0.01 * i for i in range(40)])
+    assert str(of_balls(many)) == "160 states of motion of different peers take too long at 50 digits"
+    ring = linked(paper(peers=1000), "ring")
+    assert str(of_balls(ring)) == "1,000 peers on a graph take too long at 50 digits"
+    late = compile_topology(ROOT / "tests" / "hard" / "very-long-delay.yaml")
+    assert str(of_balls(late)) == "eigenvalues of 2,006 states together take too long at 50 digits"
 
 
 def _truth(system: CompiledSystem) -> Truth:
@@ -127,7 +171,7 @@ def test_the_reference_shares_with_the_runtime_what_it_says_and_no_more() -> Non
         tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             module_name = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
-            if module_name.startswith("apc.") and "apc.benchmark" not in module_name:
+            if module_name.startswith("apc.") and "apc.compiler" not in module_name:
                 shared |= {alias.name for alias in node.names}  # type: ignore[attr-defined] # it is an import
     functions = {"evaluate_exact", "is_rational", "guards_of", "rational_ball", "precision"}
     assert shared == functions | {"resolve", "exact_numbers", "arcs", "ROW"}

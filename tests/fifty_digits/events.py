@@ -6,7 +6,7 @@ Guarantees: shares with the analysis and the simulation what says what the scene
 what it does: no Jacobian of theirs, no schedule, no lifted map, no mode. Shared are the compiled functions;
 the numbers of each peer (`parameters.resolve`, `exact_numbers`); the walk through a function's operations
 over exact numbers and whether that is possible (`exact.evaluate_exact`, `is_rational`, `guards.guards_of`);
-how a rational becomes a ball (`balls.rational_ball`, `precision`); and in `bench.reference` who hears whom on
+how a rational becomes a ball (`balls.rational_ball`, `precision`); and in `truth` who hears whom on
 a graph (`exchange.arcs`) and the row of a scene without clocks (`simulation.ROW`). A mistake in one of these
 is the reference's too: `tests.bruteforce` and `tests.eventwise` share none of them and stand beside it in its
 tests.
@@ -28,12 +28,12 @@ import casadi
 import flint
 import numpy as np
 
-from apc.benchmark.pushes import Push, impulse, in_the_way, push_of, switches
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.eigen.balls import rational_ball
 from apc.frame.exact import evaluate_exact, is_rational
-from apc.frame.guards import guards_of
+from apc.frame.jacobians import guards_of
 from apc.frame.parameters import exact_numbers, resolve
+from tests.fifty_digits.pushes import Push, impulse, in_the_way, push_of, switches
 
 Number = Any  # flint.arb, an exact 0 or 1, or an array of these
 

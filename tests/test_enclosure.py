@@ -1,11 +1,11 @@
-"""Claims about `apc.eigen.components`."""
+"""Claims about `apc.eigen.enclosure`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from apc.eigen.components import components
+from apc.eigen.enclosure import components
 
 
 def _listed(driven: np.ndarray) -> list[list[int]]:
