@@ -85,7 +85,7 @@ HOUSE = (
     (
         "apc.simulation",
         """
-        settings integrate propagate flow instants quadrature forcing
+        settings integrate propagate flow quadrature forcing
         signals pairs program writing native selection frame_packets population
         simulation blocks accuracy summary trajectory ensemble
         """,

@@ -1,4 +1,4 @@
-"""Claims about `apc.simulation.instants`."""
+"""Claims about `apc.simulation.forcing`: a function of time at many instants at once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import casadi
 import numpy as np
 import pytest
 
-from apc.simulation.instants import MOST, at_instants
+from apc.simulation.forcing import MOST_INSTANTS, at_instants
 
 PARAMETERS = np.array([0.7, -1.3])
 # Every way in which a force may hang on time.
@@ -42,7 +42,7 @@ def test_every_operation_gives_what_casadi_gives(name: str) -> None:
 
 def test_instants_of_any_shape_and_number_are_taken() -> None:
     function = function_of(FORCES["sine"])
-    instants = np.linspace(0, 1, 2 * MOST + 6).reshape(2, MOST + 3, 1)
+    instants = np.linspace(0, 1, 2 * MOST_INSTANTS + 6).reshape(2, MOST_INSTANTS + 3, 1)
     found = at_instants(function, PARAMETERS, instants)
     assert found.shape == (2, *instants.shape)
     assert (found[1] == instants).all()

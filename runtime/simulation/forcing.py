@@ -1,7 +1,7 @@
 """What forces that change with time alone add to a site's motion, exact to rounding.
 
 Takes: the `Rates` of a kind, parameter vectors, when the intervals begin and how long they last.
-Gives: `Forcing`, `forcing_of`, `SiteForcing`, `impulses`.
+Gives: `Forcing`, `forcing_of`, `SiteForcing`, `impulses`; `at_instants`.
 Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
 a table), so that what is integrated is smooth; an impulse is right to a few roundings of its terms and of
 the instants.
@@ -22,8 +22,8 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of
-from apc.simulation.instants import at_instants
 from apc.simulation.propagate import Rates
 from apc.simulation.quadrature import AGREE, Kernel, Panels, integrate, magnitude, panels, whole
 
@@ -32,6 +32,8 @@ Integers = NDArray[np.int64]
 
 MOST_HALVINGS = 30  # below 1e-9 of an interval, what a jump is missed by is far below a rounding
 MOST_PANELS = 256  # integrated at once: what is held of them stays within some MB, however many there are
+# Instants of one walk: the arrays it holds then stay in the cache of a processor.
+MOST_INSTANTS = 8192
 LOOKS = 5  # instants of an interval at which a switch that is not linear in time is looked for
 
 # A switch is found to this share of the interval, or to a rounding of its instant.
@@ -87,6 +89,40 @@ def forcing_of(rates: Rates) -> Forcing:
         switches=casadi.Function("switches", [p, t], [casadi.densify(column)]),
         affine=affine,
     )
+
+
+def at_instants(function: Any, parameters: Floats, instants: Floats) -> Floats:
+    """Return a function's column at all instants (rows, *shape of the instants).
+
+    An expression is walked once, each operation over all instants in one call of NumPy; what does not hang on
+    time is computed once. CasADi's own map takes longer to build than to evaluate, and copies the parameters
+    to each instant.
+
+    Parameters
+    ----------
+    function
+        A `casadi.Function` of (p, t), its only output a dense column.
+    parameters
+        p (n_p,).
+    instants
+        In seconds, of any shape.
+    """
+    flat = instants.reshape(-1)
+    values = np.empty((function.numel_out(0), flat.size))
+    if not function.is_a("SXFunction"):  # the solution of a nonlinear loop, which only CasADi knows
+        if flat.size:
+            many = function.map(flat.size)(parameters, flat.reshape(1, -1))
+            values[:] = np.asarray(many).reshape(values.shape)
+        return values.reshape(len(values), *instants.shape)
+    listed = list(parameters)
+    with np.errstate(all="ignore"):
+        for start in range(0, flat.size, MOST_INSTANTS):
+            some = slice(start, start + MOST_INSTANTS)
+            for row, found in enumerate(
+                evaluate_exact(function, [listed, [flat[some]]], number=np.float64, rules=ROWS)[0]
+            ):
+                values[row, some] = found
+    return values.reshape(len(values), *instants.shape)
 
 
 def impulses(site: SiteForcing, starts: Floats, which: Integers) -> Floats:

@@ -269,9 +269,9 @@ def _other_versions(computed: Computed, cluster: str | None) -> Mistake:
 def _rows(work: Work, kept: _Kept) -> Iterator[Row]:
     """Yield every row: the values of the axes, then the results."""
     for part in range(work.parts):
-        results = kept.read(part)
-        assert results is not None, f"part {part} was written and is gone"
-        for point, row in zip(work.points_of(part), results, strict=True):
+        computed = kept.read(part)
+        assert computed is not None, f"part {part} was written and is gone"
+        for point, row in zip(work.points_of(part), computed, strict=True):
             yield (*(float(value) for value in work.grid.values(point)), *row)
 
 
