@@ -187,6 +187,19 @@ def test_the_compilers_map_names_every_module_of_it() -> None:
     assert names <= set(re.findall(r"\w+", text))
 
 
+def test_the_page_on_the_rooms_names_what_there_is() -> None:
+    text = (ROOT / "runtime" / "README.md").read_text(encoding="utf-8")
+    rooms = {package.split(".")[1] for package, _ in HOUSE if package.count(".") == 1} - {"compiler"}
+    assert rooms == set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", text, re.MULTILINE))))
+    named = re.findall(r"`([a-z]\w*(?:\.\w+)+)`", text) + re.findall(r"^    (\S+\.\S+)  ", text, re.MULTILINE)
+    tops = {one.split(".")[1] for one in ORDER}
+    for name in [one for one in named if one.split(".")[0] in tops]:
+        module = max((one for one in ORDER if f"apc.{name}.".startswith(f"{one}.")), key=len, default="")
+        rest = f"apc.{name}"[len(module) + 1 :]
+        assert module, name
+        assert not rest or hasattr(importlib.import_module(module), rest), name
+
+
 def test_nothing_is_evaluated_or_unpickled() -> None:
     for name, path in modules().items():
         tree = ast.parse(path.read_text(encoding="utf-8"))
