@@ -9,7 +9,8 @@ from typing import Any
 import casadi
 import pytest
 
-from apc.compiler.compiled import CompiledSystem, Kind, Parameter
+from apc.compiler.compiled import CompiledSystem, Formula, Kind, Parameter
+from apc.compiler.plain import PlainFunction
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, library, replaced, told
 
 
@@ -76,13 +77,20 @@ def test_timings_are_exact_and_each_is_there_once() -> None:
     assert len({t.name for t in system.timings}) == len(system.timings)
 
 
-def test_a_parameter_keeps_its_bounds_its_unit_and_its_expression() -> None:
+def test_a_parameter_keeps_its_bounds_its_unit_and_what_it_follows_from() -> None:
     text = replaced(
         AVERAGE, ("clocks:", "parameters: {kt: 2 N/mm}\nclocks:"), ("500 N/m,", "kt/(peers + 1),")
     )
-    found = {parameter.name: parameter for parameter in compiled(text).parameters}
+    system = compiled(text)
+    found = {parameter.name: parameter for parameter in system.parameters}
+    quotient = PlainFunction(
+        *("formula", (("p", 2), ("c", 1)), ("y",), (), (("add", 1, 2), ("div", 0, 3)), ((4,),), None)
+    )
+    spans = ((0, 2), (4, 9), (12, 13), (4, 13), (0, 14))
+    formula = Formula("kt/(peers + 1)", ("kt", "peers"), (Fraction(1),), quotient, spans)
+    assert system.followers == ("coordination.stiffness",)
     assert found["coordination.stiffness"] == Parameter(
-        *("coordination.stiffness", "N/m", 500.0, "kt/(peers + 1)", 0.0, False, None),
+        *("coordination.stiffness", "N/m", 500.0, formula, 0.0, False, None),
         *("force per distance from the mean", Fraction(500)),
     )
     assert (found["device.mass"].minimum, found["device.mass"].open_minimum) == (0.0, True)
