@@ -105,8 +105,7 @@ def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
     """Take the rigid motions out; NaN where the directions are not rigid."""
     at, sound = relative_at(wiring, matrix)
     within = relative(matrix, at)
-    within[~sound] = np.nan
-    within[~np.isfinite(within).all(axis=(1, 2))] = np.nan
+    within[~(sound & np.isfinite(within).all(axis=(1, 2)))] = np.nan
     return np.broadcast_to(within, (count, *within.shape[1:])).copy() if len(within) < count else within
 
 
