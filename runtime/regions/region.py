@@ -145,7 +145,7 @@ class Region(Result):
     def rectangle(self) -> Rectangle:
         """The ranges."""
         low = np.array([float(self.x.low), float(self.y.low)])
-        return Rectangle(low, np.array([float(self.x.high), float(self.y.high)]) - low)
+        return Rectangle(low, np.array([float(axis.high - axis.low) for axis in (self.x, self.y)]))
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return the points of all curves as a table (needs pandas)."""
@@ -230,7 +230,7 @@ def region(
     for one in free:
         refuse_channel_number(system, one, PLACE)
     low = np.array([float(axis.low) for axis in axes])
-    rectangle = Rectangle(low, np.array([float(axis.high) for axis in axes]) - low)
+    rectangle = Rectangle(low, np.array([float(axis.high - axis.low) for axis in axes]))
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]

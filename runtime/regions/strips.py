@@ -160,8 +160,10 @@ def trace_strips(
 
 
 def _rectangle(delay: Range, other: Range) -> Rectangle:
-    low = np.array([float(delay.low), float(other.low)])
-    return Rectangle(low, np.array([float(delay.high), float(other.high)]) - low)
+    return Rectangle(
+        np.array([float(delay.low), float(other.low)]),
+        np.array([float(delay.high - delay.low), float(other.high - other.low)]),
+    )
 
 
 def _standing(
