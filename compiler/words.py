@@ -1,7 +1,8 @@
 """The words of messages and reports: numbers with their nouns and units, and lines that fit a terminal.
 
 Takes: numbers and texts.
-Gives: `WIDTH`, `cut`, `counted`, `measured`, `known_digits`, `with_unit`, `in_hertz`, `wrapped`.
+Gives: `WIDTH`, `cut`, `counted`, `measured`, `known_digits`, `with_unit`, `in_hertz`,
+`time_left`, `wrapped`.
 Guarantees: no digit is shown that its number's error leaves open; a line is at most `WIDTH` columns wide, but
 for a word that has no place to break it at.
 Does not: know what is told, or print.
@@ -71,6 +72,18 @@ def known_digits(value: float, error: float, most: int) -> str:
         return f"{value:.{most}g}"
     digits = Decimal(value).adjusted() - Decimal(error).adjusted() if error else most
     return f"{value:.{min(max(digits, 1), most)}g}"
+
+
+def time_left(seconds: float, done: float, of: float) -> str:
+    """Return `, about 3 min left` of work of which some is done in so many seconds.
+
+    Nothing where none is done yet, or what is left is not worth telling.
+    """
+    left = seconds * (of - done) / done if done > 0 else 0.0
+    if left < 2:
+        return ""
+    name, size = next(one for one in (("h", 3600), ("min", 60), ("s", 1)) if left >= 2 * one[1])
+    return f", about {math.ceil(left / size):,} {name} left"
 
 
 def with_unit(number: str, unit: str) -> str:

@@ -24,6 +24,8 @@ from apc.eigen.modes import dense
 from apc.frame import discretize as discretizing
 from apc.frame import scheduling
 from apc.frame.discretize import discretize, moved_together
+from apc.regions.axes import parse_axes
+from apc.regions.region import region
 from apc.vary import delays
 from apc.vary.critical import critical
 from tests.topologies import AVERAGE, compiled, replaced, told
@@ -135,6 +137,23 @@ def test_a_delay_is_searched_only_so_far(monkeypatch: pytest.MonkeyPatch) -> Non
         "critical value: E846 from 0 to 1e+06 (SI) events coincide at more than 10,000 values of lan.delay, "
         "the most that are searched. Write: a range up to 10"
     )
+
+
+def test_a_range_is_refused_by_the_states_that_it_would_hold_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(delays, "_piece", lambda *_: pytest.fail("a piece is built"))
+    average = compiled(replaced(AVERAGE, ("delay: 8 ms}", "delay: 2 s}")))
+    expected = (
+        "E804 a range of values is looked at in hundreds of matrices, here of 506 states; 300 are the most. "
+        "Write: apc sweep, which analyses value by value"
+    )
+    (message,) = told(lambda: critical(average, "coordination.stiffness"))
+    assert message == f"critical value: {expected}"
+    for x in ("contact.stiffness=500 N/m:900 N/m", "lan.delay=0 s:2 s"):
+        axes = parse_axes(average, x, "coordination.stiffness=0 N/m:1500 N/m")
+        (message,) = told(lambda axes=axes: region(average, axes))
+        assert message == f"region: {expected}"
 
 
 @pytest.mark.parametrize("graph", ["ring", "star", "{edges: [[1, 2], [2, 3]]}"])

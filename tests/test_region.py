@@ -275,3 +275,34 @@ def test_a_stiffness_that_holds_another_force_has_a_region_from_nothing_on() -> 
     for x, y in random.uniform([1, 1], [5000, 1500], (12, 2)).tolist():
         overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
         assert found.contains(x, y) == analyze(apply(system, overrides)).stable
+
+
+def test_where_a_motion_keeps_its_size_all_over_there_is_no_region() -> None:
+    free = """\
+topology: free
+peers: {user: {count: 1}}
+masses: {device: {mass: 2 kg}, other: {mass: 1 kg}}
+couplers:
+  tie: {type: SpringDamper, a: device, b: other, stiffness: 30 N/m}
+  wall: {type: SpringDamper, a: device, b: ground, stiffness: 30 N/m}
+"""
+    scene = compiled(free)
+    axes = parse_axes(scene, "tie.stiffness=1 N/m:100 N/m", "wall.stiffness=1 N/m:100 N/m")
+    with pytest.raises(
+        ApcError, match="E905 in part of the rectangle some motion neither grows nor dies out"
+    ):
+        region(scene, axes)
+
+
+@pytest.mark.parametrize("y", ["coordination.stiffness=0 N/m:1500 N/m", "lan.delay=0 ms:4 ms"])
+def test_a_range_in_which_nothing_moves_by_more_than_rounding_is_refused(
+    average: CompiledSystem, y: str
+) -> None:
+    axes = parse_axes(average, "contact.stiffness=0 N/m:1e-300 N/m", y)
+    with pytest.raises(ApcError, match="E905"):
+        region(average, axes, cells=4)
+
+
+def test_a_range_is_wide_enough_for_floats(average: CompiledSystem) -> None:
+    with pytest.raises(ApcError, match=r"--y: E903 .* at least 1.5e-05 N/m, got 1e-07 N/m"):
+        parse_axes(average, X, "contact.stiffness=1000 N/m:1000.0000001 N/m")

@@ -1,7 +1,8 @@
 """What long work shows on a terminal while it goes on: a bar, or a line in words.
 
 Takes: how far the work is. Gives: `Bar`, `progress_bar`, `status_line`.
-Guarantees: all of it goes to stderr, only to a terminal, and is gone when the work ends, however it ends.
+Guarantees: all of it goes to stderr, and is gone from a terminal when the work ends, however it ends; what is
+no terminal is told of long work alone, in a line now and then.
 Does not: slow the work down: what draws a bar is loaded when one is shown.
 """
 
@@ -14,8 +15,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from apc.compiler.errors import visible
+from apc.compiler.words import time_left
 
 LONG = 1.0  # seconds of work after which a bar is shown
+
+# Seconds of work after which what is no terminal is told how far it is, and again each time it has gone on
+# for twice as long: a log of a day's work has a dozen lines of it.
+QUIET = 10.0
 
 # Is told how much is done, and of how much.
 Bar = Callable[[float, float], None]
@@ -35,7 +41,13 @@ def progress_bar(title: str, unit: str, *, after: float = LONG) -> Iterator[Bar]
         Seconds of work after which it is shown.
     """
     if not sys.stderr.isatty():
-        yield lambda done, total: None
+        begun, write = time.monotonic(), _now_and_then()
+        yield lambda done, total: write(
+            lambda: (
+                f"{title}: {done:,.6g} of {total:,.6g} {unit}"
+                + time_left(time.monotonic() - begun, done, total)
+            )
+        )
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -67,14 +79,31 @@ def progress_bar(title: str, unit: str, *, after: float = LONG) -> Iterator[Bar]
 @contextmanager
 def status_line() -> Iterator[Callable[[str], None]]:
     """Give a function that writes what is being done over what it wrote before."""
-    terminal = sys.stderr.isatty()
+    if not sys.stderr.isatty():
+        spoken = _now_and_then()
+        yield lambda text: spoken(lambda: text)
+        return
 
     def write(text: str) -> None:
-        if terminal:
-            sys.stderr.write(f"\r\x1b[K{visible(text)[: shutil.get_terminal_size().columns - 1]}")
-            sys.stderr.flush()
+        sys.stderr.write(f"\r\x1b[K{visible(text)[: shutil.get_terminal_size().columns - 1]}")
+        sys.stderr.flush()
 
     try:
         yield write
     finally:
         write("")
+
+
+def _now_and_then() -> Callable[[Callable[[], str]], None]:
+    """Return what writes a line to what is no terminal: first after `QUIET`, then after twice as long, …."""
+    begun, following = time.monotonic(), QUIET
+
+    def write(text: Callable[[], str]) -> None:
+        nonlocal following
+        gone = time.monotonic() - begun
+        if gone >= following:
+            sys.stderr.write(f"{visible(text())}\n")
+            sys.stderr.flush()
+            following = 2 * gone
+
+    return write

@@ -14,10 +14,14 @@ from fractions import Fraction
 from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import with_unit
 from apc.frame.names import unit_of
 from apc.sweeps.grid import parse_axis
 
 PLACE = Place("region")
+
+# The least width of a range, of its larger end: half the digits of a float are left to tell its points apart.
+NARROWEST = Fraction(1, 2**26)
 
 _FORM = "contact.stiffness=10 N/m:3000 N/m"
 
@@ -40,7 +44,7 @@ def parse_axes(
     ------
     ApcError
         E901 not of that form, or missing; E902 the same parameter twice; E903 a parameter that can't be an
-        axis; E622, E881, E204, E624 as `grid.parse_axis`.
+        axis, or a range too narrow for floats; E622, E881, E204, E624 as `grid.parse_axis`.
     """
     found = []
     for letter, text, place in (("x", x, 0), ("y", y, 1)):
@@ -63,6 +67,12 @@ def parse_axes(
             mistakes = [replace(one, place=Place(f"--{letter}")) for one in error.mistakes]
             raise ApcError(mistakes) from None
         _refuse_period(system, axis.name, axis.label)
+        low, high = axis.values[0], axis.values[-1]
+        least = NARROWEST * max(abs(low), abs(high))
+        if high - low < least:
+            expected = with_unit(f"a width of at least {float(least):.2g}", axis.unit)
+            what, got = f"the range of {axis.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
+            raise ApcError(Mistake("E903", Place(f"--{letter}"), what, expected, got))
         found.append(Range(axis.name, axis.group, axis.unit, axis.values[0], axis.values[-1]))
     first, second = found
     if first.name == second.name and (first.group == second.group or None in (first.group, second.group)):

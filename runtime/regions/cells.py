@@ -22,6 +22,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.errors import ApcError, Mistake, Place
+
 Floats = NDArray[np.float64]
 Node = tuple[int, int]  # lattice coordinates
 Edge = tuple[Node, Node]  # the stable node first
@@ -33,6 +35,9 @@ CAUTION = 1.5
 # Signs at the rectangle's own edges are taken so far inside: a stiffness of exactly zero
 # frees what it held and leaves an eigenvalue 1 that says nothing about the points beside it.
 INSIDE_RIM = 1e-9
+
+# A magnitude nearer to 1 than this tells no side: far above the rounding of a few dozen states.
+UNSURE = 1e-11
 
 # How far inside a cell its envelope is looked at.
 _INNER = np.array([0.125, 0.375, 0.625, 0.875])
@@ -80,11 +85,20 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: 
         Coarse cells along each side.
     halvings
         How many times a cell may be halved.
+
+    Raises
+    ------
+    ApcError
+        E905 a coarse cell in which the largest magnitude is 1 to rounding: signs would be noise there.
     """
     lattice = _Lattice(log_magnitudes, cells, halvings)
     step = 2**halvings
     axis = np.arange(cells + 1) * step
     grid = lattice.sample([(int(i), int(j)) for j in axis for i in axis]).reshape(cells + 1, cells + 1, -1)
+    unsure = np.abs(grid[..., 0]) <= UNSURE
+    if (unsure[1:, 1:] & unsure[1:, :-1] & unsure[:-1, 1:] & unsure[:-1, :-1]).any():
+        what = "in part of the rectangle some motion neither grows nor dies out, as far as floats can tell"
+        raise ApcError(Mistake("E905", Place("region"), what, hint="some damping, or wider ranges"))
     suspect = _suspect(grid)
     leaves: dict[Node, int] = {}
     divided = [(int(i) * step, int(j) * step, step) for j, i in np.argwhere(suspect)]

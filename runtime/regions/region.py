@@ -37,7 +37,7 @@ from apc.result import Result
 from apc.threads import single_threaded
 from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator, matrix_errors
-from apc.vary.evaluator import PointEvaluator, evaluator, reaches_time
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_time
 from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.search import Told
 
@@ -237,7 +237,7 @@ def region(
         if times:
             source = PointEvaluator(system, free, prepared)
         else:
-            source = evaluator(system, free, prepared=prepared)
+            source = evaluator_of_many(system, free, PLACE, prepared=prepared)
         found: Striped | None = None
         start = prepare_at_start(system, prepared) if len(times) == 1 else None
         if start is not None:

@@ -29,8 +29,8 @@ from apc.regions.curves import between, refined
 from apc.regions.eigenpairs import largest, log_magnitudes
 from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
 from apc.vary.crossings import scan
-from apc.vary.delays import Piece, delay_pieces
-from apc.vary.evaluator import PointEvaluator, evaluator
+from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many
 from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.search import SPAN, Line, proved_crossing
 
@@ -116,11 +116,14 @@ def trace_strips(
     """
     delay, other = axes[axis], axes[1 - axis]
     free = (Free(delay.name, delay.group), Free(other.name, other.group))
+    longest = system_with_delay(
+        system, free[0], delay.high
+    )  # what is too much is so before any strip is looked at
+    evaluator_of_many(longest, [free[1]], PLACE, prepared=prepared)
     strips: list[_Strip] = []
+    tell = pace(system, free[0], delay.low, delay.high, place=PLACE, told=told)
     for piece in delay_pieces(system, free[0], delay.low, prepared, place=PLACE, high=delay.high):
-        if told:
-            until = float(min(piece.high, delay.high))
-            told(f"following the boundary up to {delay.label} = {until:.6g} s of {float(delay.high):.6g} s")
+        tell(min(piece.high, delay.high))
         width = delay.high - delay.low
         ends = [float((one - delay.low) / width) for one in (piece.low, min(piece.high, delay.high))]
         if piece.constant:
@@ -161,7 +164,7 @@ def _standing(
     """Return a strip in which nothing depends on the delay: straight lines at the other's critical values."""
     low, high = float(other.low), float(other.high)
     line = Line(
-        evaluator(piece.inside, [free], prepared=prepared),
+        evaluator_of_many(piece.inside, [free], PLACE, prepared=prepared),
         np.array([parameter_of(piece.inside, free).value]),
         0,
     )

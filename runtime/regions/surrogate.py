@@ -71,7 +71,7 @@ class Rectangle:
 def rectangle_of(x: Range, y: Range) -> Rectangle:
     """Return the rectangle of two ranges."""
     low = np.array([float(x.low), float(y.low)])
-    return Rectangle(low, np.array([float(x.high), float(y.high)]) - low)
+    return Rectangle(low, np.array([float(axis.high - axis.low) for axis in (x, y)]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,7 @@
 """A system's frame matrices as a delay varies: piece by piece, as far as the order of events stays the same.
 
 Takes: a `CompiledSystem` and a parameter or timing that reaches its delays.
-Gives: `Piece`, `delay_pieces`, `borders`, `system_with_delay`, `delay_now`.
+Gives: `Piece`, `delay_pieces`, `pace`, `borders`, `system_with_delay`, `delay_now`.
 Guarantees: pieces join on without a gap; events coincide at the values between them and nowhere else.
 Does not: vary periods or phases: another period is another frame.
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -24,6 +25,7 @@ from apc.analysis.plan import LONG_LINES
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.multiples import common_divisor
+from apc.compiler.words import time_left
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
@@ -104,7 +106,7 @@ def delay_pieces(
     """
     following = borders(system, free, place=place)
     if high is not None:
-        _check_range(free, low, high, following, place)
+        _count(free, low, high, following, place)
     known: dict[tuple[object, ...], BatchEvaluator] = {}
     while high is None or low < high:
         end = following(low)
@@ -112,15 +114,46 @@ def delay_pieces(
         low = end
 
 
-def _check_range(
+def pace(
+    system: CompiledSystem,
+    free: Free,
+    low: Fraction,
+    high: Fraction,
+    *,
+    place: Place,
+    told: Callable[[str], None] | None,
+) -> Callable[[Fraction], None]:
+    """Return what tells, as each piece begins and is given its end, how far a search over a delay is.
+
+    Parameters
+    ----------
+    system, free, low, high, place
+        As for `delay_pieces`, which raises the same.
+    told
+        Is told, in words, with the time that is left if the other pieces take as long as those before.
+    """
+    pieces = _count(free, low, high, borders(system, free, place=place), place)
+    begun, done = time.monotonic(), 0
+
+    def tell(value: Fraction) -> None:
+        nonlocal done
+        if told:
+            left = time_left(time.monotonic() - begun, done, pieces)
+            told(f"looking at {free.label} up to {float(value):.6g} s of {float(high):.6g} s{left}")
+        done += 1
+
+    return tell
+
+
+def _count(
     free: Free, low: Fraction, high: Fraction, following: Callable[[Fraction], Fraction], place: Place
-) -> None:
-    """Refuse a range of which nobody will see the end, before any of it is searched."""
+) -> int:
+    """Return how many pieces a range has; refuse one of which nobody will see the end."""
     at = low
-    for _ in range(MOST_PIECES):
+    for count in range(1, MOST_PIECES + 1):
         at = following(at)
         if at >= high:
-            return
+            return count
     what = (
         f"from {float(low):.6g} to {float(high):.6g} (SI) events coincide at more than {MOST_PIECES:,} "
         f"values of {free.label}, the most that are searched"

@@ -1,7 +1,7 @@
 """The evaluator of a system's matrices over some of its parameters, whatever kind of scene it is.
 
 Takes: a `CompiledSystem` and the parameters that vary.
-Gives: `evaluator`, `PointEvaluator`; `free_parameters`, `reaches_time`.
+Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `free_parameters`, `reaches_time`.
 Guarantees: peers that are alike at some values only are kept apart.
 Does not: vary times (see `delays`).
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
 from apc.eigen.relative import relative_bounded, relative_coordinates
@@ -49,6 +49,10 @@ JACOBIAN_ROUNDINGS = 64
 # An eigenvalue left this near to 1 asks for the exact search for drifts: a pair at 1 is scattered by rounding
 # to the square root of 1e-15, and ten times that.
 DRIFT = 1e-6
+
+# States of one system beyond which no range of values is looked at: a hundred matrices and more are held at a
+# time, each with the vectors of its eigenvalues. Of 250 states a range takes ten seconds and half a GB.
+MOST_STATES = 300
 
 # The blocks of a point that has no matrix.
 NOTHING = [(np.full((1, 1), np.nan), np.full((1, 1), np.nan))]
@@ -234,6 +238,45 @@ def evaluator(
         return PointEvaluator(system, tuple(free), prepared)
     groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
     return batch_evaluator(system, free, groups, exchange)
+
+
+def evaluator_of_many(
+    system: CompiledSystem, free: Sequence[Free], place: Place, *, prepared: Prepared
+) -> BatchEvaluator | PointEvaluator:
+    """Return `evaluator`, for work that takes a hundred points and more.
+
+    Parameters
+    ----------
+    system, free, prepared
+        As for `evaluator`.
+    place
+        Where that was asked for, for messages.
+
+    Raises
+    ------
+    ApcError
+        E804 a system of more than `MOST_STATES` states; and those of `evaluator`.
+    """
+    hint = "apc sweep, which analyses value by value"
+    try:
+        found = evaluator(system, free, prepared=prepared)
+        closed = (
+            found.closed
+            if isinstance(found, BatchEvaluator)
+            else split(*lifted_groups(system, prepared=prepared)).systems
+        )
+    except ApcError as error:  # an analysis has methods that spare the matrix, a range of values has none
+        raise ApcError(
+            [replace(one, hint=hint) if "--method" in one.hint else one for one in error.mistakes]
+        ) from None
+    states = max((len(one.matrix) for one in closed), default=0)
+    if states > MOST_STATES:
+        what = (
+            f"a range of values is looked at in hundreds of matrices, here of {states:,} states; "
+            f"{MOST_STATES:,} are the most"
+        )
+        raise ApcError(Mistake("E804", place, what, hint=hint))
+    return found
 
 
 def generic(system: CompiledSystem, free: Sequence[Free]) -> CompiledSystem:

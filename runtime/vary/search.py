@@ -33,8 +33,8 @@ from apc.vary.batch import BatchEvaluator
 from apc.vary.bends import bends
 from apc.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.vary.crossings import Courses, Root, Scan, scan
-from apc.vary.delays import Piece, borders, delay_now, delay_pieces, system_with_delay
-from apc.vary.evaluator import PointEvaluator, evaluator
+from apc.vary.delays import Piece, borders, delay_now, delay_pieces, pace, system_with_delay
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many
 from apc.vary.marginal import marginal_motion, with_rigid
 
 Floats = NDArray[np.float64]
@@ -188,7 +188,7 @@ def search(
         Is told how far the search is.
     """
     parameter = parameter_of(system, free)
-    family = evaluator(system, [free], prepared=prepared)
+    family = evaluator_of_many(system, [free], _PLACE, prepared=prepared)
     line = Line(family, np.array([parameter.value]), 0)
     scale = line.scale()
     bottom = low
@@ -364,10 +364,10 @@ def search_delay(
     stable = [True] if from_stable else []
     before: Piece | None = None
     at, whole, known, looked = low, True, True, 0
+    tell = pace(system, free, low, end, place=_PLACE, told=told)
     for piece in delay_pieces(system, free, low, prepared, place=_PLACE, high=end):
         at = min(piece.high, end)
-        if told:
-            told(f"looking at {free.label} up to {float(at):.6g} s of {float(end):.6g} s")
+        tell(at)
         found, enclosed = _piece_scan(piece, float(piece.low), float(at), prepared)
         whole, known, looked = whole and found.whole, known and enclosed, looked + len(found.points)
         if not len(found.points):
