@@ -185,11 +185,14 @@ def stays_rigid(
     numbering = _Numbering(system.sites)
     exact = [group.exact for group in system.sites]
     solutions = _standing_solutions(system, exact, numbering)
-    forms = (
-        list(_standing(other, others, numbering)) if solutions else []
-    )  # of the matrices alone: once for all
+    # Of the matrices alone, once for all, by the unknowns in them: of many parts a solution moves few.
+    forms: dict[int, list[Form]] = {}
+    for form in _standing(other, others, numbering) if solutions else ():
+        for index in form:
+            forms.setdefault(index, []).append(form)
     for solution in solutions:
-        if any(_value(form, solution) for form in forms):
+        moving = (index for index, value in enumerate(solution) if value)
+        if any(_value(form, solution) for index in moving for form in forms.get(index, ())):
             return False
         moved = zip(
             _standing_state(system, others, numbering, solution),
@@ -312,17 +315,17 @@ def _standing_state(
         start = number.states[g]
         state += solution[start : start + len(group.jacobians.kind.states)]
         state += [solution[number.outputs[g][v.partition] + v.output] for v in group.schedule.carried]
-        sends = _standing_sends(exact[g], number, g)
-        for packet in system.packets:
-            if packet.site == g:
-                one = group.schedule.sent[packet.row]
-                state.append(_value(sends[one.link, one.channel], solution))
+        packets = [packet for packet in system.packets if packet.site == g]
+        sends = _standing_sends(exact[g], number, g) if packets else {}
+        for packet in packets:
+            one = group.schedule.sent[packet.row]
+            state.append(_value(sends[one.link, one.channel], solution))
     return state
 
 
 def _value(form: Form, solution: Sequence[Fraction]) -> Fraction:
     """Return the value of a form at a solution."""
-    return sum((weight * solution[index] for index, weight in form.items()), Fraction(0))
+    return sum((weight * solution[index] for index, weight in form.items() if solution[index]), Fraction(0))
 
 
 class _Ramp:
