@@ -10,7 +10,7 @@ from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.parameters import resolve
-from apc.large.crowds import Crowd, crowds
+from apc.large.populations import Population, populations
 from tests.sites import columned, linked, paper
 
 
@@ -36,8 +36,8 @@ def different(
     )
 
 
-def crowded(system: CompiledSystem) -> tuple[tuple[Crowd, ...], Exchange]:
-    """Return the crowds of a system and the exchange between them."""
+def crowded(system: CompiledSystem) -> tuple[tuple[Population, ...], Exchange]:
+    """Return the populations of a system and the exchange between them."""
     prepared, numbers = prepare(system), resolve(system)
-    found = crowds(system, prepared.jacobians, prepared.schedules, numbers)
+    found = populations(system, prepared.jacobians, prepared.schedules, numbers)
     return found, build_exchange(system, numbers.timings)

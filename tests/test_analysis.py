@@ -86,12 +86,12 @@ def test_a_million_peers_cost_what_three_do() -> None:
 
 def test_a_billion_peers_in_groups_that_alternate_take_no_memory_a_peer() -> None:
     # As an array of peers each of these groups would take gigabytes.
-    crowds = (
+    populations = (
         ("left", 400_000_000, {"contact.stiffness": 900.0}),
         ("mid", 600_000_000, {}),
         ("right", 3, {"contact.stiffness": 900.0}),
     )
-    found = analyze(grouped(paper(kc=1000.0), *crowds))
+    found = analyze(grouped(paper(kc=1000.0), *populations))
     assert found.peers == 1_000_000_003
     assert sum(mode.multiplicity for mode in found.modes) > 10**9
 

@@ -34,13 +34,13 @@ HOUSE = (
         "apc.compiler.equations",
         """
         connections flatten reductions clock_inference clocks symbolic zero_test solution matching
-        residuals elimination tearing blocks jets aliases index structure
+        residuals elimination tearing blocks derivatives aliases index structure
         """,
     ),
     ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
     ("apc.compiler.view", "schema diagram svg layers picture listing"),
-    ("apc", "threads trouble distribution suffixes optional given result tables processes"),
+    ("apc", "threads finite_equations distribution suffixes optional option_value result tables processes"),
     (
         "apc.frame",
         """
@@ -62,7 +62,7 @@ HOUSE = (
     (
         "apc.large",
         """
-        diagonal transfer characteristic zeros crowds determinant determinant_spectrum translation rings
+        diagonal transfer characteristic zeros populations determinant determinant_spectrum translation rings
         sparse_system krylov
         """,
     ),

@@ -19,7 +19,7 @@ from apc.frame.parameters import resolve
 from apc.frame.schedule import Propagate
 from apc.frame.scheduling import build_schedules
 from apc.frame.site import every_matrix
-from apc.large.crowds import Crowd
+from apc.large.populations import Population
 from tests.populations import crowded, different
 from tests.sites import MS
 from tests.test_selfcheck import STIFF
@@ -39,15 +39,15 @@ NAMES = ("p", "q", "s", "d")
     ],
 )
 def test_many_sites_at_once_are_the_sites_one_by_one(values: dict[str, Fraction]) -> None:
-    [crowd], _ = crowded(different(5, **values))
-    for row, vector in enumerate(crowd.parameters):
-        site = site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, vector[None])[0])
-        alone = lift(site, crowd.schedule, exact=linearize_exact(crowd.jacobians, vector))
+    [population], _ = crowded(different(5, **values))
+    for row, vector in enumerate(population.parameters):
+        site = site_of_row(population.jacobians, linearize_rows(population.jacobians, vector[None])[0])
+        alone = lift(site, population.schedule, exact=linearize_exact(population.jacobians, vector))
         for name in NAMES:
-            apart = np.abs(getattr(crowd.lifted, name)[row] - getattr(alone, name))
-            allowed = getattr(crowd.lifted.error, name)[row] + getattr(alone.error, name)
+            apart = np.abs(getattr(population.lifted, name)[row] - getattr(alone, name))
+            allowed = getattr(population.lifted.error, name)[row] + getattr(alone.error, name)
             assert np.all(apart <= allowed)
-        assert crowd.lifted.error.p[row].max() < 1e-12 * max(1.0, np.abs(alone.p).max())
+        assert population.lifted.error.p[row].max() < 1e-12 * max(1.0, np.abs(alone.p).max())
 
 
 @pytest.mark.parametrize("decay", [0.0, 1e-9, 1.0, 50.0, 4000.0])
@@ -69,20 +69,20 @@ def _many_digits(matrix: Any) -> Any:
     return np.array(found, dtype=object).reshape(1, *plain.shape)
 
 
-def _true_frame(crowd: Crowd, vector: Any) -> FrameMap:
+def _true_frame(population: Population, vector: Any) -> FrameMap:
     """Return the map of one site's frame, its events followed in many digits."""
-    site = every_matrix(linearize_exact(crowd.jacobians, vector), _many_digits)
+    site = every_matrix(linearize_exact(population.jacobians, vector), _many_digits)
     n_x, n_u = site.b.shape[-2:]
     steps = {}
-    for duration in {one.duration for one in crowd.schedule.events if isinstance(one, Propagate)}:
-        seconds = duration * crowd.schedule.quantum
+    for duration in {one.duration for one in population.schedule.events if isinstance(one, Propagate)}:
+        seconds = duration * population.schedule.quantum
         whole = mpmath.zeros(n_x + n_u)
         for i, row in enumerate(np.concatenate([site.a[0], site.b[0]], axis=1)):
             for j, entry in enumerate(row):
                 whole[i, j] = entry * seconds.numerator / seconds.denominator
         moved = mpmath.expm(whole, method="taylor")[:n_x, :]
         steps[duration] = np.array(moved.tolist(), dtype=object).reshape(1, n_x, n_x + n_u)
-    return compose(site, crowd.schedule, steps)
+    return compose(site, population.schedule, steps)
 
 
 @pytest.mark.parametrize(
@@ -98,12 +98,12 @@ def _true_frame(crowd: Crowd, vector: Any) -> FrameMap:
 )
 def test_the_estimate_covers_the_error_against_eighty_digits(grams: str, seed: int, values: Any) -> None:
     system = apply(different(6, seed=seed, **values), [Override("cube.mass", None, Fraction(grams) / 1000)])
-    [crowd], _ = crowded(system)
-    lifted = crowd.lifted
+    [population], _ = crowded(system)
+    lifted = population.lifted
     assert lifted.estimated
     with mpmath.workdps(80):
-        for row, vector in enumerate(crowd.parameters):
-            true = _true_frame(crowd, vector)
+        for row, vector in enumerate(population.parameters):
+            true = _true_frame(population, vector)
             for name in NAMES:
                 error = np.abs(getattr(lifted, name)[row] - getattr(true, name)[0]).astype(float)
                 assert np.all(error <= getattr(lifted.error, name)[row])
@@ -112,16 +112,16 @@ def test_the_estimate_covers_the_error_against_eighty_digits(grams: str, seed: i
 def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
     """A copy of a tenth of a gram: magnitudes grow without measure over a frame, the errors don't."""
     system = apply(different(6), [Override("cube.mass", None, Fraction(1, 10**4))])
-    [crowd], _ = crowded(system)
-    assert crowd.lifted.estimated
-    for row, vector in enumerate(crowd.parameters):
-        site = site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, vector[None])[0])
+    [population], _ = crowded(system)
+    assert population.lifted.estimated
+    for row, vector in enumerate(population.parameters):
+        site = site_of_row(population.jacobians, linearize_rows(population.jacobians, vector[None])[0])
         alone = lift(
-            site, crowd.schedule, exact=linearize_exact(crowd.jacobians, vector)
+            site, population.schedule, exact=linearize_exact(population.jacobians, vector)
         )  # Arb's exponentials
         for name in NAMES:
-            apart = np.abs(getattr(crowd.lifted, name)[row] - getattr(alone, name))
-            estimate = getattr(crowd.lifted.error, name)[row]
+            apart = np.abs(getattr(population.lifted, name)[row] - getattr(alone, name))
+            estimate = getattr(population.lifted.error, name)[row]
             assert np.all(apart <= estimate)
             assert estimate.max() < 1e-8 * max(1.0, np.abs(getattr(alone, name)).max())
 

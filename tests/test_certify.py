@@ -171,11 +171,11 @@ def test_equal_peers_in_a_chain_are_as_certain_as_one() -> None:
     """
     system = paper("sum", peers=6, kt=50.0, kc=300.0)
     chain = _certified(linked(system, [(k, k + 1, 1.0) for k in range(5)]))
-    crowd = _certified(linked(system, [(0, k, 1.0) for k in range(1, 6)]))
-    assert chain.verdict == crowd.verdict
-    assert chain.proof == crowd.proof == "proved stable with 256 bits"
-    apart = abs(chain.spectral_radius - crowd.spectral_radius)
-    assert apart <= chain.spectral_radius_error + crowd.spectral_radius_error < 1e-14
+    population = _certified(linked(system, [(0, k, 1.0) for k in range(1, 6)]))
+    assert chain.verdict == population.verdict
+    assert chain.proof == population.proof == "proved stable with 256 bits"
+    apart = abs(chain.spectral_radius - population.spectral_radius)
+    assert apart <= chain.spectral_radius_error + population.spectral_radius_error < 1e-14
 
 
 def test_what_balls_leave_open_stays_as_floats_decided_it() -> None:

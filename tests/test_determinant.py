@@ -14,8 +14,8 @@ from apc.eigen.modes import arrange, complete_loops, dense, split
 from apc.eigen.spectrum import Spectrum
 from apc.frame.overrides import apply, parse_override
 from apc.large.characteristic import characteristic_ball, refine
-from apc.large.determinant import of_crowds
-from apc.large.determinant_spectrum import solve_crowds, solve_loops
+from apc.large.determinant import of_populations
+from apc.large.determinant_spectrum import solve_loops, solve_populations
 from apc.large.translation import count_translations
 from apc.large.zeros import beyond, find_zeros, near_poles
 from tests.bruteforce import Scene, frame_matrix
@@ -39,7 +39,7 @@ VARIED: list[dict[str, Any]] = [
 
 def _solved(system: Any) -> Spectrum:
     listed, exchange = crowded(system)
-    return solve_crowds(listed, exchange, rigid=count_translations(listed, exchange) or 0)
+    return solve_populations(listed, exchange, rigid=count_translations(listed, exchange) or 0)
 
 
 def _agree(found: Spectrum | Analysis, whole: Analysis) -> None:
@@ -98,8 +98,8 @@ def test_equal_peers_among_different_ones_are_counted() -> None:
     masses = [0.1, 0.1, 0.1, 0.2, 0.2, 0.3, 0.15, 0.15, 0.12]
     system = columned(paper(peers=9, kt=400.0), device__mass=masses)
     _agree(_solved(system), analyze(system, method="dense"))
-    [crowd], _ = crowded(system)
-    assert crowd.counts.tolist() == [3.0, 2.0, 1.0, 2.0, 1.0]
+    [population], _ = crowded(system)
+    assert population.counts.tolist() == [3.0, 2.0, 1.0, 2.0, 1.0]
 
 
 PAIRS = {("left", "right"): 12 * MS, ("right", "left"): 3 * MS, ("right", "right"): 8 * MS}
@@ -119,21 +119,21 @@ def test_groups_with_delays_of_their_own_are_one_determinant(delays: dict[tuple[
 def test_a_count_is_the_number_of_eigenvalues_of_the_whole_matrix(radius: float) -> None:
     system = different(8, kt=2000.0)
     values = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
-    function, _ = of_crowds(*crowded(system))
+    function, _ = of_populations(*crowded(system))
     assert beyond(function, radius, 0) == int((np.abs(values) > radius).sum())
 
 
 def test_newtons_method_finds_zeros_and_says_where_it_does_not() -> None:
     system = different(5)
     values = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
-    function, _ = of_crowds(*crowded(system))
+    function, _ = of_populations(*crowded(system))
     poles = near_poles(function, 8)
     for zero in refine(function, poles * (1 + 1e-7), poles=poles):
         assert np.isnan(zero) or np.abs(values - zero).min() < 1e-12
 
 
 def test_the_function_stays_within_its_ball() -> None:
-    function, _ = of_crowds(*crowded(different(6)))
+    function, _ = of_populations(*crowded(different(6)))
     points, reach = np.array([1.05, 0.9 + 0.6j, -1.0]), np.full(3, 1e-3)
     centre = characteristic_ball(function, points, reach)
     random = np.random.default_rng(0)
@@ -145,7 +145,7 @@ def test_the_function_stays_within_its_ball() -> None:
 
 def test_what_is_said_to_be_rigid_and_is_not_leaves_the_verdict_open() -> None:
     listed, exchange = crowded(different(6))
-    wrong = solve_crowds(listed, exchange, rigid=0)
+    wrong = solve_populations(listed, exchange, rigid=0)
     assert wrong.stable is None
 
 
@@ -251,7 +251,7 @@ def _count_by_samples(p: Any, q: Any, s: Any, frames: int, found: Analysis) -> N
 
 def test_zeros_bound_the_radius_from_both_sides() -> None:
     system = different(10)
-    function, _ = of_crowds(*crowded(system))
+    function, _ = of_populations(*crowded(system))
     values = np.abs(np.linalg.eigvals(dense(*lifted_groups(system)).matrix))
     truth = np.sort(values)[-2]
     zeros = find_zeros(function, np.zeros(0, complex), rigid=1, listed=3, near=4)
@@ -262,7 +262,7 @@ def test_zeros_bound_the_radius_from_both_sides() -> None:
 
 def test_a_zero_that_no_start_leads_to_is_found_by_the_count() -> None:
     system = different(10)
-    function, _ = of_crowds(*crowded(system))
+    function, _ = of_populations(*crowded(system))
     blind = find_zeros(function, np.array([0.5 + 0.1j]), rigid=1, listed=3, near=0)
     sighted = find_zeros(function, np.zeros(0, complex), rigid=1, listed=3, near=8)
     assert blind.counted and blind.low == pytest.approx(sighted.low, abs=1e-9)

@@ -94,8 +94,8 @@ def test_a_count_on_samples_is_the_number_of_larger_eigenvalues(radius: float) -
     system = different(20, graph="ring", kt=1500.0)
     listed, exchange = crowded(system)
     values = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
-    [crowd] = listed
-    alone = np.linalg.eigvals(crowd.lifted.p).astype(complex).ravel()
+    [population] = listed
+    alone = np.linalg.eigvals(population.lifted.p).astype(complex).ravel()
     argument = argument_of(sparse_system(listed, exchange), listed)
     found = count_beyond(argument, (alone, np.ones(len(alone))), np.array([1.0 + 0j]), radius)
     assert found == int((np.abs(values) > radius).sum())

@@ -12,7 +12,7 @@ from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.closing import Coupling, close_loop
-from apc.eigen.modes import complete_degrees, couple, dense, dense_loop, split, split_twins
+from apc.eigen.modes import complete_degrees, couple, dense, dense_loop, split, split_exchangeable
 from apc.frame.schedule import Way
 from tests.bruteforce import Scene, frame_matrix
 from tests.sites import MS, columned, edged, grouped, linked, paper
@@ -71,7 +71,7 @@ def test_the_loops_have_together_the_spectrum_of_the_whole(
     base = grouped(paper(operator, kt=300.0, bt=1.0, kc=800.0), first, ("others", 5, {}))
     groups, exchange = lifted_groups(linked(base, graph))
     whole = dense_loop(groups, exchange)
-    loops = split_twins(whole, exchange)
+    loops = split_exchangeable(whole, exchange)
     assert [len(loop.sites) for loop in loops] == sizes
     together = [
         np.linalg.eigvals(close_loop(loop).matrix) for loop in loops for _ in range(loop.multiplicity)

@@ -11,7 +11,7 @@ from collections.abc import Sequence, Set
 
 import sympy
 
-from apc.compiler.equations.jets import Jet, Jets
+from apc.compiler.equations.derivatives import Derivative, Derivatives
 from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import Assignment
 
@@ -24,8 +24,8 @@ class Aliases:
     v is then the name of the derivative, so that masses with one position are seen to have one velocity.
     """
 
-    def __init__(self, jets: Jets, names: Sequence[str], started: Set[str]) -> None:
-        self.jets = jets
+    def __init__(self, derivatives: Derivatives, names: Sequence[str], started: Set[str]) -> None:
+        self.derivatives = derivatives
         self.names = names
         self.rank = {name: (name not in started, name.count("."), j) for j, name in enumerate(names)}
         self.parent: dict[str, tuple[str, int]] = {}  # name -> ± another; sign 0: zero
@@ -45,8 +45,10 @@ class Aliases:
 
     def substitute(self, expression: sympy.Expr) -> sympy.Expr:
         """Return the expression in the names kept."""
-        jets = self.jets.jets(expression)
-        return expression.xreplace({s: self._stands_for(*jet) for s, jet in jets.items()})
+        derivatives = self.derivatives.derivatives(expression)
+        return expression.xreplace(
+            {s: self._stands_for(*derivative) for s, derivative in derivatives.items()}
+        )
 
     def remove(self, residuals: Sequence[Residual]) -> list[Residual]:
         """Take the alias equations out, pass by pass until none is left; return the others, rewritten."""
@@ -72,18 +74,18 @@ class Aliases:
         said = set(self._row.values())
         return [residual for row, residual in rows.items() if row not in said]
 
-    def _pair(self, expression: sympy.Expr) -> tuple[Jet, Jet, int] | None:
+    def _pair(self, expression: sympy.Expr) -> tuple[Derivative, Derivative, int] | None:
         """Return a, b and the sign of a = ±b; for a = 0, a twice and the sign 0; else None."""
-        jets = self.jets.jets(expression)
+        derivatives = self.derivatives.derivatives(expression)
         terms = [term.as_coeff_Mul() for term in sympy.Add.make_args(expression)]
-        if len(terms) > 2 or any(s not in jets for _, s in terms):
+        if len(terms) > 2 or any(s not in derivatives for _, s in terms):
             return None
         (factor, one), (other_factor, two) = terms[0], terms[-1]
         if len(terms) == 1:
-            return jets[one], jets[one], 0
+            return derivatives[one], derivatives[one], 0
         if abs(factor) != abs(other_factor):
             return None
-        return jets[one], jets[two], -1 if factor == other_factor else 1
+        return derivatives[one], derivatives[two], -1 if factor == other_factor else 1
 
     def _join(self, one: str, two: str, sign: int) -> set[int]:
         """Let one name stand for the other; return the rows der(x) = v to be read again in the new names."""
@@ -114,5 +116,5 @@ class Aliases:
             elif order and name in self.velocities:
                 name, order = self.velocities[name], order - 1
             else:
-                return sign * self.jets.symbol(name, order)
+                return sign * self.derivatives.symbol(name, order)
         return sympy.S.Zero

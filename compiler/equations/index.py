@@ -1,7 +1,7 @@
 """Index reduction: equations differentiated until every derivative can be solved for, and states chosen.
 
-Takes: residuals in variables and their derivatives (see `jets`). Gives: `reduce_index`: the equations to
-solve, their unknowns, and the states.
+Takes: residuals in variables and their derivatives (see `derivatives`). Gives: `reduce_index`: the equations
+to solve, their unknowns, and the states.
 Guarantees: as many equations as unknowns; the states are independent and chosen once and for all.
 Does not: solve anything (see `blocks`).
 
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import sympy
 
-from apc.compiler.equations.jets import TIME, Jet, Jets
+from apc.compiler.equations.derivatives import TIME, Derivative, Derivatives
 from apc.compiler.equations.matching import match_columns
 from apc.compiler.equations.residuals import SCENE, Residual, report_singular
 from apc.compiler.equations.symbolic import NoDerivativeError, linear_form
@@ -51,7 +51,7 @@ def reduce_index(
     residuals: Sequence[Residual],
     names: Sequence[str],
     started: Set[str],
-    jets: Jets,
+    derivatives: Derivatives,
     where: str,
     mistakes: Mistakes,
     vanishes: Vanishing = NOTHING_VANISHES,
@@ -65,7 +65,7 @@ def reduce_index(
         The equations, and the variables they hold, in the order of preference as states.
     started
         The variables with a declared start value.
-    jets
+    derivatives
         Knows the symbols of `names` and of their derivatives.
     where
         What to call the equations in a message.
@@ -78,12 +78,14 @@ def reduce_index(
         Where to point when there is no equation left.
     """
     column = {name: j for j, name in enumerate(names)}
-    incidence = [sorted({column[n] for n, _ in jets.jets(r.expression).values()}) for r in residuals]
+    incidence = [
+        sorted({column[n] for n, _ in derivatives.derivatives(r.expression).values()}) for r in residuals
+    ]
     match = match_columns(incidence, len(names))
     if len(residuals) != len(names) or None in match:
         report_singular(residuals, names, incidence, match, where, mistakes, place)
         return None
-    system = _System(residuals, names, jets, vanishes)
+    system = _System(residuals, names, derivatives, vanishes)
     if not system.differentiate_constraints(mistakes):
         return None
     dummies = system.choose_dummies(started, where, mistakes)
@@ -96,8 +98,8 @@ def reduce_index(
         # The orders made unknowns of begin here; the one below is solved for as the derivative of a state.
         first = min((k for k in range(top + 1) if (name, k) in dummies), default=top + 1)
         split = max(first - 1, 0)
-        states += [jets.symbol(name, k) for k in range(split)]
-        unknowns += [jets.symbol(name, k) for k in range(split, top + 1)]
+        states += [derivatives.symbol(name, k) for k in range(split)]
+        unknowns += [derivatives.symbol(name, k) for k in range(split, top + 1)]
     return Reduced(tuple(system.residuals), tuple(unknowns), tuple(states))
 
 
@@ -105,17 +107,21 @@ class _System:
     """The equations as they grow: each may have a derivative, which then takes its place in the matching."""
 
     def __init__(
-        self, residuals: Sequence[Residual], names: Sequence[str], jets: Jets, vanishes: Vanishing
+        self,
+        residuals: Sequence[Residual],
+        names: Sequence[str],
+        derivatives: Derivatives,
+        vanishes: Vanishing,
     ) -> None:
         self.vanishes = vanishes
         self.residuals = list(residuals)
         self.names = names
-        self.jets = jets
+        self.derivatives = derivatives
         self.held: list[dict[str, int]] = []  # for each equation, its variables and their highest orders
         self.derivative: dict[int, int] = {}  # equation -> its derivative
         self.integral: dict[int, int] = {}  # and back
         # A derivative with a name of its own is asked for, even if no equation holds it.
-        self.order = {name: jets.named_order(name) for name in names}
+        self.order = {name: derivatives.named_order(name) for name in names}
         for residual in residuals:
             self._hold(residual)
         for orders in self.held:
@@ -124,7 +130,7 @@ class _System:
 
     def _hold(self, residual: Residual) -> None:
         orders: dict[str, int] = {}
-        for name, order in self.jets.jets(residual.expression).values():
+        for name, order in self.derivatives.derivatives(residual.expression).values():
             orders[name] = max(orders.get(name, 0), order)
         self.held.append(orders)
 
@@ -182,7 +188,7 @@ class _System:
     def _differentiate(self, row: int, mistakes: Mistakes) -> bool:
         residual = self.residuals[row]
         try:
-            expression = self.jets.differentiate(residual.expression)
+            expression = self.derivatives.differentiate(residual.expression)
         except NoDerivativeError as missing:
             report_no_derivative(residual, missing, mistakes)
             return False
@@ -223,20 +229,20 @@ class _System:
 
     # ---- dummy derivatives ----
 
-    def choose_dummies(self, started: Set[str], where: str, mistakes: Mistakes) -> set[Jet] | None:
+    def choose_dummies(self, started: Set[str], where: str, mistakes: Mistakes) -> set[Derivative] | None:
         """Return the derivatives that become unknowns, level by level from the highest order down.
 
         At each level as many as there are constraints, so that the constraints' Jacobian in them is regular.
         """
         rank = {name: j for j, name in enumerate(self.names)}
 
-        def wanted_last(jet: Jet) -> tuple[bool, int, int]:
-            name, order = jet
-            return self.jets.symbol(name, order - 1).name in started, -order, -rank[name]
+        def wanted_last(derivative: Derivative) -> tuple[bool, int, int]:
+            name, order = derivative
+            return self.derivatives.symbol(name, order - 1).name in started, -order, -rank[name]
 
-        chosen: set[Jet] = set()
+        chosen: set[Derivative] = set()
         rows = [row for row in self.integral if row not in self.derivative]
-        candidates: Iterable[Jet] = [(name, order) for name, order in self.order.items() if order]
+        candidates: Iterable[Derivative] = [(name, order) for name, order in self.order.items() if order]
         while rows:
             level = self._regular_columns(rows, sorted(candidates, key=wanted_last), where, mistakes)
             if level is None:
@@ -247,45 +253,45 @@ class _System:
         return chosen
 
     def _regular_columns(
-        self, rows: Sequence[int], candidates: Sequence[Jet], where: str, mistakes: Mistakes
-    ) -> list[Jet] | None:
+        self, rows: Sequence[int], candidates: Sequence[Derivative], where: str, mistakes: Mistakes
+    ) -> list[Derivative] | None:
         """Return the first columns, in the order given, in which the rows' Jacobian is regular.
 
         Elimination column by column; a factor that moves, such as 2·x, may vanish and is no pivot.
         """
-        symbols = {self.jets.symbol(*jet): jet for jet in candidates}
+        symbols = {self.derivatives.symbol(*derivative): derivative for derivative in candidates}
         is_zero = ZeroTest()
-        matrix: dict[int, dict[Jet, sympy.Expr]] = {}
+        matrix: dict[int, dict[Derivative, sympy.Expr]] = {}
         for row in rows:
             form = linear_form(self.residuals[row].expression, symbols.keys())
             if form is None:  # else a derivative is linear in the highest derivatives
                 self._report_condition(row, where, mistakes)
                 return None
             matrix[row] = {symbols[s]: c for s, c in form[0].items() if not is_zero(c)}
-        columns: dict[Jet, dict[int, None]] = {jet: {} for jet in candidates}
+        columns: dict[Derivative, dict[int, None]] = {derivative: {} for derivative in candidates}
         for row, entries in matrix.items():
-            for jet in entries:
-                columns[jet][row] = None
-        chosen: list[Jet] = []
-        for jet in candidates:
-            still = [row for row in columns[jet] if row in matrix and jet in matrix[row]]
+            for derivative in entries:
+                columns[derivative][row] = None
+        chosen: list[Derivative] = []
+        for derivative in candidates:
+            still = [row for row in columns[derivative] if row in matrix and derivative in matrix[row]]
             fixed = [
                 row
                 for row in still
-                if not self._moves(matrix[row][jet]) and not self.vanishes(matrix[row][jet])
+                if not self._moves(matrix[row][derivative]) and not self.vanishes(matrix[row][derivative])
             ]
             if not fixed:
                 continue
-            pivot = min(fixed, key=lambda row: (not matrix[row][jet].is_Number, len(matrix[row]), row))
+            pivot = min(fixed, key=lambda row: (not matrix[row][derivative].is_Number, len(matrix[row]), row))
             entries = matrix.pop(pivot)
-            chosen.append(jet)
+            chosen.append(derivative)
             for row in still:
                 if row == pivot:
                     continue
-                factor = matrix[row][jet] / entries[jet]
+                factor = matrix[row][derivative] / entries[derivative]
                 for other, value in entries.items():
                     left = matrix[row].get(other, sympy.S.Zero) - factor * value
-                    if other == jet or is_zero(left):
+                    if other == derivative or is_zero(left):
                         matrix[row].pop(other, None)
                     else:
                         matrix[row][other] = left
@@ -296,7 +302,7 @@ class _System:
         return chosen
 
     def _moves(self, expression: sympy.Expr) -> bool:
-        return TIME in expression.free_symbols or bool(self.jets.jets(expression))
+        return TIME in expression.free_symbols or bool(self.derivatives.derivatives(expression))
 
     def _report_condition(self, row: int, where: str, mistakes: Mistakes) -> None:
         """Say that a branch of a constraint is chosen by what the constraint's derivatives would give."""
@@ -309,7 +315,7 @@ class _System:
         )
 
     def _report_no_choice(
-        self, matrix: dict[int, dict[Jet, sympy.Expr]], where: str, mistakes: Mistakes
+        self, matrix: dict[int, dict[Derivative, sympy.Expr]], where: str, mistakes: Mistakes
     ) -> None:
         """Say which constraints are left without a variable that follows from them."""
         for row, entries in matrix.items():

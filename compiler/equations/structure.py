@@ -28,9 +28,9 @@ from apc.compiler.equations.clocks import (
     PreviousCrossing,
     ReceiveCrossing,
 )
+from apc.compiler.equations.derivatives import Derivatives
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.index import reduce_index, report_no_derivative
-from apc.compiler.equations.jets import Jets
 from apc.compiler.equations.residuals import SCENE, Residual, report_no_number
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
 from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, symbol, to_sympy
@@ -208,23 +208,30 @@ def _sort_continuous(
     # What is read, each as an equation of its own, `sample(x) = x`, for messages.
     reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, place) for s in kind.samples]
     reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.sends]
-    jets = Jets(partition.variables, held)
-    residuals = _residuals(partition.equations, jets.differentiate, mistakes)
-    values = [_value(read, read.right, jets.differentiate, mistakes) for read in reads]
+    derivatives = Derivatives(partition.variables, held)
+    residuals = _residuals(partition.equations, derivatives.differentiate, mistakes)
+    values = [_value(read, read.right, derivatives.differentiate, mistakes) for read in reads]
     if len(residuals) < len(partition.equations) or None in values:
         return _Continuous()
 
-    aliases = Aliases(jets, partition.variables, started)
+    aliases = Aliases(derivatives, partition.variables, started)
     residuals = aliases.remove(residuals)
     read_values = [aliases.substitute(value) for value in values if value is not None]
     put_in = [Residual(value, read) for value, read in zip(read_values, reads, strict=True)]
     if none := [one for one in (*residuals, *put_in) if is_no_number(one.expression)]:
         report_no_number([one.shown for one in none], none[0].equation.place, mistakes)
         return _Continuous()
-    jets = jets.renamed(aliases.kept, aliases.velocities)
-    probes = _probes(reads, read_values, jets)
+    derivatives = derivatives.renamed(aliases.kept, aliases.velocities)
+    probes = _probes(reads, read_values, derivatives)
     reduced = reduce_index(
-        [*residuals, *probes.values()], jets.names, started, jets, where, mistakes, vanishes, place
+        [*residuals, *probes.values()],
+        derivatives.names,
+        started,
+        derivatives,
+        where,
+        mistakes,
+        vanishes,
+        place,
     )
     if reduced is None:
         return _Continuous()
@@ -285,17 +292,19 @@ def _value(
     return value
 
 
-def _probes(reads: Sequence[FlatEquation], values: Sequence[sympy.Expr], jets: Jets) -> dict[str, Residual]:
+def _probes(
+    reads: Sequence[FlatEquation], values: Sequence[sympy.Expr], derivatives: Derivatives
+) -> dict[str, Residual]:
     """Return, for each derivative that is sampled or sent, the equation `sampled der(x) = der(x)`.
 
     It makes sure that the derivative is computed, even if no other equation holds it.
     """
     probes: dict[str, Residual] = {}
     for read, value in zip(reads, values, strict=True):
-        for derivative, (_, order) in jets.jets(value).items():
+        for derivative, (_, order) in derivatives.derivatives(value).items():
             name = f"sampled {derivative}"
             if order and name not in probes:
-                probes[name] = Residual(jets.add(name) - derivative, read)
+                probes[name] = Residual(derivatives.add(name) - derivative, read)
     return probes
 
 

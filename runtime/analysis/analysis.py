@@ -31,6 +31,7 @@ from apc.eigen.spectrum import (
     judge,
     solve_spectrum,
 )
+from apc.finite_equations import finite_equations
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.jacobians import SiteJacobians, jacobians
@@ -41,7 +42,6 @@ from apc.frame.start import at_start
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.trouble import finite_equations
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ def analyze(
         exchange = build_exchange(system, numbers.timings)
         plan = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange, method)
         if not plan.groups:
-            spectrum, notes = _solve_crowds(system, prepared, numbers, exchange, plan.method)
+            spectrum, notes = _solve_populations(system, prepared, numbers, exchange, plan.method)
         elif plan.ring:
             spectrum, notes = _solve_ring(system, plan.groups, exchange, certify=certify)
         elif plan.method == "determinant":
@@ -177,8 +177,10 @@ def analyze(
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
         linearized = not all(prepared.jacobians[group.kind].affine for group in system.groups)
-        crowd = () if plan.loops else plan.groups or _representatives(system, prepared, numbers, exchange)
-        translations, drifts, unfelt = _what_stands(spectrum, plan.loops, crowd)
+        population = (
+            () if plan.loops else plan.groups or _representatives(system, prepared, numbers, exchange)
+        )
+        translations, drifts, unfelt = _what_stands(spectrum, plan.loops, population)
         verdict, stable = spectrum.verdict, spectrum.stable
         if unfelt and verdict in (STABLE_TRANSLATING, DRIFTS):
             verdict, stable = judge([True], translations, drifts)
@@ -211,7 +213,7 @@ def analyze(
 
 
 def _what_stands(
-    spectrum: Spectrum, loops: Sequence[Loop], crowd: Sequence[PeerGroup]
+    spectrum: Spectrum, loops: Sequence[Loop], population: Sequence[PeerGroup]
 ) -> tuple[int, int, tuple[str, ...]]:
     """Return how many translations and drifts there are, and what else neither grows nor dies out.
 
@@ -219,11 +221,11 @@ def _what_stands(
     """
     drifts = spectrum.drifts
     if not spectrum.rigid_modes or not any(
-        map(_remembers, (*crowd, *(g for one in loops for g in one.sites)))
+        map(_remembers, (*population, *(g for one in loops for g in one.sites)))
     ):
         return spectrum.rigid_modes, drifts, ()
     listed: Sequence[tuple[Loop, int]] = [(loop, loop.multiplicity) for loop in loops]
-    for group in crowd:
+    for group in population:
         anyhow = {way: ((Fraction(-1, 3),),) for way in used_ways([group.schedule])}
         listed = [*listed, (Loop(group.name, 1, (group,), anyhow), group.count)]
     found = [(what_stands(loop, with_drifts=bool(drifts and loops)), many) for loop, many in listed]
@@ -282,22 +284,22 @@ def _solve_ring(
     return with_the_rest(spectrum, ring), ring.arrangement.notes
 
 
-def _solve_crowds(
+def _solve_populations(
     system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange, method: str
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve peers that all differ."""
-    from apc.large.crowds import crowds
-    from apc.large.determinant_spectrum import solve_crowds
+    from apc.large.determinant_spectrum import solve_populations
     from apc.large.krylov import solve_sparse
+    from apc.large.populations import populations
     from apc.large.translation import count_translations
 
-    listed = crowds(system, prepared.jacobians, prepared.schedules, numbers)
+    listed = populations(system, prepared.jacobians, prepared.schedules, numbers)
     rounded = "what rounding does to the peers' own motion is estimated here, not bounded"
-    notes = (rounded,) if any(crowd.lifted.estimated for crowd in listed) else ()
+    notes = (rounded,) if any(population.lifted.estimated for population in listed) else ()
     if method == "krylov":
         return solve_sparse(listed, exchange), notes
     rigid = count_translations(listed, exchange)
-    spectrum = solve_crowds(listed, exchange, rigid=rigid or 0)
+    spectrum = solve_populations(listed, exchange, rigid=rigid or 0)
     free = "the first peer moves freely in a way that not all others do: left open"
     return spectrum, notes if rigid is not None else (*notes, free)
 

@@ -16,11 +16,11 @@ from apc.analysis.analysis import prepare
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.finite_equations import finite_equations
 from apc.frame.exchange import build_exchange
 from apc.frame.jacobians import edge_name
 from apc.frame.parameters import resolve
 from apc.result import Result
-from apc.trouble import finite_equations
 
 
 @dataclass(frozen=True, slots=True)

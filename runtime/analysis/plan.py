@@ -109,12 +109,12 @@ def make_plan(
     assert method in METHODS and method != PAPER, f"no such method: {method}"
     refuse_varying(system, jacobians)
     if method in ("auto", "determinant", "krylov"):
-        reason = _not_crowds(system, jacobians)
+        reason = _not_populations(system, jacobians)
         if method == "krylov" and reason:
             raise cannot_serve(system, method, reason)
         whole = method == "krylov" or (method == "determinant" and _prompt(schedules, numbers, exchange))
         if not reason and (whole or _many(system, jacobians, schedules, numbers, exchange)):
-            return _plan_crowds(system, jacobians, schedules, exchange, method)
+            return _plan_populations(system, jacobians, schedules, exchange, method)
     groups = peer_groups(system, jacobians, schedules, numbers, exchange)
     if method in ("auto", "modes") and is_large_ring(groups, exchange):
         states = states_of(groups[0].schedule, groups[0].jacobians)
@@ -176,7 +176,7 @@ def _refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
         raise too_large(exchange, f"{exchange.peers:,} peers", states)
 
 
-def _not_crowds(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> str:
+def _not_populations(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> str:
     """Say why peers can't be taken by the thousand, "" if they can."""
     for kind, site in zip(system.kinds, jacobians, strict=True):
         if site.edges:
@@ -214,7 +214,7 @@ def _prompt(schedules: Sequence[Schedule], numbers: Numbers, exchange: Exchange)
     return complete and short and sum(map(len, numbers.parameters)) > 1
 
 
-def _plan_crowds(
+def _plan_populations(
     system: CompiledSystem,
     jacobians: Sequence[SiteJacobians],
     schedules: Sequence[Schedule],

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.finite_equations import finite_equations
 from apc.frame.discretize import PRECISIONS, TOO_LARGE, UNIT, moved_together
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
@@ -29,7 +30,6 @@ from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.scheduling import build_schedules
 from apc.frame.site import LinearSite
 from apc.threads import single_threaded
-from apc.trouble import finite_equations
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from apc.cli.options import WholeNumber, beside, json_option, print_result, set_
 from apc.cli.progress import Bar, progress_bar
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
-from apc.given import given
+from apc.option_value import option_value
 
 
 @click.command("sweep")
@@ -104,7 +104,7 @@ def sweep_command(
 def _seconds(patience: str | None) -> float | None:
     if patience is None:
         return None
-    found = float(given("--patience", patience, what="patience", unit="s"))
+    found = float(option_value("--patience", patience, what="patience", unit="s"))
     if found <= 0:
         form = '--patience "10 min"'
         raise ApcError(Mistake("E889", Place("sweep"), "--patience", "more than 0 s", patience[:80], form))

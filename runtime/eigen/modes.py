@@ -1,8 +1,8 @@
 """A whole system as few and small loops instead of one large one.
 
 Takes: the groups of equal peers of a scene, and the exchange between them.
-Gives: `Split`, `split`; `Arrangement`, `arrange`; `complete_loops`, `dense_loop`, `dense`, `split_twins`;
-`couple`, `complete_degrees`.
+Gives: `Split`, `split`; `Arrangement`, `arrange`; `complete_loops`, `dense_loop`, `dense`,
+`split_exchangeable`; `couple`, `complete_degrees`.
 Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
 `dense`, whatever the number of peers. Weights are exact; a mean over nobody, or of weights that add up to 0,
 raises.
@@ -17,10 +17,10 @@ for a sum. K groups of n_1 … n_K equal peers then split exactly:
     times
 
 Equal peers on any other graph: see `graph_loops`. Different peers on such a graph are one whole system, less
-twins: g and h of equal dynamics that hear all others alike and are heard by them alike. A class c of n_c
-twins that weigh themselves by w_own and one another by w_other moves alike, as one site that hears
-w_own + (n_c − 1) w_other times itself and n_d W_cd times class d; or apart, its sum zero and all else at
-rest, each twin hearing w_own − w_other times itself, n_c − 1 times over.
+those that are exchangeable: g and h of equal dynamics that hear all others alike and are heard by them alike.
+A class c of n_c exchangeable peers that weigh themselves by w_own and one another by w_other moves alike, as
+one site that hears w_own + (n_c − 1) w_other times itself and n_d W_cd times class d; or apart, its sum zero
+and all else at rest, each of them hearing w_own − w_other times itself, n_c − 1 times over.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
             note = f"{len(found)} systems, one an eigenvalue of the graph of {named}"
             return Arrangement("modes", tuple(graph_loop(groups[0], one, scale) for one in found), (note,))
         reason = f"the graph of {named} has no full set of eigenvectors"
-    parts = split_twins(dense_loop(groups, exchange), exchange)
+    parts = split_exchangeable(dense_loop(groups, exchange), exchange)
     if len(parts) > 1:
         note = f"{len(parts)} systems, as peers that can change places move alike or apart"
         return Arrangement("modes", parts, (note,))
@@ -181,19 +181,19 @@ def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
     return Loop("dense", 1, everyone, coupling)
 
 
-def split_twins(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
-    """Split a loop by its twins.
+def split_exchangeable(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
+    """Split a loop by its exchangeable peers.
 
     Parameters
     ----------
     loop
-        Of all peers, one a site, its weights exact; without twins it is returned as it is.
+        Of all peers, one a site, its weights exact; without exchangeable ones it is returned as it is.
     exchange
         The links, for the names of the groups.
     """
     classes: list[list[int]] = []
     for place in range(len(loop.sites)):
-        alike = (members for members in classes if _are_twins(loop, members[0], place))
+        alike = (members for members in classes if _are_exchangeable(loop, members[0], place))
         found = next(alike, None)
         if found is None:
             classes.append([place])
@@ -218,7 +218,7 @@ def split_twins(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
     return tuple(loops)
 
 
-def _are_twins(loop: Loop, g: int, h: int) -> bool:
+def _are_exchangeable(loop: Loop, g: int, h: int) -> bool:
     """Say whether two sites can change places."""
     one, other = loop.sites[g], loop.sites[h]
     if one.lifted is not other.lifted or one.schedule is not other.schedule:

@@ -4,7 +4,7 @@ Takes: the Jacobians of a kind, a `Schedule`, and the matrices of many sites as 
 Gives: `lift_rows`; `exponential_rows`.
 Guarantees: the maps are those of `lift`, to rounding; every matrix comes with a bound on its error, entry by
 entry, wider than that of `lift`, as no ball arithmetic is done.
-Does not: decide which sites are alike (see `peers`), or close a loop (see `crowds`).
+Does not: decide which sites are alike (see `peers`), or close a loop (see `populations`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Populations by a small determinant: all different on a complete graph, or delays of any length.
 
-Takes: crowds of different peers on complete graphs; or a few sites that hear each other.
-Gives: `of_crowds`, `of_loop`; `Places`, `senders_of`.
+Takes: populations of different peers on complete graphs; or a few sites that hear each other.
+Gives: `of_populations`, `of_loop`; `Places`, `senders_of`.
 Guarantees: the determinant's size is what is sent in a frame, by one peer of each role or by the few sites,
 whatever the number of peers or the length of a delay.
 Does not: find its zeros (see `zeros`).
@@ -26,29 +26,32 @@ from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Heard, Sent, Way
 from apc.large.characteristic import Characteristic
-from apc.large.crowds import Crowd, hear_themselves
+from apc.large.populations import Population, hear_themselves
 from apc.large.transfer import StateSpace, build_transfer
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-def senders_of(listed: Sequence[Crowd], exchange: Exchange) -> list[Floats]:
-    """Return, for each crowd, how many others each line of r could hear over its complete graph (n_r,)."""
+def senders_of(listed: Sequence[Population], exchange: Exchange) -> list[Floats]:
+    """Return, for each population, how many others each line of r could hear on its complete graph (n_r,)."""
     senders = {
-        link: float(sum(crowd.counts.sum() for crowd in listed if crowd.sends(link)))
+        link: float(sum(population.counts.sum() for population in listed if population.sends(link)))
         for link in exchange.links
     }
     return [
         np.array(
-            [senders[one.way.link] - (1 if crowd.sends(one.way.link) else 0) for one in crowd.schedule.heard]
+            [
+                senders[one.way.link] - (1 if population.sends(one.way.link) else 0)
+                for one in population.schedule.heard
+            ]
         )
-        for crowd in listed
+        for population in listed
     ]
 
 
-def heard_weights(listed: Sequence[Crowd], exchange: Exchange) -> list[Floats]:
-    """Return, for each crowd, what each line of r weighs another's packet by on complete graphs (n_r,).
+def heard_weights(listed: Sequence[Population], exchange: Exchange) -> list[Floats]:
+    """Return, for each population, what each line of r weighs another's packet by on complete graphs (n_r,).
 
     Raises
     ------
@@ -56,11 +59,11 @@ def heard_weights(listed: Sequence[Crowd], exchange: Exchange) -> list[Floats]:
         E801 a mean over nobody.
     """
     weights = []
-    for crowd, senders in zip(listed, senders_of(listed, exchange), strict=True):
+    for population, senders in zip(listed, senders_of(listed, exchange), strict=True):
         own = np.ones(len(senders))
-        for line, (one, others) in enumerate(zip(crowd.schedule.heard, senders.tolist(), strict=True)):
+        for line, (one, others) in enumerate(zip(population.schedule.heard, senders.tolist(), strict=True)):
             if one.way.operator == "mean":
-                first = int(exchange.starts[crowd.group])
+                first = int(exchange.starts[population.group])
                 check_mean(exchange, first, one.way.link, "mean", others > 0, Fraction(others))
                 own[line] = 1.0 / others
         weights.append(own)
@@ -69,7 +72,7 @@ def heard_weights(listed: Sequence[Crowd], exchange: Exchange) -> list[Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where in s and r of the whole each crowd's rows are; what it weighs its own packets and others' by."""
+    """Where in s and r of the whole each population's rows are; how it weighs its own packets and others'."""
 
     sent: tuple[Integers, ...]
     heard: tuple[Integers, ...]
@@ -77,7 +80,7 @@ class Places:
     others: tuple[Floats, ...]
 
 
-def of_crowds(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Characteristic, Places]:
+def of_populations(listed: Sequence[Population], exchange: Exchange) -> tuple[Characteristic, Places]:
     """Return the characteristic function of different peers on complete graphs.
 
     Parameters
@@ -87,15 +90,17 @@ def of_crowds(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Characterist
     exchange
         The links, all of them complete.
     """
-    roles = [exchange.role(crowd.group) for crowd in listed]
+    roles = [exchange.role(population.group) for population in listed]
     sent_place: dict[tuple[int, Sent], int] = {}
     heard_place: dict[tuple[int, Heard], int] = {}
-    for role, crowd in zip(roles, listed, strict=True):
-        for sent in crowd.schedule.sent:
+    for role, population in zip(roles, listed, strict=True):
+        for sent in population.schedule.sent:
             sent_place.setdefault((role, sent), len(sent_place))
-        for heard in crowd.schedule.heard:
+        for heard in population.schedule.heard:
             heard_place.setdefault((role, heard), len(heard_place))
-    group_of = {role: crowd.group for role, crowd in reversed(list(zip(roles, listed, strict=True)))}
+    group_of = {
+        role: population.group for role, population in reversed(list(zip(roles, listed, strict=True)))
+    }
 
     def on_the_way(way: Way, sender: int, receiver: int) -> bool:
         return exchange.delay(way.link, group_of[sender], group_of[receiver]) == way.delay
@@ -103,26 +108,26 @@ def of_crowds(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Characterist
     others = heard_weights(listed, exchange)
     places = Places(
         sent=tuple(
-            np.array([sent_place[role, one] for one in crowd.schedule.sent], np.int64)
-            for role, crowd in zip(roles, listed, strict=True)
+            np.array([sent_place[role, one] for one in population.schedule.sent], np.int64)
+            for role, population in zip(roles, listed, strict=True)
         ),
         heard=tuple(
-            np.array([heard_place[role, one] for one in crowd.schedule.heard], np.int64)
-            for role, crowd in zip(roles, listed, strict=True)
+            np.array([heard_place[role, one] for one in population.schedule.heard], np.int64)
+            for role, population in zip(roles, listed, strict=True)
         ),
         own=tuple(
-            -weight * np.array([float(on_the_way(one.way, role, role)) for one in crowd.schedule.heard])
-            for role, crowd, weight in zip(roles, listed, others, strict=True)
+            -weight * np.array([float(on_the_way(one.way, role, role)) for one in population.schedule.heard])
+            for role, population, weight in zip(roles, listed, others, strict=True)
         ),
         others=tuple(others),
     )
     transfers = []
-    for g, crowd in enumerate(listed):
-        k = len(crowd.parameters)
+    for g, population in enumerate(listed):
+        k = len(population.parameters)
         own, weight = (np.tile(row, (k, 1)) for row in (places.own[g], places.others[g]))
-        space = hear_themselves(crowd.lifted, crowd.schedule, own, weight)
+        space = hear_themselves(population.lifted, population.schedule, own, weight)
         placed = _placed(space, places.sent[g], places.heard[g], len(sent_place), len(heard_place))
-        transfers.append(build_transfer(placed, crowd.counts))
+        transfers.append(build_transfer(placed, population.counts))
     lags = sorted({heard.lag for _, heard in heard_place})
     weights = np.zeros((len(lags), len(heard_place), len(sent_place)))
     for (receiver, heard), line in heard_place.items():

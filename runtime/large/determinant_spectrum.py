@@ -1,7 +1,7 @@
 """The spectrum of a population by its characteristic function: bounds, verdict, the largest modes.
 
-Takes: loops with long delays, or crowds of different peers on complete graphs.
-Gives: `solve_loops`, `solve_crowds`.
+Takes: loops with long delays, or populations of different peers on complete graphs.
+Gives: `solve_loops`, `solve_populations`.
 Guarantees: as `zeros`: the radius is bounded from both sides, and nothing beyond it is missed; a verdict
 nearer to the boundary than its bound says so. Rigid modes are known from the equations.
 Does not: list more than the largest modes.
@@ -20,8 +20,9 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.exchange import Exchange
 from apc.large.characteristic import Characteristic, null_vectors, weights_at
-from apc.large.crowds import (
-    Crowd,
+from apc.large.determinant import Places, heard_weights, of_loop, of_populations, senders_of
+from apc.large.populations import (
+    Population,
     hear_roughly,
     lines_of,
     mode_of,
@@ -30,7 +31,6 @@ from apc.large.crowds import (
     state_names,
     turned_by,
 )
-from apc.large.determinant import Places, heard_weights, of_crowds, of_loop, senders_of
 from apc.large.transfer import CHUNK, differentiate
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
@@ -40,10 +40,10 @@ Complexes = NDArray[np.complex128]
 # Modes listed of each system; of many peers fewer, as the shares of all peers are worked out for each.
 LISTED, LISTED_OF_MANY, MANY = 5, 1, 20_000
 
-# Poles of a crowd's sites that zeros are looked for close to.
+# Poles of a population's sites that zeros are looked for close to.
 NEAR_POLES = 6
 
-# Peers of a crowd whose copies, all equal, tell where its common zeros may be.
+# Peers of a population whose copies, all equal, tell where its common zeros may be.
 SAMPLES = 2
 
 # Smaller eigenvalues of these decide nothing, and those this near to 1 are rigid.
@@ -77,7 +77,7 @@ def solve_loops(loops: Sequence[Loop]) -> Spectrum:
     return _spectrum([_solve_loop(loop) for loop in loops], [loop.multiplicity for loop in loops])
 
 
-def solve_crowds(listed: Sequence[Crowd], exchange: Exchange, *, rigid: int) -> Spectrum:
+def solve_populations(listed: Sequence[Population], exchange: Exchange, *, rigid: int) -> Spectrum:
     """Compute the spectrum of different peers on complete graphs.
 
     Parameters
@@ -89,8 +89,8 @@ def solve_crowds(listed: Sequence[Crowd], exchange: Exchange, *, rigid: int) -> 
     rigid
         How many common translations there are, from the equations (see `translation`).
     """
-    function, places = of_crowds(listed, exchange)
-    peers = int(sum(len(crowd.parameters) for crowd in listed))
+    function, places = of_populations(listed, exchange)
+    peers = int(sum(len(population.parameters) for population in listed))
     zeros = find_zeros(
         function,
         _common_starts(listed, exchange),
@@ -98,7 +98,7 @@ def solve_crowds(listed: Sequence[Crowd], exchange: Exchange, *, rigid: int) -> 
         listed=LISTED_OF_MANY if peers > MANY else LISTED,
         near=NEAR_POLES,
     )
-    modes = _with_conjugates(_crowd_mode(function, places, listed, zero) for zero in zeros.found)
+    modes = _with_conjugates(_population_mode(function, places, listed, zero) for zero in zeros.found)
     return _spectrum([_Solved(zeros, rigid, 0, modes)], [1])
 
 
@@ -169,14 +169,14 @@ def _delay_starts(function: Characteristic) -> Complexes:
     return np.concatenate([starts, poles * (1 + 1e-3), poles * (1 - 1e-3)])
 
 
-def _common_starts(listed: Sequence[Crowd], exchange: Exchange) -> Complexes:
+def _common_starts(listed: Sequence[Population], exchange: Exchange) -> Complexes:
     """Return the eigenvalues of populations of copies of one peer, for some peers: all moving alike."""
     found = [np.zeros(0, np.complex128)]
     weights = zip(heard_weights(listed, exchange), senders_of(listed, exchange), strict=True)
-    for crowd, (weight, senders) in zip(listed, weights, strict=True):
-        few = np.unique(np.linspace(0, len(crowd.parameters) - 1, SAMPLES).astype(np.int64))
+    for population, (weight, senders) in zip(listed, weights, strict=True):
+        few = np.unique(np.linspace(0, len(population.parameters) - 1, SAMPLES).astype(np.int64))
         own = np.tile(weight * senders, (len(few), 1))
-        alike, *_ = hear_roughly(some_rows(crowd.lifted, few), crowd.schedule, own, 0 * own)
+        alike, *_ = hear_roughly(some_rows(population.lifted, few), population.schedule, own, 0 * own)
         values = np.linalg.eigvals(alike).astype(np.complex128).ravel()
         kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
         found.append(values[kept])
@@ -241,35 +241,37 @@ def _nearly_free(function: Characteristic, loop: Loop, value: complex) -> tuple[
     return motions, sent
 
 
-def _crowd_mode(function: Characteristic, places: Places, listed: Sequence[Crowd], zero: Zero) -> Mode:
-    """Describe a zero of a population of crowds; the shares of a crowd's peers are added up."""
+def _population_mode(
+    function: Characteristic, places: Places, listed: Sequence[Population], zero: Zero
+) -> Mode:
+    """Describe a zero of a heterogeneous population; the shares of a population's peers are added up."""
     if zero.site:
         return _own_mode(listed[zero.site[0]], places, zero, zero.site)
     value = zero.value
     sent, weight = null_vectors(function, value)
     heard = weights_at(function, np.array([value]))[0] @ sent
     motions = [
-        _move_crowd(
-            crowd, places.own[g], places.others[g], value, heard[places.heard[g]], weight[places.sent[g]]
+        _move_population(
+            population, places.own[g], places.others[g], value, heard[places.heard[g]], weight[places.sent[g]]
         )
-        for g, crowd in enumerate(listed)
+        for g, population in enumerate(listed)
     ]
     felt = np.zeros(len(heard), np.complex128)
-    for g, (crowd, motion) in enumerate(zip(listed, motions, strict=True)):
-        felt[places.heard[g]] += crowd.counts @ motion.felt
+    for g, (population, motion) in enumerate(zip(listed, motions, strict=True)):
+        felt[places.heard[g]] += population.counts @ motion.felt
     waiting = _waiting(function, value, felt, max(function.lags, default=0))
     shares: dict[str, float] = {}
     most, dominant = -1.0, (0, 0)
-    for g, (crowd, motion) in enumerate(zip(listed, motions, strict=True)):
-        n_z = len(crowd.lifted.z_names)
+    for g, (population, motion) in enumerate(zip(listed, motions, strict=True)):
+        n_z = len(population.lifted.z_names)
         covector = motion.w.copy()
         place = n_z
-        for row, depth in enumerate(crowd.schedule.depths):
+        for row, depth in enumerate(population.schedule.depths):
             covector[:, place : place + depth] += waiting[:depth, places.sent[g][row]]
             place += depth
         own = np.abs(covector * motion.z)
-        for name, share in zip(state_names(crowd), crowd.counts @ own, strict=True):
-            name = f"{crowd.name}.{name}" if len(listed) > 1 else name
+        for name, share in zip(state_names(population), population.counts @ own, strict=True):
+            name = f"{population.name}.{name}" if len(listed) > 1 else name
             shares[name] = shares.get(name, 0.0) + float(share)
         peer = int(np.argmax(own.sum(axis=1)))
         if float(own[peer].sum()) > most:
@@ -280,24 +282,24 @@ def _crowd_mode(function: Characteristic, places: Places, listed: Sequence[Crowd
     return mode_of(zero.value, zero.error, turned, shares, "different peers", zero.multiplicity)
 
 
-def _own_mode(crowd: Crowd, places: Places, zero: Zero, site: tuple[int, int]) -> Mode:
+def _own_mode(population: Population, places: Places, zero: Zero, site: tuple[int, int]) -> Mode:
     """Describe an eigenvalue of one peer by itself: of equal peers moving apart, or of one nobody hears."""
     g, row = site
-    some = some_rows(crowd.lifted, slice(row, row + 1))
+    some = some_rows(population.lifted, slice(row, row + 1))
     own, others = places.own[g], places.others[g]
-    m, _, s, _ = hear_roughly(some, crowd.schedule, own[None], others[None])
+    m, _, s, _ = hear_roughly(some, population.schedule, own[None], others[None])
     values, vectors = np.linalg.eig(m[0])
     z = vectors[:, int(np.argmin(np.abs(values - zero.value)))]
     found, covectors = np.linalg.eig(m[0].T)
     w = covectors[:, int(np.argmin(np.abs(found - zero.value)))]
-    now, before, _ = lines_of(crowd.schedule)
+    now, before, _ = lines_of(population.schedule)
     n_z = some.p.shape[-1]
     received = own * (now @ (s[0] @ z) + before @ z[n_z:])
     shares: dict[str, float] = {}
-    for name, share in zip(state_names(crowd), np.abs(w * z).tolist(), strict=True):
+    for name, share in zip(state_names(population), np.abs(w * z).tolist(), strict=True):
         shares[name] = shares.get(name, 0.0) + share
-    turned = turned_by(site_one(crowd, row), crowd.schedule, zero.value, z, received, w)
-    return mode_of(zero.value, zero.error, turned, shares, f"{crowd.name} by itself", zero.multiplicity)
+    turned = turned_by(site_one(population, row), population.schedule, zero.value, z, received, w)
+    return mode_of(zero.value, zero.error, turned, shares, f"{population.name} by itself", zero.multiplicity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,16 +335,16 @@ def _move(
     return _Motion(z, w, heard.astype(np.complex128), (w[:, None, :] @ b)[:, 0] + weight @ d)
 
 
-def _move_crowd(
-    crowd: Crowd, own: Floats, others: Floats, value: complex, heard: Complexes, weight: Complexes
+def _move_population(
+    population: Population, own: Floats, others: Floats, value: complex, heard: Complexes, weight: Complexes
 ) -> _Motion:
-    """Return how the peers of a crowd move, each hearing itself by `own` (n_r,), a chunk at a time."""
+    """Return how the peers of a population move, each hearing itself by `own` (n_r,), a chunk at a time."""
     parts = []
-    now, before, _ = lines_of(crowd.schedule)
-    for start in range(0, len(crowd.parameters), CHUNK):
-        some = some_rows(crowd.lifted, slice(start, start + CHUNK))
+    now, before, _ = lines_of(population.schedule)
+    for start in range(0, len(population.parameters), CHUNK):
+        some = some_rows(population.lifted, slice(start, start + CHUNK))
         k = len(some.p)
-        blocks = hear_roughly(some, crowd.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
+        blocks = hear_roughly(some, population.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
         moved = _move(blocks, value, np.tile(heard, (k, 1)), weight)
         sent = (blocks[2] @ moved.z[..., None] + blocks[3] @ moved.r[..., None])[..., 0]
         packets = moved.z[:, some.p.shape[-1] :]

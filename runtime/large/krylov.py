@@ -1,6 +1,6 @@
 """The largest eigenvalues of a sparse frame map, and a count of those that are larger.
 
-Takes: crowds of different peers on any graphs, and the exchange between them.
+Takes: populations of different peers on any graphs, and the exchange between them.
 Gives: `solve_sparse`; `argument_of`, `count_beyond`.
 Guarantees: rigid motions are taken out by their exact directions before any eigenvalue is computed. Errors
 are estimates to first order, from residuals and the errors of the matrix, and so is the radius they bound;
@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
-from apc.large.crowds import (
-    Crowd,
+from apc.large.populations import (
+    Population,
     hear_roughly,
     mode_of,
     site_one,
@@ -92,13 +92,13 @@ class _Pair:
     error: float
 
 
-def solve_sparse(listed: Sequence[Crowd], exchange: Exchange) -> Spectrum:
+def solve_sparse(listed: Sequence[Population], exchange: Exchange) -> Spectrum:
     """Compute the largest eigenvalues of different peers on any graphs.
 
     Parameters
     ----------
     listed
-        All peers, one crowd a group of the scene.
+        All peers, one population a group of the scene.
     exchange
         The links.
     """
@@ -143,20 +143,20 @@ def solve_sparse(listed: Sequence[Crowd], exchange: Exchange) -> Spectrum:
     return Spectrum(modes, radius, radius_error, len(rigid.held), 0, verdict, stable, "", tuple(notes))
 
 
-def _shifts(system: SparseSystem, listed: Sequence[Crowd]) -> list[complex]:
+def _shifts(system: SparseSystem, listed: Sequence[Population]) -> list[complex]:
     """Return where the largest eigenvalues may be: those of populations of copies of one peer."""
     found = []
     heard = np.asarray(sum(abs(one) for one in system.hearing).sum(axis=1)).ravel()
-    lines = np.array([len(crowd.schedule.heard) for crowd in listed])[system.crowd_of]
+    lines = np.array([len(population.schedule.heard) for population in listed])[system.population_of]
     starts = np.concatenate([[0], np.cumsum(lines)[:-1]])
-    for g, crowd in enumerate(listed):
-        few = np.unique(np.linspace(0, len(crowd.parameters) - 1, SAMPLES).astype(np.int64))
-        some = some_rows(crowd.lifted, few)
-        peers = np.flatnonzero(system.crowd_of == g)
-        most = heard[starts[peers][:, None] + np.arange(len(crowd.schedule.heard))].max(axis=0)
+    for g, population in enumerate(listed):
+        few = np.unique(np.linspace(0, len(population.parameters) - 1, SAMPLES).astype(np.int64))
+        some = some_rows(population.lifted, few)
+        peers = np.flatnonzero(system.population_of == g)
+        most = heard[starts[peers][:, None] + np.arange(len(population.schedule.heard))].max(axis=0)
         for share in SHARES:
             own = np.tile(share * most, (len(few), 1))
-            found.append(np.linalg.eigvals(hear_roughly(some, crowd.schedule, own, 0 * own)[0]).ravel())
+            found.append(np.linalg.eigvals(hear_roughly(some, population.schedule, own, 0 * own)[0]).ravel())
     values = np.concatenate(found).astype(np.complex128)
     values = values[(values.imag >= 0)]
     values = values[np.argsort(-np.abs(values), kind="stable")]
@@ -241,15 +241,15 @@ def _paired(matrix: Any, error: Any, value: complex, right: Complexes) -> _Pair:
     return _Pair(value, right, left, float(off / scale) + 8 * UNIT * abs(value))
 
 
-def _alone(listed: Sequence[Crowd]) -> tuple[Complexes, Floats]:
+def _alone(listed: Sequence[Population]) -> tuple[Complexes, Floats]:
     """Return the eigenvalues of all peers when they hear nothing, and how often each is there."""
-    values = [np.linalg.eigvals(crowd.lifted.p).astype(np.complex128).ravel() for crowd in listed]
-    counts = [np.repeat(crowd.counts, crowd.lifted.p.shape[-1]) for crowd in listed]
+    values = [np.linalg.eigvals(population.lifted.p).astype(np.complex128).ravel() for population in listed]
+    counts = [np.repeat(population.counts, population.lifted.p.shape[-1]) for population in listed]
     return np.concatenate(values), np.concatenate(counts)
 
 
-def _mode(system: SparseSystem, listed: Sequence[Crowd], rigid: RigidSpace, pair: _Pair) -> Mode:
-    """Describe an eigenvalue over the whole state; the shares of all peers of a crowd are added up.
+def _mode(system: SparseSystem, listed: Sequence[Population], rigid: RigidSpace, pair: _Pair) -> Mode:
+    """Describe an eigenvalue over the whole state; the shares of all peers of a population are added up.
 
     With y of the map without rigid motions, M x = λ x of x = y + V c, V_p c = M_p y/(λ − 1); its left
     vectors are those of M.
@@ -259,20 +259,22 @@ def _mode(system: SparseSystem, listed: Sequence[Crowd], rigid: RigidSpace, pair
         vector = vector + rigid.motions @ (system.matrix[rigid.held] @ vector / (pair.value - 1))
     own = np.abs(vector * covector)
     shares: dict[str, float] = {}
-    for g, crowd in enumerate(listed):
-        starts = system.starts[:-1][system.crowd_of == g]
-        for place, name in enumerate(state_names(crowd)):
-            name = f"{crowd.name}.{name}" if len(listed) > 1 else name
+    for g, population in enumerate(listed):
+        starts = system.starts[:-1][system.population_of == g]
+        for place, name in enumerate(state_names(population)):
+            name = f"{population.name}.{name}" if len(listed) > 1 else name
             shares[name] = shares.get(name, 0.0) + float(own[starts + place].sum())
     peer = int(np.argmax(np.add.reduceat(own, system.starts[:-1])))
-    crowd, row = listed[system.crowd_of[peer]], int(system.row_of[peer])
+    population, row = listed[system.population_of[peer]], int(system.row_of[peer])
     z, w = (
-        part[system.starts[peer] : system.starts[peer] + crowd.lifted.p.shape[-1]]
+        part[system.starts[peer] : system.starts[peer] + population.lifted.p.shape[-1]]
         for part in (vector, covector)
     )
     # What the peer hears is what its memory of it says: P z + Q r = ζ z.
-    heard = np.linalg.lstsq(crowd.lifted.q[row], pair.value * z - crowd.lifted.p[row] @ z, rcond=None)[0]
-    turned = turned_by(site_one(crowd, row), crowd.schedule, pair.value, z, heard, w)
+    heard = np.linalg.lstsq(
+        population.lifted.q[row], pair.value * z - population.lifted.p[row] @ z, rcond=None
+    )[0]
+    turned = turned_by(site_one(population, row), population.schedule, pair.value, z, heard, w)
     return mode_of(pair.value, pair.error, turned, shares, "different peers", 1)
 
 
@@ -362,7 +364,7 @@ def count_beyond(argument: Argument, alone: tuple[Complexes, Floats], known: Com
     return round(outside - turns) if abs(turns - round(turns)) < 0.1 else -1
 
 
-def argument_of(system: SparseSystem, listed: Sequence[Crowd]) -> Argument:
+def argument_of(system: SparseSystem, listed: Sequence[Population]) -> Argument:
     """Return the argument of det(I − R/ζ), from a small matrix: see `sparse_system.small_matrix`."""
     linalg = load_pool("scipy.sparse.linalg")
     small = small_matrix(system, listed)
@@ -371,10 +373,10 @@ def argument_of(system: SparseSystem, listed: Sequence[Crowd]) -> Argument:
         factors = linalg.splu(small(point))
         total = float(np.angle(factors.U.diagonal()).sum())
         total += np.pi * (_odd(factors.perm_r) ^ _odd(factors.perm_c))
-        for crowd in listed:
-            p = crowd.lifted.p
+        for population in listed:
+            p = population.lifted.p
             sign, _ = np.linalg.slogdet(np.eye(p.shape[-1]) - p / point)
-            total += float(crowd.counts @ np.angle(sign))
+            total += float(population.counts @ np.angle(sign))
         return _wrapped(total)
 
     return argument

@@ -34,8 +34,8 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.eigen.spectrum import Spectrum, judge
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
-from apc.large.crowds import hear_themselves, rows_of
 from apc.large.diagonal import block_diagonal, block_norms, block_resolvent
+from apc.large.populations import hear_themselves, rows_of
 from apc.large.transfer import INNER
 
 Floats = NDArray[np.float64]

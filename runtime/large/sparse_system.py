@@ -1,6 +1,6 @@
 """All peers of a sparse graph as one sparse matrix, each peer with numbers of its own.
 
-Takes: crowds, and the exchange between them; what nothing holds back of their peers.
+Takes: populations, and the exchange between them; what nothing holds back of their peers.
 Gives: `SparseSystem`, `sparse_system`; `RigidSpace`, `rigid_space`, `nothing_rigid`, `without_rigid`;
 `small_matrix`.
 Guarantees: the matrix is that of `modes.dense`, in the same order of states, with a bound on its error entry
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from apc.compiler.weights import sum_weights
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
-from apc.large.crowds import Crowd
+from apc.large.populations import Population
 from apc.large.translation import FreeMotions
 
 Floats = NDArray[np.float64]
@@ -38,37 +38,40 @@ Complexes = NDArray[np.complex128]
 class SparseSystem:
     """state⁺ = `matrix` · state; the state holds, peer by peer, z and then the packets on their way.
 
-    `starts` (N + 1,) says where each peer's part starts, `crowd_of` (N,) and `row_of` (N,) which crowd it is
-    of and which of its different peers it is; `error` bounds the error of the matrix entry by entry.
-    `hearing` are, for each lag, what every line of r weighs every row of s by, both peer by peer.
+    `starts` (N + 1,) says where each peer's part starts, `population_of` (N,) and `row_of` (N,) which
+    population it is of and which of its different peers it is; `error` bounds the error of the matrix
+    entry by entry. `hearing` are, for each lag, what every line of r weighs every row of s by, both peer
+    by peer.
     """
 
     matrix: Any  # scipy.sparse, (n, n)
     error: Any
     starts: Integers
-    crowd_of: Integers
+    population_of: Integers
     row_of: Integers
     lags: tuple[int, ...]
     hearing: tuple[Any, ...]  # scipy.sparse, (lines, rows)
 
 
-def sparse_system(listed: Sequence[Crowd], exchange: Exchange) -> SparseSystem:
+def sparse_system(listed: Sequence[Population], exchange: Exchange) -> SparseSystem:
     """Assemble all peers.
 
     Parameters
     ----------
     listed
-        All peers, one crowd a group of the scene.
+        All peers, one population a group of the scene.
     exchange
         The links.
     """
-    crowd_of = np.repeat(np.arange(len(listed)), [len(crowd.rows) for crowd in listed])
-    row_of = np.concatenate([np.asarray(crowd.rows) for crowd in listed])
-    sizes = np.array([crowd.lifted.p.shape[-1] + sum(crowd.schedule.depths) for crowd in listed])
-    starts = np.concatenate([[0], np.cumsum(sizes[crowd_of])])
-    lags, hearing = _hearing(listed, exchange, crowd_of)
-    exact = [crowd.lifted.blocks for crowd in listed]
-    errors = [crowd.lifted.error.blocks for crowd in listed]
+    population_of = np.repeat(np.arange(len(listed)), [len(population.rows) for population in listed])
+    row_of = np.concatenate([np.asarray(population.rows) for population in listed])
+    sizes = np.array(
+        [population.lifted.p.shape[-1] + sum(population.schedule.depths) for population in listed]
+    )
+    starts = np.concatenate([[0], np.cumsum(sizes[population_of])])
+    lags, hearing = _hearing(listed, exchange, population_of)
+    exact = [population.lifted.blocks for population in listed]
+    errors = [population.lifted.error.blocks for population in listed]
     large = [tuple(np.abs(block) for block in blocks) for blocks in exact]
     wide = [
         tuple(block + error for block, error in zip(*both, strict=True))
@@ -78,38 +81,42 @@ def sparse_system(listed: Sequence[Crowd], exchange: Exchange) -> SparseSystem:
     matrix = _assemble(exact, listed, lags, hearing)
     upper, bound = _assemble(wide, listed, lags, sized), _assemble(large, listed, lags, sized)
     most = max((int(np.diff(one.indptr).max(initial=0)) for one in hearing), default=0)
-    terms = max(crowd.lifted.p.shape[-1] + len(crowd.schedule.heard) * (2 + most) for crowd in listed)
-    rounds = 4 * (terms + 4) * (1 + max(len(crowd.schedule.sent) for crowd in listed)) * UNIT
-    return SparseSystem(matrix, (upper - bound) + rounds * upper, starts, crowd_of, row_of, lags, hearing)
+    terms = max(
+        population.lifted.p.shape[-1] + len(population.schedule.heard) * (2 + most) for population in listed
+    )
+    rounds = 4 * (terms + 4) * (1 + max(len(population.schedule.sent) for population in listed)) * UNIT
+    return SparseSystem(
+        matrix, (upper - bound) + rounds * upper, starts, population_of, row_of, lags, hearing
+    )
 
 
 def _hearing(
-    listed: Sequence[Crowd], exchange: Exchange, crowd_of: Integers
+    listed: Sequence[Population], exchange: Exchange, population_of: Integers
 ) -> tuple[tuple[int, ...], tuple[Any, ...]]:
     """Return the lags, and what every line of r weighs every row of s of so many frames ago by."""
     import scipy.sparse
 
-    n_s = np.array([len(crowd.schedule.sent) for crowd in listed])[crowd_of]
-    n_r = np.array([len(crowd.schedule.heard) for crowd in listed])[crowd_of]
+    n_s = np.array([len(population.schedule.sent) for population in listed])[population_of]
+    n_r = np.array([len(population.schedule.heard) for population in listed])[population_of]
     s_start, r_start = np.concatenate([[0], np.cumsum(n_s)]), np.concatenate([[0], np.cumsum(n_r)])
-    lags = tuple(sorted({one.lag for crowd in listed for one in crowd.schedule.heard}))
+    lags = tuple(sorted({one.lag for population in listed for one in population.schedule.heard}))
     triplets: dict[int, list[tuple[Floats, Integers, Integers]]] = {lag: [] for lag in lags}
     for link in exchange.links:
-        sends = np.array([crowd.sends(link) for crowd in listed])[crowd_of]
+        sends = np.array([population.sends(link) for population in listed])[population_of]
         pairs, weights = exchange.arcs(link)
         kept = sends[pairs[:, 0]]
         sender, receiver, weight = pairs[kept, 0], pairs[kept, 1], weights[kept]
         total = sum_weights(receiver, weight, exchange.peers).floats
-        for g, crowd in enumerate(listed):
-            for line, heard in enumerate(crowd.schedule.heard):
+        for g, population in enumerate(listed):
+            for line, heard in enumerate(population.schedule.heard):
                 if heard.way.link != link:
                     continue
                 share = weight / total[receiver] if heard.way.operator == "mean" else weight
                 for h, other in enumerate(listed):
                     sent = other.schedule.sent
-                    late = exchange.delay(link, other.group, crowd.group)
+                    late = exchange.delay(link, other.group, population.group)
                     if heard.sent in sent and late == heard.way.delay:
-                        pick = (crowd_of[receiver] == g) & (crowd_of[sender] == h)
+                        pick = (population_of[receiver] == g) & (population_of[sender] == h)
                         rows = s_start[sender[pick]] + sent.index(heard.sent)
                         triplets[heard.lag].append((share[pick], r_start[receiver[pick]] + line, rows))
     found = []
@@ -122,15 +129,15 @@ def _hearing(
 
 def _assemble(
     blocks: Sequence[tuple[Floats, ...]],
-    listed: Sequence[Crowd],
+    listed: Sequence[Population],
     lags: Sequence[int],
     hearing: Sequence[Any],
 ) -> Any:
-    """Return the closed matrix of peers with these P, Q, S and D, crowd by crowd (k, …)."""
+    """Return the closed matrix of peers with these P, Q, S and D, population by population (k, …)."""
     import scipy.sparse
 
     p, q, s, d = (_beside([one[k] for one in blocks], listed) for k in range(4))
-    depth = _by_peer(listed, lambda crowd: crowd.schedule.depths)
+    depth = _by_peer(listed, lambda population: population.schedule.depths)
     kept = [np.flatnonzero(depth >= lag) for lag in range(1, int(depth.max(initial=0)) + 1)]
     states = p.shape[0] + sum(map(len, kept))
     weights, nobody = dict(zip(lags, hearing, strict=True)), scipy.sparse.csr_matrix(d.shape[::-1])
@@ -156,13 +163,13 @@ def _assemble(
     return scipy.sparse.vstack(rows).tocsr()[order][:, order]
 
 
-def _beside(blocks: Sequence[Floats | Complexes], listed: Sequence[Crowd]) -> Any:
-    """Return every peer's block, of its row in its crowd's (k, h, w), on the diagonal of a sparse matrix."""
+def _beside(blocks: Sequence[Floats | Complexes], listed: Sequence[Population]) -> Any:
+    """Return every peer's block, of its row in its population's (k, h, w), on a sparse matrix's diagonal."""
     import scipy.sparse
 
     found = []
-    for block, crowd in zip(blocks, listed, strict=True):
-        own = block[np.asarray(crowd.rows)]
+    for block, population in zip(blocks, listed, strict=True):
+        own = block[np.asarray(population.rows)]
         count, height, width = own.shape
         shape = (count * height, count * width)
         if own.size:
@@ -181,17 +188,19 @@ def _widened(matrix: Any, width: int) -> Any:
     return scipy.sparse.csr_matrix((matrix.data, matrix.indices, matrix.indptr), (matrix.shape[0], width))
 
 
-def _by_peer(listed: Sequence[Crowd], numbers: Callable[[Crowd], Sequence[int]]) -> Integers:
-    """Return what is listed of a crowd, peer after peer."""
-    found = [np.tile(np.array(numbers(crowd), dtype=np.int64), len(crowd.rows)) for crowd in listed]
+def _by_peer(listed: Sequence[Population], numbers: Callable[[Population], Sequence[int]]) -> Integers:
+    """Return what is listed of a population, peer after peer."""
+    found = [
+        np.tile(np.array(numbers(population), dtype=np.int64), len(population.rows)) for population in listed
+    ]
     return np.concatenate(found)
 
 
-def _peer_by_peer(listed: Sequence[Crowd], kept: Sequence[Integers]) -> Integers:
+def _peer_by_peer(listed: Sequence[Population], kept: Sequence[Integers]) -> Integers:
     """Return the order of `modes.dense` of a state of all z and then all packets, the youngest first."""
-    peer = np.arange(sum(len(crowd.rows) for crowd in listed))
-    own = np.repeat(peer, _by_peer(listed, lambda crowd: [crowd.lifted.p.shape[-1]]))
-    sender = np.repeat(peer, _by_peer(listed, lambda crowd: [len(crowd.schedule.sent)]))
+    peer = np.arange(sum(len(population.rows) for population in listed))
+    own = np.repeat(peer, _by_peer(listed, lambda population: [population.lifted.p.shape[-1]]))
+    sender = np.repeat(peer, _by_peer(listed, lambda population: [len(population.schedule.sent)]))
     whose = np.concatenate([own, *(sender[places] for places in kept)])
     row = np.concatenate([np.full(len(own), -1), *kept])
     age = np.concatenate([np.arange(len(own)), *(np.full(len(one), lag) for lag, one in enumerate(kept))])
@@ -239,18 +248,18 @@ def rigid_space(system: SparseSystem, exchange: Exchange, free: FreeMotions) -> 
         columns.append((np.tile(motion[moving], len(starts)), places, np.repeat(numbers, len(moving))))
 
     for g, (own, pivots) in enumerate(zip(free.own, free.pivots, strict=True)):
-        starts = system.starts[:-1][system.crowd_of == g]
+        starts = system.starts[:-1][system.population_of == g]
         for motion, pivot in zip(own.T, pivots, strict=True):
             add(motion, starts, len(held) + np.arange(len(starts)))
             held.extend((starts + pivot).tolist())
     single = len(held)
     for members in _parts(exchange):
-        crowd_of = system.crowd_of[members]
-        for (crowd, pivot), vectors in free.together(np.unique(crowd_of).tolist()):
+        population_of = system.population_of[members]
+        for (population, pivot), vectors in free.together(np.unique(population_of).tolist()):
             for g, motion in vectors.items():
-                starts = system.starts[members[crowd_of == g]]
+                starts = system.starts[members[population_of == g]]
                 add(motion, starts, np.full(len(starts), len(held)))
-            held.append(int(system.starts[members[crowd_of == crowd][0]]) + pivot)
+            held.append(int(system.starts[members[population_of == population][0]]) + pivot)
     shape = (int(system.starts[-1]), len(held))
     value, place, column = (
         (np.concatenate(part) for part in zip(*columns, strict=True)) if columns else ([],) * 3
@@ -301,7 +310,7 @@ def without_rigid(system: SparseSystem, rigid: RigidSpace) -> tuple[Any, Any]:
 MatrixAt = Callable[[complex], Any]
 
 
-def small_matrix(system: SparseSystem, listed: Sequence[Crowd]) -> MatrixAt:
+def small_matrix(system: SparseSystem, listed: Sequence[Population]) -> MatrixAt:
     """Return ζ ↦ I − T(ζ) W(ζ), sparse, over what all peers send: see `characteristic`.
 
     Its determinant is that of I − R/ζ over Π (1 − p/ζ), p the eigenvalues of the peers hearing nothing; it is
@@ -318,7 +327,7 @@ def small_matrix(system: SparseSystem, listed: Sequence[Crowd]) -> MatrixAt:
 
     def at(point: complex) -> Any:
         answers = []
-        for one in (crowd.lifted for crowd in listed):
+        for one in (population.lifted for population in listed):
             shifted = point * np.eye(one.p.shape[-1]) - one.p
             answers.append(one.d + one.s @ np.linalg.solve(shifted, one.q.astype(np.complex128)))
         hearing = sum(weights * point**-lag for lag, weights in zip(system.lags, system.hearing, strict=True))

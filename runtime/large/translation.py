@@ -1,14 +1,14 @@
 """How many motions nothing holds back, in a population of peers that all differ.
 
-Takes: crowds, and the exchange between them.
+Takes: populations, and the exchange between them.
 Gives: `count_translations`; `FreeMotions`, `free_motions`.
 Guarantees: a motion counts if it is one in exact arithmetic for every peer, each with its own numbers.
-Does not: find a motion that only some peers of a crowd are free to make: a count of eigenvalues (see `zeros`)
-then finds one more at 1 than was said, and the verdict is left open.
+Does not: find a motion that only some peers of a population are free to make: a count of eigenvalues (see
+`zeros`) then finds one more at 1 than was said, and the verdict is left open.
 
-The first peer of each crowd stands for all: were all peers like it, the standing solutions of the common and
-the difference system would be found exactly (see `rigid`). Each of these is then put into the equations of
-every peer, modulo two primes.
+The first peer of each population stands for all: were all peers like it, the standing solutions of the common
+and the difference system would be found exactly (see `rigid`). Each of these is then put into the equations
+of every peer, modulo two primes.
 """
 
 from __future__ import annotations
@@ -34,23 +34,28 @@ from apc.frame.linearize import site_of_entries
 from apc.frame.residues import PRIMES, Residues, residues_of, residues_of_rounded
 from apc.frame.schedule import Way
 from apc.frame.site import LinearSite
-from apc.large.crowds import Crowd
+from apc.large.populations import Population
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-def representatives(listed: Sequence[Crowd], exchange: Exchange) -> list[PeerGroup]:
-    """Return the first peer of each crowd, as many as there are peers in it."""
+def representatives(listed: Sequence[Population], exchange: Exchange) -> list[PeerGroup]:
+    """Return the first peer of each population, as many as there are peers in it."""
     return [
         group_of_row(
-            crowd.jacobians, crowd.parameters[0], crowd.schedule, exchange, crowd.group, len(crowd.rows)
+            population.jacobians,
+            population.parameters[0],
+            population.schedule,
+            exchange,
+            population.group,
+            len(population.rows),
         )
-        for crowd in listed
+        for population in listed
     ]
 
 
-def count_translations(listed: Sequence[Crowd], exchange: Exchange) -> int | None:
+def count_translations(listed: Sequence[Population], exchange: Exchange) -> int | None:
     """Return how many independent motions nothing holds back on complete graphs; None if it can't be told.
 
     Parameters
@@ -61,11 +66,11 @@ def count_translations(listed: Sequence[Crowd], exchange: Exchange) -> int | Non
         The links, all of them complete.
     """
     groups = representatives(listed, exchange)
-    crowd_of = {id(group): crowd for group, crowd in zip(groups, listed, strict=True)}
+    population_of = {id(group): population for group, population in zip(groups, listed, strict=True)}
     total = 0
     for loop in complete_loops(groups, exchange):
         free = find_rigid_modes(loop, with_drifts=False).directions.shape[1]
-        if free and not hold_for_all(loop, [crowd_of[id(group)] for group in loop.sites]):
+        if free and not hold_for_all(loop, [population_of[id(group)] for group in loop.sites]):
             return None
         total += loop.multiplicity * free
     return total
@@ -73,37 +78,39 @@ def count_translations(listed: Sequence[Crowd], exchange: Exchange) -> int | Non
 
 @dataclass(frozen=True, slots=True)
 class FreeMotions:
-    """What nothing holds back, for each crowd over the state of one of its peers: z, then its packets.
+    """What nothing holds back, for each population over the state of one of its peers: z, then its packets.
 
-    `own` (n_g, d_g) are motions of a peer by itself, whoever hears it, and `pivots` for each crowd the places
-    where one of these is 1 and all others 0. `common` are motions of all peers of a connected part of the
-    graph together, crowd by crowd; they are 0 at the pivots.
+    `own` (n_g, d_g) are motions of a peer by itself, whoever hears it, and `pivots` for each population the
+    places where one of these is 1 and all others 0. `common` are motions of all peers of a connected part of
+    the graph together, population by population; they are 0 at the pivots.
     """
 
     own: tuple[Floats, ...]
     pivots: tuple[tuple[int, ...], ...]
     common: tuple[tuple[tuple[Fraction, ...], ...], ...]
 
-    def together(self, crowds: Sequence[int]) -> list[tuple[tuple[int, int], dict[int, Floats]]]:
-        """Return the independent common motions of peers of some crowds.
+    def together(self, populations: Sequence[int]) -> list[tuple[tuple[int, int], dict[int, Floats]]]:
+        """Return the independent common motions of peers of some populations.
 
-        Each with its pivot, a crowd and a place, where it is 1 and all others 0, and its vector by crowd.
+        Each with its pivot, a population and a place where it is 1 and all others 0, and its vectors.
         """
-        lengths = [len(self.own[g]) for g in crowds]
+        lengths = [len(self.own[g]) for g in populations]
         ends = np.cumsum([0, *lengths]).tolist()
-        basis = _echelon([list(itertools.chain.from_iterable(one[g] for g in crowds)) for one in self.common])
+        basis = _echelon(
+            [list(itertools.chain.from_iterable(one[g] for g in populations)) for one in self.common]
+        )
         found = []
         for place, vector in basis.items():
             at = int(np.searchsorted(ends, place, side="right")) - 1
             parts = {
                 g: np.array([float(entry) for entry in vector[a:b]])
-                for g, (a, b) in zip(crowds, itertools.pairwise(ends), strict=True)
+                for g, (a, b) in zip(populations, itertools.pairwise(ends), strict=True)
             }
-            found.append(((crowds[at], place - ends[at]), parts))
+            found.append(((populations[at], place - ends[at]), parts))
         return found
 
 
-def free_motions(listed: Sequence[Crowd], exchange: Exchange) -> FreeMotions | None:
+def free_motions(listed: Sequence[Population], exchange: Exchange) -> FreeMotions | None:
     """Return the motions that nothing holds back on any graph; None if that can't be told.
 
     Parameters
@@ -116,8 +123,8 @@ def free_motions(listed: Sequence[Crowd], exchange: Exchange) -> FreeMotions | N
     Notes
     -----
     Where all senders send the same, it does not matter which of them a peer hears: the common motions are
-    those of one peer of each crowd, each hearing all. Motions that stand still whatever the weights of what
-    is heard are those of single peers.
+    those of one peer of each population, each hearing all. Motions that stand still whatever the weights of
+    what is heard are those of single peers.
     """
     together, apart = _standing_loops(listed, exchange)
     if not hold_for_all(apart, listed) or not hold_for_all(together, listed, exchange=exchange):
@@ -146,7 +153,7 @@ def free_motions(listed: Sequence[Crowd], exchange: Exchange) -> FreeMotions | N
     )
 
 
-def may_drift(listed: Sequence[Crowd], exchange: Exchange) -> bool:
+def may_drift(listed: Sequence[Population], exchange: Exchange) -> bool:
     """Say whether nothing brakes some motion of the first peers, alone or together.
 
     Parameters
@@ -159,8 +166,8 @@ def may_drift(listed: Sequence[Crowd], exchange: Exchange) -> bool:
     return any(find_rigid_modes(loop).drifts for loop in _standing_loops(listed, exchange))
 
 
-def _standing_loops(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Loop, Loop]:
-    """Return the first peers of all crowds hearing as if all moved alike, and hearing anyhow."""
+def _standing_loops(listed: Sequence[Population], exchange: Exchange) -> tuple[Loop, Loop]:
+    """Return the first peers of all populations hearing as if all moved alike, and hearing anyhow."""
     groups = representatives(listed, exchange)
     ways = used_ways(group.schedule for group in groups)
     shares = {way: _shares(groups, exchange, way) for way in ways}
@@ -181,9 +188,9 @@ def _standing_loops(listed: Sequence[Crowd], exchange: Exchange) -> tuple[Loop, 
 
 
 def _shares(groups: Sequence[PeerGroup], exchange: Exchange, way: Way) -> tuple[tuple[Fraction, ...], ...]:
-    """Return what each crowd hears of each on a way, as if it heard as much of every crowd that it hears.
+    """Return what each population hears of each on a way, in shares of all that it hears.
 
-    In shares of all that it hears.
+    As if it heard as much of every population that it hears.
     """
     sending = [one.sends(way.link) for one in groups]
     rows = []
@@ -205,24 +212,26 @@ def _weighed(
     return tuple(tuple(total * share for share in row) for row, total in zip(rows, totals, strict=True))
 
 
-def _heard_arcs(listed: Sequence[Crowd], exchange: Exchange, link: str) -> tuple[Integers, Floats]:
+def _heard_arcs(listed: Sequence[Population], exchange: Exchange, link: str) -> tuple[Integers, Floats]:
     """Return who hears something over a link, arc by arc, and the weights."""
     pairs, weights = exchange.arcs(link)
-    sends = np.repeat([crowd.sends(link) for crowd in listed], [len(crowd.rows) for crowd in listed])
+    sends = np.repeat(
+        [population.sends(link) for population in listed], [len(population.rows) for population in listed]
+    )
     heard = sends[pairs[:, 0]]
     return pairs[heard, 1], weights[heard]
 
 
-def _first_totals(listed: Sequence[Crowd], exchange: Exchange, link: str) -> list[Fraction]:
-    """Return what the first peer of each crowd hears over a link in all: the weights of its senders."""
+def _first_totals(listed: Sequence[Population], exchange: Exchange, link: str) -> list[Fraction]:
+    """Return what the first peer of each population hears over a link in all: the weights of its senders."""
     receivers, weights = _heard_arcs(listed, exchange, link)
     return [
-        sum(map(exact_weight, weights[receivers == exchange.starts[crowd.group]].tolist()), Fraction(0))
-        for crowd in listed
+        sum(map(exact_weight, weights[receivers == exchange.starts[population.group]].tolist()), Fraction(0))
+        for population in listed
     ]
 
 
-def _all_totals(listed: Sequence[Crowd], exchange: Exchange, link: str, prime: int) -> Integers:
+def _all_totals(listed: Sequence[Population], exchange: Exchange, link: str, prime: int) -> Integers:
     """Return what each peer hears over a link in all, modulo a prime (N,)."""
     receivers, weights = _heard_arcs(listed, exchange, link)
     found = np.zeros(exchange.peers, np.int64)
@@ -255,15 +264,15 @@ def _subtract(vector: list[Fraction], times: Fraction, other: Sequence[Fraction]
             vector[start + place] -= times * entry
 
 
-def hold_for_all(loop: Loop, listed: Sequence[Crowd], *, exchange: Exchange | None = None) -> bool:
-    """Say whether the rigid modes of a loop of representatives are those of every peer of their crowds.
+def hold_for_all(loop: Loop, listed: Sequence[Population], *, exchange: Exchange | None = None) -> bool:
+    """Say whether the rigid modes of a loop of representatives are those of every peer of their populations.
 
     Parameters
     ----------
     loop
         Its sites are the representatives.
     listed
-        The crowd of each site.
+        The population of each site.
     exchange
         The links, where a sum over one is as large as what each peer hears itself; else all hear what their
         representative does.
@@ -274,14 +283,14 @@ def hold_for_all(loop: Loop, listed: Sequence[Crowd], *, exchange: Exchange | No
         for prime in PRIMES:
             links = dict.fromkeys(way.link for way in shares)
             totals = [_all_totals(listed, exchange, link, prime) for link in links] if exchange else []
-            for place, crowd in enumerate(listed):
+            for place, population in enumerate(listed):
                 # Its peers, each once that differ in their numbers or in what they hear.
-                first = int(exchange.starts[crowd.group]) if exchange else 0
-                own = [one[first : first + len(crowd.rows)] for one in totals]
-                rows, *heard = np.unique(np.stack([crowd.rows, *own]), axis=1)
+                first = int(exchange.starts[population.group]) if exchange else 0
+                own = [one[first : first + len(population.rows)] for one in totals]
+                rows, *heard = np.unique(np.stack([population.rows, *own]), axis=1)
                 total_of = {link: Residues(one, prime) for link, one in zip(links, heard, strict=True)}
                 sites = [group.exact for group in loop.sites]
-                sites[place] = _all_peers(crowd, rows, prime)
+                sites[place] = _all_peers(population, rows, prime)
                 coupling: dict[Way, Any] = dict(loop.coupling)
                 for way, listed_shares in shares.items():
                     weights = tuple(total_of[way.link] * share for share in listed_shares[place])
@@ -293,12 +302,12 @@ def hold_for_all(loop: Loop, listed: Sequence[Crowd], *, exchange: Exchange | No
     return True
 
 
-def _all_peers(crowd: Crowd, rows: Integers, prime: int) -> LinearSite:
-    """Return the matrices of some of a crowd's different peers, each entry a column modulo a prime."""
-    built = crowd.jacobians
-    columns = [residues_of(column, prime) for column in crowd.parameters[rows].T]
+def _all_peers(population: Population, rows: Integers, prime: int) -> LinearSite:
+    """Return the matrices of some of a population's different peers, each entry a column modulo a prime."""
+    built = population.jacobians
+    columns = [residues_of(column, prime) for column in population.parameters[rows].T]
     for place, rationals in built.kind.rounded:
-        columns[place] = residues_of_rounded(crowd.parameters[rows, place], rationals, prime)
+        columns[place] = residues_of_rounded(population.parameters[rows, place], rationals, prime)
     zero = Residues(np.zeros(len(rows), np.int64), prime)
     arguments = [[zero] * built.function.numel_in(argument) for argument in range(4)]
 

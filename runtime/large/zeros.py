@@ -221,7 +221,7 @@ SAME = 1e-11
 # Poles that are eigenvalues themselves, looked at of each structure.
 MOST_HELD = 64
 
-# Poles taken out of f, of each structure, where zeros are looked for: those that crowd about the zeros.
+# Poles taken out of f, of each structure, where zeros are looked for: those that population about the zeros.
 TAKEN_OUT = 128
 
 # Points on a ring, and poles, to look for missed zeros from.

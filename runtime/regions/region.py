@@ -23,6 +23,7 @@ from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.words import counted
+from apc.finite_equations import finite_equations
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.network.nominal import left_out, refuse_channel_number
@@ -35,7 +36,6 @@ from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_time
 from apc.vary.marginal import marginal_motion, with_rigid

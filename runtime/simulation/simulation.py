@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.finite_equations import finite_equations
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.parameters import Numbers, resolve
@@ -35,7 +36,6 @@ from apc.simulation.quadrature import Kernel, kernel_of
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import Choice, LocalSignal, Signal, choose, local_signals, signals_of
 from apc.simulation.writing import build_program
-from apc.trouble import finite_equations
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.distribution import versions
-from apc.given import given
+from apc.option_value import option_value
 from apc.result import Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
 from apc.simulation.blocks import Block, blocks
@@ -266,7 +266,7 @@ def trajectory_of(
 
 def parse_duration(text: str) -> Fraction:
     """Read a duration such as "2 s". Raises ApcError if it is none."""
-    return given("--duration", text, what="duration", unit="s")
+    return option_value("--duration", text, what="duration", unit="s")
 
 
 def duration_of(system: CompiledSystem, duration: Fraction | None) -> Fraction:

@@ -19,12 +19,12 @@ from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
+from apc.finite_equations import finite_equations
 from apc.frame.names import Free, find, parameter_of, unit_of
-from apc.given import given
 from apc.network.nominal import left_out, refuse_channel_number
+from apc.option_value import option_value
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.trouble import finite_equations
 from apc.vary.crossings import CELL
 from apc.vary.delays import delay_now
 from apc.vary.evaluator import reaches_time
@@ -173,7 +173,7 @@ def _at_start(system: CompiledSystem, prepared: Prepared) -> Prepared:
 
 def _limit(option: str, text: str | None, free: Free, unit: str) -> Fraction | None:
     """Read a limit, None if there is none."""
-    return None if text is None else given(option, text, what=free.name, unit=unit)
+    return None if text is None else option_value(option, text, what=free.name, unit=unit)
 
 
 def _check_limits(

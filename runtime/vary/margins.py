@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.spectrum import finite
+from apc.finite_equations import finite_equations
 from apc.frame.names import Free, named_times, parameter_of
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator
 from apc.vary.crossings import scan_lines
 from apc.vary.delays import delay_now

@@ -26,12 +26,12 @@ from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
 from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.eigen.rigid import find_rigid_modes
+from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.trouble import finite_equations
 from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.batch import slope_errors as slope_errors_of
 from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters

@@ -172,7 +172,7 @@ def speed(judge: Judge) -> None:
         )
 
 
-def crowds(numbers: list[int]) -> None:
+def populations(numbers: list[int]) -> None:
     """Many equal peers at 1 kHz, one of them recorded."""
     print("\nequal peers, forces every 1 ms, one peer recorded, one core")
     for number in numbers:
@@ -189,13 +189,13 @@ def crowds(numbers: list[int]) -> None:
 def main() -> None:
     """Print everything."""
     parser = parser_of("simulate", __doc__)
-    parser.add_argument("--quick", action="store_true", help="leave out the largest crowd")
+    parser.add_argument("--quick", action="store_true", help="leave out the largest population")
     given = parser.parse_args()
     judge = Judge(given.strict)
     with single_threaded():
         for check in (against_frame_map, against_events, growth, drag, speed):
             check(judge)
-        crowds([100, 1000, 10**4] if given.quick else [100, 1000, 10**4, 10**5])
+        populations([100, 1000, 10**4] if given.quick else [100, 1000, 10**4, 10**5])
     judge.end()
 
 

@@ -1,10 +1,10 @@
 """Peers by the thousand, all different: the matrices of every one, without an object for each.
 
 Takes: a `CompiledSystem`, its numbers, Jacobians and schedules.
-Gives: `Crowd`, `crowds`, `some_rows`, `site_one`; `hear_themselves`, `hear_roughly`, `lines_of`;
+Gives: `Population`, `populations`, `some_rows`, `site_one`; `hear_themselves`, `hear_roughly`, `lines_of`;
 `state_names`, `turned_by`, `mode_of`.
-Guarantees: a crowd costs what its different peers cost in one array operation each, not in one Python call
-each; equal peers of a crowd are counted.
+Guarantees: a population costs what its different peers cost in one array operation each, not in one Python
+call each; equal peers of a population are counted.
 Does not: merge equal peers of different groups (see `peers`), or take sites that are not affine.
 """
 
@@ -35,7 +35,7 @@ Complexes = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Crowd:
+class Population:
     """The peers of one group of the scene, k different ones.
 
     `group` is its place in the scene; `parameters` (k, n_p) and `lifted` are the different peers', `rows`
@@ -56,12 +56,12 @@ class Crowd:
         return any(sending.link == link for sending in self.jacobians.kind.sends)
 
 
-def crowds(
+def populations(
     system: CompiledSystem,
     jacobians: Sequence[SiteJacobians],
     schedules: Sequence[Schedule],
     numbers: Numbers,
-) -> tuple[Crowd, ...]:
+) -> tuple[Population, ...]:
     """Linearize and lift all different peers of a system.
 
     Parameters
@@ -81,7 +81,7 @@ def crowds(
         lifted = lift_rows(site, schedule, linearize_rows(site, parameters))
         rows = numbers.rows[place]
         counts = np.bincount(rows, minlength=len(parameters)).astype(np.float64)
-        found.append(Crowd(group.name, place, site, schedule, parameters, lifted, rows, counts))
+        found.append(Population(group.name, place, site, schedule, parameters, lifted, rows, counts))
     return tuple(found)
 
 
@@ -100,9 +100,11 @@ def _every_block(lifted: LiftedSite, change: Callable[[Floats], Floats]) -> Lift
     return replace(lifted, p=p, q=q, s=s, d=d, error=lifted.error.mapped(change))
 
 
-def site_one(crowd: Crowd, row: int) -> LinearSite:
+def site_one(population: Population, row: int) -> LinearSite:
     """Return the matrices of one of the different peers by itself."""
-    return site_of_row(crowd.jacobians, linearize_rows(crowd.jacobians, crowd.parameters[[row]])[0])
+    return site_of_row(
+        population.jacobians, linearize_rows(population.jacobians, population.parameters[[row]])[0]
+    )
 
 
 def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> StateSpace:
@@ -185,10 +187,10 @@ def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:
     return now, before, int(starts[-1])
 
 
-def state_names(crowd: Crowd) -> list[str]:
+def state_names(population: Population) -> list[str]:
     """Return the names of a peer's state, z and then the packets on their way."""
-    waiting = zip(crowd.schedule.sent_names, crowd.schedule.depths, strict=True)
-    return [*crowd.lifted.z_names, *(name for name, depth in waiting for _ in range(depth))]
+    waiting = zip(population.schedule.sent_names, population.schedule.depths, strict=True)
+    return [*population.lifted.z_names, *(name for name, depth in waiting for _ in range(depth))]
 
 
 def turned_by(

@@ -1,6 +1,6 @@
 """The symbols of variables and of their time derivatives, both ways, and differentiation by them.
 
-Takes: names of variables, and which of them are others' derivatives. Gives: `Jet`, `Jets`.
+Takes: names of variables, and which of them are others' derivatives. Gives: `Derivative`, `Derivatives`.
 Guarantees: one symbol for each derivative of each variable.
 Does not: choose states (see `index`).
 """
@@ -19,10 +19,10 @@ from apc.compiler.equations.symbolic import (
 )
 
 TIME = symbol("time")
-Jet = tuple[str, int]  # a variable and how often it is differentiated
+Derivative = tuple[str, int]  # a variable and how often it is differentiated
 
 
-class Jets:
+class Derivatives:
     """The symbols of variables and of their derivatives, `x`, `der(x)`, `der(der(x))`, both ways.
 
     `velocities` gives derivatives their own names: with {x: v} they are `x`, `v`, `der(v)`, and v is no
@@ -35,25 +35,25 @@ class Jets:
         velocities = velocities or {}
         derived = set(velocities.values())
         self.names = [name for name in names if name not in derived]
-        self._jets: dict[sympy.Symbol, Jet] = {}
+        self._derivatives: dict[sympy.Symbol, Derivative] = {}
         self._named: dict[str, int] = {}
         for name in self.names:
-            self._jets[symbol(name)] = (name, 0)
+            self._derivatives[symbol(name)] = (name, 0)
             own, order = name, 0
             while own in velocities:
                 own, order = velocities[own], order + 1
-                self._jets[symbol(own)] = (name, order)
+                self._derivatives[symbol(own)] = (name, order)
                 self._named[name] = order
-        self._symbols = {jet: s for s, jet in self._jets.items()}
+        self._symbols = {derivative: s for s, derivative in self._derivatives.items()}
         self._jumping = {symbol(name) for name in jumping}
 
-    def renamed(self, names: Iterable[str], velocities: Mapping[str, str]) -> Jets:
-        """Return the jets of some of the variables, where `velocities` name derivatives."""
-        kept = Jets(names, (), velocities)
+    def renamed(self, names: Iterable[str], velocities: Mapping[str, str]) -> Derivatives:
+        """Return the derivatives of some of the variables, where `velocities` name derivatives."""
+        kept = Derivatives(names, (), velocities)
         kept._jumping = self._jumping
         for name, order in self._symbols:
-            if symbol(name) in kept._jets:
-                root, first = kept._jets[symbol(name)]
+            if symbol(name) in kept._derivatives:
+                root, first = kept._derivatives[symbol(name)]
                 kept.symbol(root, first + order)
         return kept
 
@@ -71,14 +71,14 @@ class Jets:
         known = self._symbols.get((name, order))
         if known is None:
             known = derivative_symbol(self.symbol(name, order - 1).name) if order else symbol(name)
-            self._jets[known] = (name, order)
+            self._derivatives[known] = (name, order)
             self._symbols[name, order] = known
         return known
 
-    def jets(self, expression: sympy.Expr) -> dict[sympy.Symbol, Jet]:
+    def derivatives(self, expression: sympy.Expr) -> dict[sympy.Symbol, Derivative]:
         """Return the variables and derivatives an expression holds, in the order of their names."""
-        found = [s for s in expression.free_symbols if s in self._jets]
-        return {s: self._jets[s] for s in sorted(found, key=str)}
+        found = [s for s in expression.free_symbols if s in self._derivatives]
+        return {s: self._derivatives[s] for s in sorted(found, key=str)}
 
     def differentiate(self, expression: sympy.Expr) -> sympy.Expr:
         """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""
@@ -87,7 +87,7 @@ class Jets:
     def _rate(self, s: sympy.Symbol) -> sympy.Expr:
         if s in self._jumping:
             raise NoDerivativeError(s.name, "a force that jumps at its ticks")
-        if s in self._jets:
-            name, order = self._jets[s]
+        if s in self._derivatives:
+            name, order = self._derivatives[s]
             return self.symbol(name, order + 1)
         return sympy.S.One if s == TIME else sympy.S.Zero

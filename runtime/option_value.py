@@ -1,6 +1,6 @@
 """Quantities given to an option of the command line.
 
-Takes: an option's name and its text. Gives: `given`.
+Takes: an option's name and its text. Gives: `option_value`.
 Guarantees: what is wrong is told at the option, with the words to write there.
 Does not: know any option.
 """
@@ -13,7 +13,7 @@ from fractions import Fraction
 from apc.compiler.errors import ApcError, Place
 
 
-def given(option: str, text: str, *, what: str, unit: str) -> Fraction:
+def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
     """Read the quantity given to an option, in SI.
 
     Parameters

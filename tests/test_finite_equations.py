@@ -7,7 +7,7 @@ import math
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.trouble import finite_equations
+from apc.finite_equations import finite_equations
 
 
 def test_an_equation_without_a_value_is_one_mistake() -> None:
