@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from apc.compiler.cache import DAMAGE, LARGEST, SUFFIX, Archive, changed, read_archive, record_of
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, check_file, check_target, read_file, same_file
+from apc.compiler.files import RefusedError, check_file, check_target, is_special, read_file, same_file
 from apc.suffixes import written
 
 if TYPE_CHECKING:
@@ -149,13 +149,16 @@ def check_model_name(topology: Path) -> None:
         E617 another topology's model has the same name; E601 of that name is a device or pipe, which whoever
         packed the folder put there, or a link to what is no compiled model.
     """
+    if not topology.name:
+        return  # "." or "/": a folder, which whoever reads it says
     model = topology.with_suffix(".apc")
     try:
         check_file(model, LARGEST)
     except RefusedError as refused:
         if refused.why == "special":
             raise _not_written(model, f"it {refused.words}") from None
-    if model.is_symlink() and Path(os.path.realpath(model)).suffix != model.suffix:
+    # `Path.is_symlink` raises for a name that is too long, which whoever reads the topology says.
+    if os.path.islink(model) and Path(os.path.realpath(model)).suffix != model.suffix:  # noqa: PTH114 -- see above
         raise _not_written(model, "it is a link to what is no compiled model")
     for suffix in YAML_SUFFIXES:
         other = topology.parent / f"{topology.stem}{suffix}"
@@ -205,12 +208,14 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
     ApcError
         E601 one of them can't be written; E616 one is read, or given twice.
     """
-    named = [path, path.with_suffix(".yaml"), *(path.parent / text for text in texts)]
+    named = [path, path.parent / f"{path.stem}.yaml", *(path.parent / text for text in texts)]
     given = [(option, output) for option, output in outputs.items() if output is not None]
     for place, (option, output) in enumerate(given):
         check_target(output)
         hint = written(option, output.with_name(f"{output.stem}-result{output.suffix}"))
         for other, before in given[:place]:
+            if is_special(output):
+                continue  # a device or pipe takes what both write
             if output.absolute() == before.absolute() or same_file(output, before):
                 what = f"is given to {other} and to {option}: the second would replace the first"
                 raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))

@@ -408,3 +408,9 @@ def test_from_python_the_line_to_write_is_python(folder: Path) -> None:
     assert told(lambda: apc.sweep("scene.yaml", over, out="users.csv")) == [
         'users.csv: E616 is read by this command: out would replace it. Write: out="users-result.csv"'
     ]
+
+
+def test_two_outputs_may_be_one_device(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["simulate", "scene.yaml", "--duration", "10 ms", "--plot", "/dev/null", "--still", "/dev/null"]
+    assert run(words) == 0, capsys.readouterr().err
+    assert Path("/dev/null").is_char_device()

@@ -13,6 +13,7 @@ import mpmath
 import numpy as np
 import pytest
 
+from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
 from apc.frame.parameters import resolve
@@ -181,3 +182,9 @@ def test_a_force_that_crosses_zero_is_not_halved_in_vain(monkeypatch: pytest.Mon
     monkeypatch.setattr(forcings, "panels", pytest.fail)
     found = impulses(site, starts, np.zeros(len(starts), np.int64))
     assert (np.abs(found) < 1e-8).all()
+
+
+def test_a_force_that_changes_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forcings, "MOST_HALVED", 1000)
+    with pytest.raises(ApcError, match=r"E871 a force changes too fast: .* more than 1,000 places"):
+        moved(tmp_path, "type: SineForce, force: 1 N, frequency: 1e9 Hz", "1/10")

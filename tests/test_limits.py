@@ -124,6 +124,12 @@ def test_what_moves_together_has_a_limit_and_what_is_apart_has_none(monkeypatch:
         discretize(np.full((4, 4), Fraction(1)), np.ones((4, 1)), [Fraction(1)])
 
 
+def test_the_states_of_a_peer_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(discretizing, "moved_together", lambda _: pytest.fail("it is looked at"))
+    with pytest.raises(ApcError, match=r"E812 one peer has 401 states, and 400 are the most"):
+        discretize(np.zeros((401, 401)), np.ones((401, 1)), [Fraction(1)])
+
+
 def test_states_move_together_where_one_enters_the_rate_of_another() -> None:
     rates = np.zeros((6, 6))
     rates[0, 3] = rates[3, 5] = rates[1, 1] = rates[4, 2] = 1

@@ -22,6 +22,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of
 from apc.simulation.propagate import Rates
@@ -31,6 +32,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 MOST_HALVINGS = 30  # below 1e-9 of an interval, what a jump is missed by is far below a rounding
+MOST_HALVED = 2**18  # panels of the intervals of one chunk: some seconds; a jump in an interval takes sixty
 MOST_PANELS = 256  # integrated at once: what is held of them stays within some MB, however many there are
 # Instants of one walk: the arrays it holds then stay in the cache of a processor.
 MOST_INSTANTS = 8192
@@ -152,6 +154,7 @@ def _impulses_of_length(site: SiteForcing, kernel: Kernel, starts: Floats) -> Fl
         return total
     total[off] = 0.0
     work = [(*_between(np.flatnonzero(off), rows, at, float(kernel.duration)), 0)]
+    halved = 0
     while work:
         rows, low, high, halvings = work.pop()
         if len(rows) > MOST_PANELS:
@@ -162,11 +165,23 @@ def _impulses_of_length(site: SiteForcing, kernel: Kernel, starts: Floats) -> Fl
         off &= halvings < MOST_HALVINGS
         np.add.at(total, rows[~off], added[~off])
         if off.any():
+            halved += int(off.sum())
+            if halved > MOST_HALVED:
+                raise _too_fast(starts, kernel)
             rows, low, high = rows[off], low[off], high[off]
             middle = (low + high) / 2
             halves = np.tile(rows, 2), np.append(low, middle), np.append(middle, high)
             work.append((*halves, halvings + 1))
     return total
+
+
+def _too_fast(starts: Floats, kernel: Kernel) -> ApcError:
+    begin, end = float(starts.min()), float(starts.max() + kernel.duration)
+    what = (
+        f"a force changes too fast: from {begin:.6g} s to {end:.6g} s it would be looked at in more than "
+        f"{MOST_HALVED:,} places"
+    )
+    return ApcError(Mistake("E871", Place("simulation"), what, hint="a lower frequency, or a constant force"))
 
 
 def _integrated(

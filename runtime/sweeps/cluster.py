@@ -60,13 +60,14 @@ def cluster_workers(
     for logger in loggers:
         logger.setLevel(logging.CRITICAL + 1)
     try:
+        certificate = distributed.Security().get_connection_args("client").get("ssl_context")
+        if address.startswith("tls://") and certificate is None:  # a client without one never ends well
+            what = "Dask has no certificate for it (distributed.comm.tls in its own configuration)"
+            raise ApcError(Mistake("E888", place, what, hint=form))
         try:
             client = distributed.Client(address, timeout=PATIENCE_S, set_as_default=False)
         except (OSError, ValueError) as error:
             what = f"no Dask scheduler answers there within {PATIENCE_S} s"
-            raise ApcError(Mistake("E888", place, what, hint=form)) from error
-        except (TypeError, RuntimeError) as error:  # what it says of an address it can't be asked at
-            what = "Dask has no certificate for it (distributed.comm.tls in its own configuration)"
             raise ApcError(Mistake("E888", place, what, hint=form)) from error
         with client:
             try:
