@@ -20,4 +20,6 @@ def users_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep what apc keeps for a user in a folder of this process, and not among the user's own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        # Nothing is said of how far work is, however long it takes.
+        patch.setattr("apc.cli.progress.QUIET", float("inf"))
         yield

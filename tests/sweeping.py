@@ -18,9 +18,13 @@ couplers:
 """
 
 
+# However long it takes, it says nothing of how far it is.
+SILENT = "from apc.__main__ import main; from apc.cli import progress; progress.QUIET = float('inf'); main()"
+
+
 def start(folder: Path, *words: str) -> subprocess.Popen[str]:
     """Start `apc sweep` in a folder."""
-    command = [sys.executable, "-m", "apc", "sweep", *words]
+    command = [sys.executable, "-c", SILENT, "sweep", *words]
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -28,8 +32,10 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
 _WAITING = """\
 import signal, sys, time
 from apc.__main__ import run
+from apc.cli import progress
 from apc.sweeps.store import Parts
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell starts in the background
+progress.QUIET = float('inf')
 kept, write = [], Parts.write
 
 def write_and_wait(*arguments):

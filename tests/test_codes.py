@@ -64,7 +64,7 @@ E327 compiler/language: a number stands where a condition is due, or the other w
 E328 compiler/language: an expression is too long or nested too deep
 E329 compiler/language: an equation has not just one =
 E330 compiler/language: a name has no value in an expression of numbers
-E331 compiler/language runtime/frame: an expression has no finite value
+E331 compiler compiler/language runtime/frame: an expression has no finite value
 E332 compiler/language: a parameter would follow what changes
 E401 compiler/language: the sides of an equation differ in unit
 E402 compiler/language: the terms of a sum differ in unit
@@ -83,7 +83,7 @@ E509 compiler/equations: what rigid joints hold can't be determined
 E510 compiler/equations: a state has no start value
 E511 compiler/equations: equations that depend on one another leave their unknowns open
 E512 compiler/equations: a constant is no number
-E601 compiler runtime/cli runtime/sweeps: a file can't be written
+E601 compiler runtime: a file can't be written
 E602 compiler: a compiled model can't be read
 E603 compiler: a compiled model is of another format version
 E604 compiler: a compiled model is damaged
@@ -107,7 +107,7 @@ E703 compiler/language: a cell or row of a table is wrong
 E801 runtime/frame: an operator runs over nobody
 E802 runtime/frame: the weights of a mean add up to nothing
 E803 runtime/eigen: an operator over equal peers has no linearization
-E804 runtime/eigen: a matrix would be too large, or what is equal is not linear
+E804 runtime/eigen runtime/vary: a matrix would be too large, or what is equal is not linear
 E805 runtime/frame: a frame is too long to be taken apart
 E806 runtime/analysis runtime/frame: numbers leave the range of floats
 E807 runtime/frame: an operator over the others has no linearization inside a loop
@@ -146,9 +146,9 @@ E883 runtime/cli runtime/sweeps: a sweep has nothing, too much or the same thing
 E884 runtime/sweeps: a sweep can't compute what is asked of it
 E885 runtime/sweeps: other work stands where a sweep keeps its parts
 E886 runtime/regions: a published condition is written wrong
-E887 runtime: a table has another format than can be written here
+E887 runtime: a table needs a library that is not installed
 E888 runtime/sweeps: a cluster can't compute
-E889 runtime/cli runtime/sweeps: processes can't compute, or not for ever
+E889 runtime runtime/cli runtime/sweeps: processes can't compute, or not for ever
 E891 runtime/network: a link's law of packets can't differ by group
 E892 runtime/network: too many ways with packets of their own
 E893 runtime/simulation: a missing value has no own one to stand in for it
@@ -162,7 +162,6 @@ E904 runtime/regions: a point lies outside a region
 E905 runtime/regions: a region has points that can't be analysed
 E906 runtime/regions: there is no one effective gain to compare at
 E907 runtime/cli runtime/regions: the panels of a region are written wrong
-E908 runtime/present: a region has another format than can be written
 E910 runtime/simulation: a method to play by is not known
 E911 runtime/simulation: a method's step is none
 E912 runtime/simulation: a method's tolerance is none

@@ -21,6 +21,7 @@ def test_what_is_no_terminal_sees_nothing_of_short_work(capsys: pytest.CaptureFi
 def test_what_is_no_terminal_sees_a_line_now_and_then_of_long_work(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(progress, "QUIET", 10.0)
     clock = iter([0.0, 5.0, 11.0, 15.0, 23.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
     with status_line() as told:

@@ -59,7 +59,7 @@ def test_components_that_double_at_every_level_are_refused_at_once(tmp_path: Pat
     parts = {f"nest{level}.yaml": nested(level) for level in range(25)}
     message = refusal(tmp_path, "  n: {type: Nest24}\n", parts)
     assert "E216" in message
-    assert "more than 10 deep" in message
+    assert "1000 are the most" in message
 
 
 def test_an_array_of_composites_beyond_the_limit_is_refused(tmp_path: Path) -> None:
