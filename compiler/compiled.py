@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 PEERS = "peers"  # the parameter that holds the number of peers
 LARGEST_COUNT = 10**9  # of peers in one group
+MOST_GROUPS = 1000  # of a scene: who hears whom is worked out for each two of them
 COUNT = "count("  # how those begin that hold how many peers are heard over a link, see `count_of`
 
 

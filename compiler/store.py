@@ -47,6 +47,7 @@ from apc.compiler.cache import (
 )
 from apc.compiler.compiled import (
     LARGEST_COUNT,
+    MOST_GROUPS,
     CompiledSystem,
     Formula,
     Graph,
@@ -156,6 +157,7 @@ def _is_consistent(system: CompiledSystem) -> bool:
         and all(link.clock in clocks for link in system.links)
         and all({pair.sender, pair.receiver} <= groups for link in system.links for pair in link.delays)
         and all(0 <= group.kind < len(system.kinds) for group in system.groups)
+        and len(system.groups) <= MOST_GROUPS
         and all(1 <= group.count <= LARGEST_COUNT for group in system.groups)
         and all(column.values.shape == (group.count,) for group in system.groups for column in group.columns)
         and all(np.isfinite(column.values).all() for group in system.groups for column in group.columns)

@@ -170,6 +170,9 @@ def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> s
     ticks = max(sum(schedule.ticks) for schedule in prepared.schedules)
     if ticks > MOST_TICKS:
         return f"not looked for: {ticks:,} ticks in a frame take too long"
+    packets = max(len(schedule.heard) for schedule in prepared.schedules)
+    if packets > MOST_TICKS:
+        return f"not looked for: {packets:,} packets heard in a frame take too long"
     for kind in system.kinds:
         if len(kind.parameters) * len(kind.states) ** 2 > MOST_ENTRIES:
             what = f"{len(kind.parameters):,} numbers of {len(kind.states):,} states take too long"

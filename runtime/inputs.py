@@ -209,6 +209,10 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
         E601 one of them can't be written; E616 one is read, or given twice.
     """
     named = [path, path.parent / f"{path.stem}.yaml", *(path.parent / text for text in texts)]
+
+    def read(file: Path) -> bool:
+        return file.is_file() and any(same_file(file, one) or _is_below(file, one) for one in named)
+
     given = [(option, output) for option, output in outputs.items() if output is not None]
     for place, (option, output) in enumerate(given):
         check_target(output)
@@ -219,11 +223,11 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
             if output.absolute() == before.absolute() or same_file(output, before):
                 what = f"is given to {other} and to {option}: the second would replace the first"
                 raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
-        if not output.is_file():
-            continue
-        if any(same_file(output, one) or _is_below(output, one) for one in named):
-            what = f"is read by this command: {option.removesuffix('=')} would replace it"
-            raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
+        # Beside a CSV file of rows stands what made them, see `present.recording`.
+        for file in (output, output.with_name(f"{output.name}.json")):
+            if read(file):
+                what = f"is read by this command: {option.removesuffix('=')} would replace it"
+                raise ApcError(Mistake("E616", Place(str(file)), what, hint=hint))
 
 
 def _is_below(file: Path, folder: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -414,3 +415,23 @@ def test_two_outputs_may_be_one_device(folder: Path, capsys: pytest.CaptureFixtu
     words = ["simulate", "scene.yaml", "--duration", "10 ms", "--plot", "/dev/null", "--still", "/dev/null"]
     assert run(words) == 0, capsys.readouterr().err
     assert Path("/dev/null").is_char_device()
+
+
+def test_what_is_written_beside_an_output_is_no_input_either(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pressed = "hands: {h: {type: TableForce, flange: device, force: run.csv.json}}\n"
+    Path("scene.yaml").write_text(AVERAGE + pressed, encoding="utf-8")
+    Path("run.csv.json").write_text("time [s],force [N]\n0,0\n1,1\n", encoding="utf-8")
+    assert run(["simulate", "--duration", "20 ms", "--no-jit", "--out", "run.csv"]) == 1
+    assert "run.csv.json: E616 is read by this command" in capsys.readouterr().err
+    assert Path("run.csv.json").read_text(encoding="utf-8").startswith("time [s]")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere every name is a text")
+def test_a_scene_whose_name_is_no_text_is_simulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    name = os.fsdecode(b"b\xff.yaml")
+    Path(name).write_text(AVERAGE, encoding="utf-8")
+    assert run(["simulate", name, "--duration", "20 ms", "--no-jit", "--out", f"{name}.csv"]) == 0

@@ -12,7 +12,7 @@ from apc import answer as answering
 from apc.analysis.analysis import lifted_groups
 from apc.analysis.selfcheck import check_frame
 from apc.answer import answer
-from apc.api import simulate
+from apc.api import analyze, simulate
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.language import tables
 from apc.compiler.language.recordings import read_time_table, read_trace
@@ -268,3 +268,18 @@ def test_a_force_that_has_no_value_from_some_instant_on_ends_the_run_there(tmp_p
     ran = simulate(compile_topology(tmp_path / "scene.yaml"), duration="20 ms", jit=False)
     assert ran.time[-1] == pytest.approx(0.01)
     assert np.isfinite(ran.values).all()
+
+
+def test_packets_in_a_frame_and_groups_have_a_limit_that_is_told_at_once() -> None:
+    beside = ("haptic: 1 ms", "haptic: 1/2003 s"), ("network: 8 ms", "network: 1/1999 s")
+    [message] = told(analyze, compiled(replaced(AVERAGE, *beside)))
+    assert "E805 3,998 packets of one peer in a frame, and 1000 are the most that are analysed" in message
+    groups = "".join(f"  g{i}: {{count: 1}}\n" for i in range(1001))
+    [message] = told(compiled, replaced(AVERAGE, ("  user: {count: 3}\n", groups)))
+    assert "E208 peers wants at most 1000 groups, got 1,001" in message
+
+
+def test_different_peers_are_counted_before_a_number_is_kept_of_each() -> None:
+    groups = "".join(f"  g{i}: {{count: 1000000000, set: {{device.mass: {i + 1} kg}}}}\n" for i in range(300))
+    [message] = told(analyze, compiled(replaced(AVERAGE, ("  user: {count: 3}\n", groups))))
+    assert "E804 300,000,000,000 peers, some of whom differ, and 20,000,000 are the most of these" in message

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import LARGEST_COUNT
+from apc.compiler.compiled import LARGEST_COUNT, MOST_GROUPS
 from apc.compiler.components.component import Number, Option, Reference, Settable, Variable
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.evaluation import evaluate
@@ -88,6 +88,11 @@ def read_counts(
     section = read_mapping(node, "peers", mistakes, hint=hint)
     if section is not None and not section.entries:
         mistakes.add("E201", section.place, "peers names no group", hint=hint)
+    if section is not None and len(section.entries) > MOST_GROUPS:
+        got, expected = f"{len(section.entries):,}", f"at most {MOST_GROUPS} groups"
+        hint = "one group, {table: users.csv}, with a row a peer"
+        mistakes.add("E208", section.place, "peers", expected=expected, got=got, hint=hint)
+        return found
     for key, value in entries(section):
         name = read_name(key, "a group of peers", mistakes)
         body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{count: 3}}")

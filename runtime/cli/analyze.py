@@ -11,7 +11,11 @@ import click
 
 from apc.analysis.methods import AUTO, METHODS
 from apc.cli.options import json_option, print_result, set_option
+from apc.cli.progress import at_work
 from apc.threads import start_single_threaded
+
+# Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
+SECONDS_A_PEER = 1e-4
 
 
 @click.command("analyze")
@@ -74,5 +78,7 @@ def analyze_command(
         from apc.analysis.box import parse_range
 
         ranges = [parse_range(system, text) for text in box]
-    found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)
+    listed = sum(group.count for group in system.groups if group.columns)
+    with at_work(f"analysing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
+        found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)
     print_result(found, as_json=as_json)

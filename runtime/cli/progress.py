@@ -1,6 +1,6 @@
 """What long work shows on a terminal while it goes on: a bar, or a line in words.
 
-Takes: how far the work is. Gives: `Bar`, `progress_bar`, `status_line`.
+Takes: how far the work is. Gives: `Bar`, `progress_bar`, `status_line`, `at_work`.
 Guarantees: all of it goes to stderr, and is gone from a terminal when the work ends, however it ends; what is
 no terminal is told of long work alone, in a line now and then.
 Does not: slow the work down: what draws a bar is loaded when one is shown.
@@ -8,8 +8,10 @@ Does not: slow the work down: what draws a bar is loaded when one is shown.
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -92,6 +94,40 @@ def status_line() -> Iterator[Callable[[str], None]]:
         yield write
     finally:
         write("")
+
+
+@contextmanager
+def at_work(title: str, *, about: float = 0.0) -> Iterator[None]:
+    """Say on stderr, while work of unknown length goes on, that it does: after `QUIET`, then ever rarer.
+
+    Parameters
+    ----------
+    title
+        What is being done, in a few words.
+    about
+        Seconds it will take, as far as is known: said first if it is long.
+    """
+    if about > QUIET:
+        sys.stderr.write(f"{visible(title)}: this may take {about:,.0f} s\n")
+    ended = threading.Event()
+
+    def watch() -> None:
+        gone = QUIET
+        while not ended.wait(gone if gone == QUIET else gone / 2):
+            sys.stderr.write(f"{visible(title)}: at work for {gone:,.0f} s\n")
+            sys.stderr.flush()
+            gone *= 2
+
+    # Never longer than the work: a thread that only waits.
+    watching = threading.Thread(target=watch, daemon=True) if math.isfinite(QUIET) else None
+    if watching is not None:
+        watching.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        if watching is not None:
+            watching.join()
 
 
 def _now_and_then() -> Callable[[Callable[[], str]], None]:

@@ -22,6 +22,7 @@ from apc.frame.lift import (
     FrameMap,
     LiftedSite,
     bounded,
+    check_packets,
     compose,
     named,
     roundings_of,
@@ -68,6 +69,7 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedSi
     with the roundings it reports. Where stiffness and damping nearly cancel over many ticks that grows
     without measure, whatever the errors are: beyond `HOPELESS` they are estimated, see `_perturbed`.
     """
+    check_packets(schedule)
     parts: list[tuple[FrameMap, FrameMap]] = []
     estimated = False
     for start in range(0, len(rows), CHUNK):

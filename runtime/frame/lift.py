@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import UNIT, Step, discretize
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.site import LinearSite, magnitudes
@@ -32,6 +33,9 @@ Matrix = NDArray[Any]
 # Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
 # short polynomials of the parameters, a few roundings an entry.
 COEFFICIENT_ROUNDINGS = 8
+
+# Packets that a peer sends or hears in a frame, each a row or column of the frame's map and of the loop's.
+MOST_PACKETS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +90,20 @@ def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = Non
         The site's matrices in rationals, whose exponentials are taken; without it, those of `site` count as
         exact.
     """
+    check_packets(schedule)
     durations = step_durations(schedule)
     exact = site if exact is None else exact
     found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
     return named(site.kind, schedule, *bounded(site, schedule, dict(zip(durations, found, strict=True))))
+
+
+def check_packets(schedule: Schedule) -> None:
+    """Refuse a frame in which a site sends or hears too many packets: ApcError E805."""
+    most = max(len(schedule.sent), len(schedule.heard))
+    if most > MOST_PACKETS:
+        what = f"{most:,} packets of one peer in a frame, and {MOST_PACKETS} are the most that are analysed"
+        hint = "periods of clocks that are simple multiples of one another"
+        raise ApcError(Mistake("E805", Place("the scene"), what, hint=hint))
 
 
 def step_durations(schedule: Schedule) -> list[int]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Closed, Feedback, StateLayout, close, closing_errors, lay_out
 from apc.eigen.spectrum import Mode, oscillation
 from apc.frame.batch_lift import CHUNK, lift_rows
@@ -32,6 +33,10 @@ from apc.large.transfer import StateSpace
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Complexes = NDArray[np.complex128]
+
+
+# Peers of all groups where some differ: a number is kept of each, some hundred megabytes of so many.
+MOST_DIFFERENT = 2 * 10**7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +80,9 @@ def populations(
     numbers
         The parameters and timings.
     """
+    if sum(map(len, numbers.rows)) > MOST_DIFFERENT:
+        what = f"{system.peers:,} peers, some of whom differ, and {MOST_DIFFERENT:,} are the most of these"
+        raise ApcError(Mistake("E804", Place(system.name), what, hint="smaller counts"))
     found = []
     for place, (group, schedule) in enumerate(zip(system.groups, schedules, strict=True)):
         site, parameters = jacobians[group.kind], numbers.parameters[place]

@@ -119,7 +119,7 @@ def provenance_of(simulation: Simulation) -> Provenance:
     texts = "\n".join(f"{name} {digest}" for name, digest in system.origin.texts)
     return Provenance(
         topology=system.name,
-        texts=hashlib.sha256(texts.encode()).hexdigest(),
+        texts=hashlib.sha256(texts.encode("utf-8", "surrogateescape")).hexdigest(),
         duration_s=str(simulation.settings.duration),
         method=simulation.how,
         tolerances=simulation.tolerances,

@@ -51,7 +51,7 @@ class Parts:
     def write(self, part: int, rows: tuple[Row, ...]) -> None:
         """Keep the rows of a part. Raises ApcError E601 if they can't be written."""
         document = {"sweep": self.sweep, "part": part, "rows": rows}
-        body = json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
+        body = json.dumps(document, allow_nan=False).encode()
         digest = hashlib.sha256(body).hexdigest().encode()
         write_file(self._path(part), lambda path: _fill(path, digest + b"\n" + body))
 
@@ -95,7 +95,7 @@ def open_parts(target: Path, description: Mapping[str, Any]) -> Iterator[Parts]:
         sweep, or a process works on it.
     """
     folder = target.with_name(target.name + SUFFIX)
-    whole = json.dumps({**_MARK, **description}, ensure_ascii=False, indent=1)
+    whole = json.dumps({**_MARK, **description}, indent=1)
     _remove(_finished(target))  # what a process left that was killed while it tidied up
     lock = _locked(folder, whole)
     try:
