@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,7 +56,12 @@ def find_input(*, compiled_too: bool) -> Path:
         )
     listed = ", ".join(str(path) for path in candidates[:10]) + (", …" if len(candidates) > 10 else "")
     raise ApcError(
-        Mistake("E611", place, f"holds {len(candidates)} scenes: {listed}", hint=f"apc … {candidates[0]}")
+        Mistake(
+            "E611",
+            place,
+            f"holds {len(candidates)} scenes: {listed}",
+            hint=f"apc … {_as_word(candidates[0])}",
+        )
     )
 
 
@@ -169,6 +175,11 @@ def check_model_name(topology: Path) -> None:
 
 def _not_written(model: Path, why: str) -> ApcError:
     return ApcError(Mistake("E601", Place(str(model)), f"can't be written: {why}", hint=f"rm {model}"))
+
+
+def _as_word(path: Path) -> str:
+    """Return a path as a word of a command line, which is no option."""
+    return shlex.quote(f"./{path}" if str(path).startswith("-") else str(path))
 
 
 def _renaming(topology: Path) -> str:

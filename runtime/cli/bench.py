@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 
 from apc.cli.options import json_option, print_result, set_option, tell
+from apc.cli.progress import at_work
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target
@@ -90,7 +91,8 @@ def bench_command(
         check_target(plot)
         check_format(plot)
     system = open_scene(file, settings, {"--plot": plot})
-    found = bench(system)
+    with at_work("measuring"):
+        found = bench(system)
     print_result(found, as_json=as_json)
     if plot is not None:
         from apc.present.bench import save_bench

@@ -19,6 +19,7 @@ from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
 from apc.cli.critical import critical_command
 from apc.cli.options import beside, tell
+from apc.cli.progress import at_work
 from apc.cli.region import region_command
 from apc.cli.simulate import simulate_command
 from apc.cli.sweep import sweep_command
@@ -165,7 +166,8 @@ def compile_command(file: str | None, until: str, force: bool, timings: bool) ->
         tell(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
         return
     check_model_name(path)
-    _compile(path, timings=timings)
+    with at_work("compiling"):
+        _compile(path, timings=timings)
 
 
 def _compile(path: Path, *, timings: bool) -> None:

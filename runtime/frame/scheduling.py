@@ -9,6 +9,7 @@ Does not: look at numbers other than times.
 
 from __future__ import annotations
 
+import decimal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -134,9 +135,9 @@ def _check_held(
             f"and do not act yet; at most {MOST_HELD:,} can be analysed"
         )
         left = MOST_HELD - (number - held[longest])
-        fits = (
-            f"{longest}: {float(seconds * left / held[longest]):.3g} s, or a slower clock" if left > 0 else ""
-        )
+        three = decimal.Context(prec=3, rounding=decimal.ROUND_FLOOR)
+        most = float(three.create_decimal_from_float(float(seconds * left / held[longest])))
+        fits = f"{longest}: {most:g} s, or a slower clock" if left > 0 else ""
         hint = fits or "shorter delays of all forces, or a slower clock"
         raise ApcError(Mistake("E805", Place(system.name), what, hint=hint))
 
