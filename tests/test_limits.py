@@ -111,6 +111,17 @@ def test_delays_of_forces_are_refused_by_what_they_keep(monkeypatch: pytest.Monk
     ]
 
 
+@pytest.mark.parametrize("asked", ["10 s", "1285.71 ms", "1001 ms"])
+def test_the_delay_that_is_proposed_for_a_force_is_taken(asked: str) -> None:
+    def late(delay: str) -> list[str]:
+        return told(
+            check_frame, compiled(replaced(AVERAGE, ("haptic, delay: 1 ms}", f"haptic, delay: {delay}}}")))
+        )
+
+    [message] = late(asked)
+    assert late(message.split("Write: contact.delay: ")[1].split(",")[0]) == []
+
+
 def test_what_moves_together_has_a_limit_and_what_is_apart_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discretizing, "MOST_TOGETHER", 3)
     rates = np.array([[Fraction(-i - 1)] for i in range(4)])

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from apc.cli import progress
-from apc.cli.progress import progress_bar, status_line
+from apc.cli.progress import at_work, progress_bar, status_line
 
 
 def test_what_is_no_terminal_sees_nothing_of_short_work(capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,3 +61,27 @@ def test_a_bar_is_shown_once_the_work_takes_long(
         show(1, 4)
         show(3, 4)
     assert "of 4 points" in capsys.readouterr().err
+
+
+def test_long_work_of_unknown_length_says_that_it_goes_on(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[float] = []
+
+    def ended(seconds: float) -> bool:
+        waits.append(seconds)
+        return len(waits) == 3
+
+    monkeypatch.setattr(progress, "QUIET", 10.0)
+    progress._watch("analysing", ended)
+    said = "analysing: at work for 10 s\nanalysing: at work for 20 s\n"
+    assert (capsys.readouterr(), waits) == (("", said), [10.0, 10.0, 20.0])
+
+
+def test_what_may_take_long_is_said_first_and_nothing_of_what_may_not(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "QUIET", 1000.0)  # no machine is so busy that a second passes for these
+    with at_work("analysing", about=7500.0), at_work("compiling", about=75.0), at_work("measuring"):
+        pass
+    assert capsys.readouterr() == ("", "analysing: this may take 7,500 s\n")

@@ -109,25 +109,27 @@ def at_work(title: str, *, about: float = 0.0) -> Iterator[None]:
     """
     if about > QUIET:
         sys.stderr.write(f"{visible(title)}: this may take {about:,.0f} s\n")
+    if not math.isfinite(QUIET):
+        yield
+        return
     ended = threading.Event()
-
-    def watch() -> None:
-        gone = QUIET
-        while not ended.wait(gone if gone == QUIET else gone / 2):
-            sys.stderr.write(f"{visible(title)}: at work for {gone:,.0f} s\n")
-            sys.stderr.flush()
-            gone *= 2
-
     # Never longer than the work: a thread that only waits.
-    watching = threading.Thread(target=watch, daemon=True) if math.isfinite(QUIET) else None
-    if watching is not None:
-        watching.start()
+    watching = threading.Thread(target=_watch, args=(title, ended.wait), daemon=True)
+    watching.start()
     try:
         yield
     finally:
         ended.set()
-        if watching is not None:
-            watching.join()
+        watching.join()
+
+
+def _watch(title: str, ended: Callable[[float], bool]) -> None:
+    """Say now and then that work goes on, until `ended` says after some seconds that it doesn't."""
+    gone = QUIET
+    while not ended(gone if gone == QUIET else gone / 2):
+        sys.stderr.write(f"{visible(title)}: at work for {gone:,.0f} s\n")
+        sys.stderr.flush()
+        gone *= 2
 
 
 def _now_and_then() -> Callable[[Callable[[], str]], None]:
