@@ -45,7 +45,7 @@ HOUSE = (
         "apc.frame",
         """
         exact names parameters overrides
-        discretize exchange
+        discretize radius exchange
         site jacobians start linearize
         schedule liveness hyperperiod scheduling
         lift batch_lift course residues

@@ -87,7 +87,7 @@ def test_error_bounds_hold_the_true_matrices() -> None:
             with precision(200):
                 balls = frame_balls(family.exact_at(row.tolist())[place])
                 at = wiring.relative
-                reduced = relative(balls, replace(at, weights=at.weights.astype(object)), multiply=np.dot)
+                reduced = relative(balls, replace(at, weights=at.weights.astype(object)))
                 off = np.array([[abs(float((e - float(f)).mid()) if not isinstance(e, int) else e - f)
                                  for e, f in zip(a, b, strict=True)]
                                 for a, b in zip(reduced, found[place][k], strict=True)])  # fmt: skip

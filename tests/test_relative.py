@@ -40,7 +40,7 @@ def test_what_is_left_has_all_other_eigenvalues_of_one_matrix_of_many_and_of_fra
     np.testing.assert_array_equal(many, np.stack([left, left * 1j]))
     fractions = np.array([[Fraction(x) for x in row] for row in matrix.tolist()], dtype=object)
     weights = np.array([[Fraction(x) for x in row] for row in at.weights.tolist()], dtype=object)
-    exact = relative(fractions, Relative(at.held, at.rest, weights, at.doubt), multiply=np.dot)
+    exact = relative(fractions, Relative(at.held, at.rest, weights, at.doubt))
     np.testing.assert_allclose(exact.astype(float), left, rtol=1e-15)
     _, error = relative_bounded(matrix, np.zeros((3, 3)), at)
     assert (np.abs(exact.astype(float) - left) <= error).all() and error.max() < 1e-13

@@ -29,6 +29,7 @@ from apc.eigen.relative import Relative, relative
 from apc.frame.discretize import step_balls
 from apc.frame.exact import is_rational
 from apc.frame.lift import follow
+from apc.frame.radius import Arithmetic
 from apc.frame.schedule import Propagate, Schedule, Way
 from apc.frame.site import LinearSite, entrywise
 
@@ -195,6 +196,9 @@ def _multiply(matrix: Balls, rows: Balls) -> Balls:
     return product
 
 
+BALLS = Arithmetic(_multiply, np.add, np.subtract, lambda value: value.astype(object))
+
+
 def square(balls: Balls) -> Any:
     """Return an array of balls as a matrix of python-flint."""
     return flint.arb_mat(len(balls), len(balls), [flint.arb(entry) for entry in balls.ravel()])
@@ -223,7 +227,7 @@ def reduced_balls(matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: ND
     weights: Balls = np.empty(len(rest) * count, dtype=object)
     weights[:] = [rational_ball(Fraction(int(e.p), int(e.q))) for e in quotient.entries()]
     weights = weights.reshape(len(rest), count)
-    return relative(matrix, Relative(held, rest, weights, np.zeros(weights.shape)), multiply=_multiply)
+    return relative(matrix, Relative(held, rest, weights, np.zeros(weights.shape)), BALLS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,7 @@
 
 Takes: groups of equal peers, and what each weighs the packets of each other by.
 Gives: `Loop`, `Coupling`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`, `close_loop`; `Feedback`,
-`feedback_of`, `close`, `closing_errors`, `shift_packets`.
+`feedback_of`, `close`, `shift_packets`.
 Guarantees: the state holds, site by site, z and then the packets on their way, in order of row and age. The
 matrix of `close_loop` comes with a bound on its rounding error, entry by entry; `close` takes one system or
 many (k, …), real or complex.
@@ -25,6 +25,7 @@ from apc.eigen.graph_modes import Surd
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
+from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of
 from apc.frame.schedule import Schedule, Way
 
 Floats = NDArray[np.float64]
@@ -165,13 +166,7 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
     """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it."""
     lifted = [group.lifted for group in loop.sites]
     layout = lay_out_loop(loop)
-    closed = close(lifted, feedback_of(loop, layout, lambda weight, _: float(weight)), layout)
-    # The magnitudes, and these with their errors: those of the sites, and of the weights.
-    feedback = feedback_of(loop, layout, lambda weight, _: float(abs(weight)))
-    doubtful = feedback_of(loop, layout, lambda weight, doubt: float(abs(weight)) + doubt)
-    sizes = [site.mapped(np.abs) for site in lifted]
-    wide = [size.mapped(np.add, site.error) for size, site in zip(sizes, lifted, strict=True)]
-    error = closing_errors(sizes, wide, feedback, layout, doubtful=doubtful)
+    closed = close([site.bounded for site in lifted], feedback_of(loop, layout), layout, numbers=RADII)
     return ClosedSystem(
         name=loop.name,
         multiplicity=loop.multiplicity,
@@ -179,9 +174,9 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
         coupling=loop.coupling,
         frame_s=lifted[0].frame_s,
         layout=layout,
-        matrix=closed.matrix,
-        error=error.matrix,
-        heard=closed.heard,
+        matrix=value_of(closed.matrix),
+        error=radius_of(closed.matrix),
+        heard=tuple(map(value_of, closed.heard)),
         motion=tuple(
             offset + place
             for site, offset in zip(lifted, layout.offsets, strict=True)
@@ -194,7 +189,7 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """What a site hears, r = `now` s + `before` x.
+    """What a site hears, r = `now` s + `before` x, in floats or with their radii.
 
     s are the packets that all sites send in this frame, site by site; x is the state, and behind it, if
     `before` has more columns, what comes from outside.
@@ -204,9 +199,9 @@ class Feedback:
     before: Matrix  # (n_r, n)
 
     @property
-    def size(self) -> Feedback:
-        """The magnitudes of its weights."""
-        return Feedback(np.abs(self.now), np.abs(self.before))
+    def plain(self) -> Feedback:
+        """The weights without their radii."""
+        return Feedback(value_of(self.now), value_of(self.before))
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,37 +214,38 @@ class Closed:
     matrix: Matrix  # (n, n) or more columns
     heard: tuple[Matrix, ...]  # one a site
     sent: Matrix  # of all sites, one below the other
-    turns: int
 
 
-def feedback_of(
-    loop: Loop | ClosedSystem, layout: StateLayout, weigh: Callable[[Fraction, float], float]
-) -> list[Feedback]:
-    """Return what each site hears.
-
-    `weigh` makes a number of a weight and by how much it may be off.
-    """
+def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback]:
+    """Return what each site hears, each weight with the radius of its doubt and of its rounding."""
     row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in loop.sites]
     starts = np.cumsum([0] + [len(group.schedule.sent) for group in loop.sites])
     found = []
     for g, group in enumerate(loop.sites):
-        now = np.zeros((len(group.schedule.heard), starts[-1]))
-        before = np.zeros((len(group.schedule.heard), len(layout.names)))
+        now = np.zeros((2, len(group.schedule.heard), starts[-1]))
+        before = np.zeros((2, len(group.schedule.heard), len(layout.names)))
         for line, one in enumerate(group.schedule.heard):
             doubt = loop.doubts.get(one.way, 0.0)
             for h, weight in enumerate(loop.coupling[one.way][g]):
                 if weight == 0 and doubt == 0:
                     continue
-                row = row_of[h][one.sent]
+                row, known = row_of[h][one.sent], float(weight)
+                found_as = known, doubt + (UNIT * abs(known) if known != weight else 0.0)
                 if one.lag == 0:
-                    now[line, starts[h] + row] = weigh(weight, doubt)
+                    now[:, line, starts[h] + row] = found_as
                 else:
-                    before[line, layout.places[Packet(h, row, one.lag)]] = weigh(weight, doubt)
+                    before[:, line, layout.places[Packet(h, row, one.lag)]] = found_as
         found.append(Feedback(now, before))
     return found
 
 
-def close(maps: Sequence[FrameMap], feedback: Sequence[Feedback], layout: StateLayout) -> Closed:
+def close(
+    maps: Sequence[FrameMap],
+    feedback: Sequence[Feedback],
+    layout: StateLayout,
+    *,
+    numbers: Arithmetic = FLOATS,
+) -> Closed:
     """Close a loop, or many of one layout (k, …).
 
     Parameters
@@ -258,6 +254,8 @@ def close(maps: Sequence[FrameMap], feedback: Sequence[Feedback], layout: StateL
         Each site's, over real or complex numbers.
     layout
         The state's.
+    numbers
+        What all of them are of.
 
     Notes
     -----
@@ -274,41 +272,42 @@ def close(maps: Sequence[FrameMap], feedback: Sequence[Feedback], layout: StateL
     sent = np.zeros((*many, starts[-1], columns), dtype=number)
     for one, heard, own, place in zip(maps, feedback, rows, z, strict=True):
         sent[..., own, place] = one.s
-        sent[..., own, :] += one.d @ heard.before
-    turns, at_once = 0, any(heard.now.any() for heard in feedback)
+        sent[..., own, :] = numbers.add(sent[..., own, :], numbers.multiply(one.d, heard.before))
+    at_once = any(heard.now.any() for heard in feedback)
     if at_once:
         within = np.zeros((*many, starts[-1], starts[-1]), dtype=number)
         for one, heard, own in zip(maps, feedback, rows, strict=True):
-            within[..., own, :] = one.d @ heard.now
-        sent, turns = _sent_in_turn(within, sent)
+            within[..., own, :] = numbers.multiply(one.d, heard.now)
+        sent = _sent_in_turn(within, sent, numbers)
     matrix = np.zeros((*many, n, columns), dtype=number)
     received = []
     for one, heard, place in zip(maps, feedback, z, strict=True):
-        r = heard.now @ sent + heard.before if at_once else heard.before
+        r = numbers.add(numbers.multiply(heard.now, sent), heard.before) if at_once else heard.before
         received.append(r)
         matrix[..., place, place] = one.p
-        matrix[..., place, :] += one.q @ r
-    shift_packets(matrix, layout, lambda packet: sent[..., starts[packet.site] + packet.row, :])
-    return Closed(matrix, tuple(received), sent, turns)
+        matrix[..., place, :] = numbers.add(matrix[..., place, :], numbers.multiply(one.q, r))
+    shift_packets(matrix, layout, lambda packet: sent[..., starts[packet.site] + packet.row, :], numbers)
+    return Closed(matrix, tuple(received), sent)
 
 
-def _sent_in_turn(within: Matrix, alone: Matrix) -> tuple[Matrix, int]:
-    """Return (1 − D W₀)⁻¹ times what is sent without hearing anybody in this frame, and the turns it takes.
-
-    NaN where a part is.
-    """
+def _sent_in_turn(within: Matrix, alone: Matrix, numbers: Arithmetic) -> Matrix:
+    """Return (1 − D W₀)⁻¹ times what is sent without hearing anybody in this frame; NaN where a part is."""
     sent = term = alone
-    most = within.shape[-1]
-    for turns in range(most):
-        term = within @ term
+    for _ in range(within.shape[-1]):
+        term = numbers.multiply(within, term)
         if not term.any():
-            return sent, turns
-        sent = sent + term
+            return sent
+        sent = numbers.add(sent, term)
     assert not (np.isfinite(term) & (term != 0)).any(), "a packet is heard before it is sent"
-    return sent, most
+    return sent
 
 
-def shift_packets(matrix: Matrix, layout: StateLayout, sent: Callable[[Packet], Matrix]) -> None:
+def shift_packets(
+    matrix: Matrix,
+    layout: StateLayout,
+    sent: Callable[[Packet], Matrix],
+    numbers: Arithmetic = FLOATS,
+) -> None:
     """Write how packets grow older: the youngest of a row is what was `sent`, each other the one before it.
 
     Parameters
@@ -319,59 +318,12 @@ def shift_packets(matrix: Matrix, layout: StateLayout, sent: Callable[[Packet], 
         Its state's.
     sent
         Gives what was sent (…, columns).
+    numbers
+        What the matrix is of.
     """
+    one = numbers.exact(np.array(1))
     for packet, place in layout.places.items():
         if packet.lag == 1:
             matrix[..., place, :] = sent(packet)
         else:
-            matrix[..., place, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = 1
-
-
-def closing_errors(
-    size: Sequence[FrameMap],
-    wide: Sequence[FrameMap],
-    feedback: Sequence[Feedback],
-    layout: StateLayout,
-    *,
-    doubtful: Sequence[Feedback] | None = None,
-    times: int = 1,
-) -> Closed:
-    """Bound the errors of a closed loop, entry by entry: those of its sites and weights, and its rounding.
-
-    Parameters
-    ----------
-    size, wide
-        The magnitudes of the sites' maps, and these with their errors: what they close to differs by a bound
-        on the errors to all orders.
-    feedback, doubtful
-        The magnitudes of what each weighs, and these with their errors where they have any.
-    layout
-        The state's.
-    times
-        How many products stand for one.
-
-    Returns
-    -------
-    The bounds.
-    """
-    doubtful = feedback if doubtful is None else doubtful
-    bound, upper = close(size, feedback, layout), close(wide, doubtful, layout)
-    roundings = times * _closing_roundings(wide, doubtful, upper.turns)
-
-    def off(large: Matrix, small: Matrix) -> Matrix:
-        return np.asarray((large - small) + roundings * large)
-
-    heard = tuple(off(*pair) for pair in zip(upper.heard, bound.heard, strict=True))
-    return Closed(off(upper.matrix, bound.matrix), heard, off(upper.sent, bound.sent), upper.turns)
-
-
-def _closing_roundings(maps: Sequence[FrameMap], feedback: Sequence[Feedback], turns: int) -> float:
-    """Return how much closing a loop rounds, relative to its magnitudes.
-
-    A sum rounds as often as it has terms that are not zero, whatever the size of the whole.
-    """
-    listened = max(one.now.shape[-2] for one in feedback)
-    senders = max(int(np.count_nonzero(one.now, axis=-1).max(initial=0)) for one in feedback)
-    terms = max(one.p.shape[-1] for one in maps) + listened * (1 + senders)
-    turns = max(turns, *(one.s.shape[-2] for one in maps))
-    return float(4 * (terms + 2) * (1 + turns) * UNIT)
+            matrix[..., place, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = one

@@ -37,7 +37,7 @@ SMALL = 1e-2
 
 # A radius less certain than this, or than this part of it where it is above 1, is worth more work: other
 # splits, this many.
-WIDE = 1e-8
+WIDE = 1e-9
 SPLITS_TRIED = 8
 
 # Eigenvalues nearer to one another than this, relatively, are enclosed together: their own vectors are hardly

@@ -12,8 +12,7 @@ x_r − W x_p move by themselves, by M_rr − W M_pr: that map has all other eig
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.frame.discretize import UNIT
+from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -41,25 +41,19 @@ class Relative:
     doubt: Floats
 
 
-def relative(
-    matrix: Matrix, at: Relative, *, multiply: Callable[[Matrix, Matrix], Matrix] = np.matmul
-) -> Matrix:
-    """Return M_rr − W M_pr of matrices (…, n, n) over any kind of number that `multiply` multiplies."""
+def relative(matrix: Matrix, at: Relative, numbers: Arithmetic = FLOATS) -> Matrix:
+    """Return M_rr − W M_pr of matrices (…, n, n) of some kind of number."""
     within = matrix[..., at.rest[:, None], at.rest]
-    return within - multiply(at.weights, matrix[..., at.held[:, None], at.rest]) if len(at.held) else within
+    if not len(at.held):
+        return within
+    return numbers.subtract(within, numbers.multiply(at.weights, matrix[..., at.held[:, None], at.rest]))
 
 
 def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matrix, Floats]:
     """Return M_rr − W M_pr of matrices (…, n, n) known up to an error, and a bound on what that is off by."""
-    found = relative(matrix, at)
-    within = error[..., at.rest[:, None], at.rest]
-    count = len(at.held)
-    if not count:
-        return found, within
-    below, size = error[..., at.held[:, None], at.rest], np.abs(at.weights)
-    large = np.abs(matrix[..., at.held[:, None], at.rest]) + below
-    off = within + at.doubt @ large + size @ below
-    return found, off + (PRODUCT_ROUNDINGS * (count + 2) * UNIT) * (size @ large + np.abs(found))
+    doubtful = replace(at, weights=with_radius(at.weights, at.doubt))
+    found = relative(with_radius(matrix, error), doubtful, RADII)
+    return value_of(found), radius_of(found)
 
 
 def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:

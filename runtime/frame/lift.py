@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import UNIT, Step, discretize
+from apc.frame.radius import FLOATS, RADII, Arithmetic, magnitude, radius_of, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
-from apc.frame.site import LinearSite, magnitudes
+from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
 
@@ -75,6 +76,11 @@ class LiftedSite(FrameMap):
     continuous: int  # the first so many entries of z are continuous states
     frame_s: float
     estimated: bool = False
+
+    @property
+    def bounded(self) -> FrameMap:
+        """The map with its errors as radii."""
+        return self.mapped(with_radius, self.error)
 
 
 def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = None) -> LiftedSite:
@@ -147,16 +153,21 @@ def bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> 
 
     Notes
     -----
-    Rounding: a sum of k products is off by at most γ_k = k·u/(1 − k·u) times the same sum of magnitudes
-    (Higham, Accuracy and Stability of Numerical Algorithms, section 3.1). The factors multiply along a
-    composition, so the whole frame is off by at most γ times the composition of the magnitudes, with the
-    roundings of every event added up. That bound holds whatever the scaling of the states.
+    Each coefficient carries its own roundings as a radius, and each event adds its own to these (see
+    `radius`). The bound holds whatever the scaling of the states.
     """
-    frame = compose(site, schedule, {duration: step.matrix for duration, step in steps.items()})
-    large = compose(magnitudes(site), schedule, {duration: step.size for duration, step in steps.items()})
-    roundings = roundings_of(site, schedule, steps)
-    gamma = roundings * UNIT / (1 - roundings * UNIT)
-    return frame, large.mapped(lambda size: gamma * size)
+    off = {
+        duration: with_radius(step.matrix, step.roundings * UNIT * step.size)
+        for duration, step in steps.items()
+    }
+    both = compose(with_roundings(site), schedule, off, numbers=RADII)
+    return both.mapped(value_of), both.mapped(radius_of)
+
+
+def with_roundings(site: LinearSite) -> LinearSite:
+    """Return a site's matrices with their radii, those of what CasADi rounds."""
+    charge = COEFFICIENT_ROUNDINGS * UNIT
+    return every_matrix(site, lambda matrix: with_radius(matrix, charge * magnitude(matrix)))
 
 
 def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:
@@ -173,7 +184,13 @@ def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]
     )
 
 
-def compose(site: LinearSite, schedule: Schedule, steps: Mapping[int, Matrix]) -> FrameMap:
+def compose(
+    site: LinearSite,
+    schedule: Schedule,
+    steps: Mapping[int, Matrix],
+    *,
+    numbers: Arithmetic = FLOATS,
+) -> FrameMap:
     """Follow z and r through one frame.
 
     Parameters
@@ -184,11 +201,17 @@ def compose(site: LinearSite, schedule: Schedule, steps: Mapping[int, Matrix]) -
         What happens in a frame.
     steps
         [F G] (n_x, n_x + n_u) by duration in quanta, or of many (k, …).
+    numbers
+        What these matrices are of.
     """
     n_z = len(site.kind.states) + len(schedule.carried)
-    unit = np.eye(n_z + len(schedule.heard))
+    unit = numbers.exact(np.eye(n_z + len(schedule.heard)))
     sent: dict[int, Matrix] = {}
-    course = follow(site, schedule, steps, unit[:n_z], lambda row: unit[n_z + row])
+
+    def hear(row: int) -> Matrix:
+        return unit[..., n_z + row, :]
+
+    course = follow(site, schedule, steps, unit[..., :n_z, :], hear, multiply=numbers.multiply)
     while True:
         try:
             row, packet = next(course)
@@ -240,13 +263,13 @@ def follow(
     z⁺ (n_z, columns).
     """
     n_x = len(site.kind.states)
-    nothing = np.zeros(start.shape[1], dtype=start.dtype)
-    value: dict[Value, Matrix] = {one: start[n_x + row] for row, one in enumerate(schedule.carried)}
-    many = np.broadcast_shapes(site.a.shape[:-2], *(step.shape[:-2] for step in steps.values()))
+    nothing = np.zeros((*start.shape[:-2], start.shape[-1]), dtype=start.dtype)
+    value: dict[Value, Matrix] = {one: start[..., n_x + row, :] for row, one in enumerate(schedule.carried)}
+    many = np.broadcast_shapes(*(one.shape[:-2] for one in (site.a, start, *steps.values())))
     number = np.result_type(start, site.a, *steps.values())
     # The continuous states above what the holds put out: a step multiplies both at once.
     acting = [nothing if one is None else value.get(one, nothing) for one in schedule.acting]
-    x = np.broadcast_to(start[:n_x].astype(number), (*many, n_x, start.shape[1]))
+    x = np.broadcast_to(start[..., :n_x, :].astype(number), (*many, n_x, start.shape[-1]))
     moving = _over(x, acting)
     sends = [np.concatenate([send.x, send.u], axis=-1) for send in site.sends]
     ticks = [np.concatenate([tick.x, tick.u, tick.m, tick.r], axis=-1) for tick in site.ticks]

@@ -2,7 +2,7 @@
 
 Takes: a kind, and matrices of floats, exact rationals, truth values or any other kind of number.
 Gives: `LinearSite`, `LinearTick`, `LinearSend`; `matrices_of`, `assemble`, `cut`; `every_matrix`,
-`entrywise`, `magnitudes`, `rational_floats`, `with_own_parts`.
+`entrywise`, `rational_floats`, `with_own_parts`.
 Guarantees: every matrix says what its rows and columns are, whatever kind of number it holds.
 Does not: compute a number of them (see `linearize`); keep offsets: constant forces move the equilibrium, not
 the spectrum.
@@ -118,11 +118,6 @@ def entrywise(site: LinearSite, change: Callable[[Any], Any], kind_of_number: ty
         entries[:] = [change(value) for value in matrix.ravel()]
         changed.append(entries.reshape(matrix.shape))
     return assemble(site.kind, site.affine, changed, channels)
-
-
-def magnitudes(site: LinearSite) -> LinearSite:
-    """Return the site with every entry replaced by its absolute value, a leading axis or none."""
-    return every_matrix(site, np.abs)
 
 
 def rational_floats(site: LinearSite) -> LinearSite:

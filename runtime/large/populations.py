@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import Closed, Feedback, StateLayout, close, closing_errors, lay_out
+from apc.eigen.closing import Closed, Feedback, StateLayout, close, lay_out
 from apc.eigen.spectrum import Mode, oscillation
 from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.course import turns
@@ -26,6 +26,7 @@ from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import LiftedSite
 from apc.frame.linearize import linearize_rows, site_of_row
 from apc.frame.parameters import Numbers
+from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite
 from apc.large.transfer import StateSpace
@@ -156,10 +157,9 @@ def _hear_themselves(
 ) -> tuple[Floats, ...]:
     """Close a chunk of sites, with the errors."""
     layout, feedback = _open_loop(lifted, schedule, own, others)
-    size = lifted.mapped(np.abs)
-    wide = size.mapped(np.add, lifted.error)
-    error = closing_errors([size], [wide], [feedback.size], layout)
-    return (*_cut(close([lifted], [feedback], layout)), *_cut(error))
+    heard = Feedback(rounded(feedback.now), rounded(feedback.before))
+    closed = close([lifted.bounded], [heard], layout, numbers=RADII)
+    return (*map(value_of, _cut(closed)), *map(radius_of, _cut(closed)))
 
 
 def _open_loop(

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Closed, ClosedSystem, close_loop, closing_errors
+from apc.eigen.closing import ClosedSystem, close, close_loop, feedback_of
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
@@ -37,10 +37,11 @@ from apc.frame.batch_lift import (
 from apc.frame.discretize import UNIT, Step
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import FrameMap, compose, lift, roundings_of
+from apc.frame.lift import FrameMap, compose, lift, roundings_of, with_roundings
 from apc.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
 from apc.frame.parameters import free_rows
+from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix
 from apc.vary.wiring import (
@@ -338,41 +339,26 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
     values
         The points (k, m).
 
-    Notes
-    -----
-    The composition of magnitudes and that of magnitudes with their errors differ by a bound on the error to
-    all orders, as in `closing.closing_errors`; the roundings of closing are added to it.
     """
     assert not evaluator.timed, "the errors of a step belong to its time"
-    plain = evaluator.lifted(values)
-    large: dict[tuple[int, int], FrameMap] = {}
-    wide: dict[tuple[int, int], FrameMap] = {}
+    bounded: dict[tuple[int, int], FrameMap] = {}
     for group in evaluator.groups:
         rows = linearize_rows(group.jacobians, evaluator.vectors(group, values))
-        one = lift_rows(group.jacobians, group.schedule, rows)
-        large[site_key(group)] = one.mapped(np.abs)
-        wide[site_key(group)] = large[site_key(group)].mapped(np.add, one.error)
+        bounded[site_key(group)] = lift_rows(group.jacobians, group.schedule, rows).bounded
     found = []
     for wiring in evaluator.wirings:
-        error = _closing_errors(wiring, large, wide).matrix
-        matrix = closed_loop(wiring, plain)
+        closed = _closed_bounded(wiring, bounded)
+        matrix, error = value_of(closed), radius_of(closed)
         _, own = relative_bounded(matrix, error, _relative_here(wiring, matrix, error))
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
 
 
-def _closing_errors(
-    wiring: Wiring,
-    size: Mapping[tuple[int, int], FrameMap],
-    wide: Mapping[tuple[int, int], FrameMap],
-    *,
-    times: int = 1,
-) -> Closed:
-    """Return `closing.closing_errors` of a system, from the magnitudes of its sites and these with errors."""
-    keys = [site_key(group) for group in wiring.system.sites]
-    feedback = [one.size for one in wiring.feedback]
-    sizes, wides = ([maps[key] for key in keys] for maps in (size, wide))
-    return closing_errors(sizes, wides, feedback, wiring.system.layout, times=times)
+def _closed_bounded(wiring: Wiring, maps: Mapping[tuple[int, int], FrameMap]) -> Matrices:
+    """Return the closed matrices (k, 2, n, n) of a system with their radii, from such maps of its sites."""
+    system = wiring.system
+    sites = [maps[site_key(group)] for group in system.sites]
+    return close(sites, feedback_of(system, system.layout), system.layout, numbers=RADII).matrix
 
 
 def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tuple[Floats, ...]:
@@ -387,27 +373,23 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
 
     Notes
     -----
-    A complex step whose every number is replaced by its magnitudes, of value and of slope, comes out as the
-    magnitudes of all that was added up on either way: both are off by the roundings of a frame times that.
-    Where that says nothing, it is estimated as in `batch_lift`.
+    A number with a complex step has a radius with one: what its value and what its slope is off by. Where the
+    slope's says nothing, it is estimated as in `batch_lift`.
     """
     assert not evaluator.timed, "the errors of a step belong to its time"
     complex_values = values + (STEP * 1j) * along
-    large: dict[tuple[int, int], FrameMap] = {}
-    wide: dict[tuple[int, int], FrameMap] = {}
+    bounded: dict[tuple[int, int], FrameMap] = {}
     for group in evaluator.groups:
         built, schedule = group.jacobians, group.schedule
         rows = evaluator.rows(built, evaluator.vectors(group, complex_values))
         here = lift_rows(built, schedule, rows.real[:1])
-        size, doubt = _moved_blocks(sites_of_rows(built, rows), schedule, evaluator.durations)
-        large[site_key(group)] = size
-        wide[site_key(group)] = size.mapped(lambda a, b, c: a + b + (STEP * 1j) * c, here.error, doubt)
+        frame, doubt = _moved_blocks(sites_of_rows(built, rows), schedule, evaluator.durations)
+        both = here.error.mapped(lambda a, b: a + (STEP * 1j) * b, doubt)
+        bounded[site_key(group)] = frame.mapped(with_radius, both)
     found = []
-    errors, plain = matrix_errors(evaluator, values), evaluator.lifted(complex_values)
-    for wiring, error in zip(evaluator.wirings, errors, strict=True):
-        matrix = closed_loop(wiring, plain)
-        # Of each product the slope is a sum of two: twice the roundings.
-        off = _closing_errors(wiring, large, wide, times=2).matrix.imag / STEP
+    for wiring, error in zip(evaluator.wirings, matrix_errors(evaluator, values), strict=True):
+        closed = _closed_bounded(wiring, bounded)
+        matrix, off = value_of(closed), radius_of(closed).imag / STEP
         at = relative_at(wiring, matrix)[0]
         turned = np.abs(at.weights.imag / STEP)
         nothing = np.zeros((len(at.rest), len(at.held)))
@@ -427,18 +409,20 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
 def _moved_blocks(
     site: LinearSite, schedule: Schedule, durations: Mapping[int, tuple[float, float]]
 ) -> tuple[FrameMap, FrameMap]:
-    """Return the sizes of a frame and of its slopes as a complex step, and the errors of the slopes."""
+    """Return a frame with its slopes as a complex step, and the errors of the slopes."""
     plain, steps = {}, {}
     for quanta, (seconds, _) in durations.items():
         plain[quanta] = exponential_rows(site.a * seconds, site.b * seconds, 1.0).matrix
         steps[quanta] = _large_step(site, seconds)
-    roundings = roundings_of(site, schedule, steps)
-    frame = compose(site, schedule, plain)
-    bounds = compose(
-        every_matrix(site, _sized), schedule, {quanta: step.matrix for quanta, step in steps.items()}
-    )
-    error = bounds.mapped(lambda one: (2 * roundings * UNIT / STEP) * one.imag)
+    off = {
+        quanta: with_radius(plain[quanta], 2 * step.roundings * UNIT * step.matrix)
+        for quanta, step in steps.items()
+    }
+    bounds = compose(with_roundings(site), schedule, off, numbers=RADII)
+    frame = bounds.mapped(value_of)
+    error = bounds.mapped(lambda one: radius_of(one).imag / STEP)
     slope = frame.mapped(lambda one: np.abs(one.imag) / STEP)
+    roundings = roundings_of(site, schedule, steps)
     if not (error.largest <= HOPELESS * slope.largest).all():
         random = np.random.default_rng(len(schedule.events))
 
@@ -454,12 +438,7 @@ def _moved_blocks(
             error = error.mapped(
                 lambda e, a, b: np.maximum(e, SAFE * np.abs(a.imag - b.imag) / STEP), frame, other
             )
-    return frame.mapped(_sized), error
-
-
-def _sized(matrix: Matrices) -> Matrices:
-    """Return the magnitudes of values and slopes as numbers with a complex step."""
-    return np.asarray(np.abs(matrix.real) + 1j * np.abs(matrix.imag))
+    return frame, error
 
 
 def _large_step(site: LinearSite, seconds: float) -> Step:

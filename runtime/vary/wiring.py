@@ -57,7 +57,7 @@ def site_key(group: PeerGroup) -> tuple[int, int]:
 
 def wire(system: ClosedSystem) -> Wiring:
     """Take down who hears whom in a closed system, and its rigid motions."""
-    feedback = tuple(feedback_of(system, system.layout, lambda weight, _: float(weight)))
+    feedback = tuple(one.plain for one in feedback_of(system, system.layout))
     rigid = find_rigid_modes(system, with_drifts=False)
     wiring = _without(system, feedback, rigid)
     if rigid.names:

@@ -1,0 +1,108 @@
+"""What the kernel computes with: floats, or floats that carry their radius.
+
+Takes: matrices of floats, real or with a complex step, and bounds on what their entries are off by.
+Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`.
+Guarantees: a sum or product in `RADII` holds that of all matrices within the radii of its operands, its own
+rounding and that of the radius included.
+Does not: divide; carry rational numbers or balls of many digits (see `balls`).
+
+A matrix with its radius has a third axis from the end, (…, 2, n, m): its entries, and how far each may be
+off. A row (2, m) and a single number (2,) have it first. Of a number with a complex step, value + i·h·slope
+with h² ≈ 0, the radius has both, too: a product of magnitudes of such numbers is the magnitude of all that
+its value and its slope add up.
+
+A sum of k products is off by at most γ_k = k·u/(1 − k·u) times the same sum of magnitudes (Higham, Accuracy
+and Stability of Numerical Algorithms, section 3.1), in whatever order it is added up. Terms that are exactly
+zero don't round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.frame.discretize import UNIT
+
+Matrix = NDArray[Any]
+
+# Terms of a sum worth counting one by one, as many may be exactly zero.
+FEW = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Arithmetic:
+    """How matrices of a kind of number are multiplied, added and subtracted, and exact ones written."""
+
+    multiply: Callable[[Matrix, Matrix], Matrix]
+    add: Callable[[Matrix, Matrix], Matrix]
+    subtract: Callable[[Matrix, Matrix], Matrix]
+    exact: Callable[[Matrix], Matrix]
+
+
+def with_radius(value: Matrix, radius: Matrix) -> Matrix:
+    """Return matrices (…, n, m) with their radii (…, 2, n, m)."""
+    shape = np.broadcast_shapes(value.shape, radius.shape)
+    found = np.empty((*shape[:-2], 2, *shape[-2:]), dtype=value.dtype)
+    found[..., 0, :, :], found[..., 1, :, :] = value, radius
+    return found
+
+
+def rounded(value: Matrix) -> Matrix:
+    """Return matrices (…, n, m) of which each entry was rounded once, with their radii."""
+    return with_radius(value, UNIT * magnitude(value))
+
+
+def value_of(matrix: Matrix) -> Matrix:
+    """Return the entries (…, n, m) of matrices with their radii."""
+    return matrix[..., 0, :, :]
+
+
+def radius_of(matrix: Matrix) -> Matrix:
+    """Return how far the entries (…, n, m) of matrices with their radii may be off."""
+    return matrix[..., 1, :, :]
+
+
+def magnitude(value: Matrix) -> Matrix:
+    """Return |value|, or |value| + i·h·|slope| of numbers with a complex step."""
+    if np.iscomplexobj(value):
+        return np.asarray(np.abs(value.real) + 1j * np.abs(value.imag))
+    return np.asarray(np.abs(value))
+
+
+def _multiply(left: Matrix, right: Matrix) -> Matrix:
+    """Return the product of matrices with their radii; NaN or infinite where a bound is."""
+    a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
+    terms = a.shape[-1]
+    if terms > FEW:  # a term is none where its factor is exactly 0
+        terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
+    product = a @ b
+    terms = 2 + (2 * terms if np.iscomplexobj(product) else terms)  # of a complex step each is a sum of two
+    charge = terms * UNIT / (1 - terms * UNIT)
+    size_a, size_b = magnitude(a), magnitude(b)
+    # Each radius is as much larger as adding it up may have rounded it down.
+    off = size_a @ (charge * size_b + (1 + 2 * charge) * off_b)
+    if off_a.any():
+        off = off + off_a @ ((1 + 2 * charge) * (size_b + off_b))
+    return with_radius(product, (1 + 2 * charge) * off)
+
+
+def _added(left: Matrix, right: Matrix, values: Callable[[Matrix, Matrix], Matrix]) -> Matrix:
+    """Return the sum or difference of matrices with their radii."""
+    value = values(value_of(left), value_of(right))
+    off = radius_of(left) + radius_of(right)
+    return with_radius(value, (1 + 4 * UNIT) * (off + UNIT * magnitude(value)))
+
+
+def _exact(value: Matrix) -> Matrix:
+    """Return exact matrices, or an exact row or number, with their radii."""
+    return np.stack([value, np.zeros_like(value)], axis=-min(value.ndim + 1, 3))
+
+
+FLOATS = Arithmetic(np.matmul, np.add, np.subtract, lambda value: value)
+RADII = Arithmetic(
+    _multiply, lambda a, b: _added(a, b, np.add), lambda a, b: _added(a, b, np.subtract), _exact
+)
