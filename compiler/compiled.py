@@ -258,7 +258,7 @@ class Ports:
     port: Any  # casadi.Function
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Kind:
     """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
 

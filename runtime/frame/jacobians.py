@@ -15,6 +15,7 @@ u and m: its own part, ∂r/∂x and so on, is part of the tick's X, U and M; �
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import ClockPartition, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.site import LinearSite, Matrix, assemble, with_own_parts
+
+# Kinds whose Jacobians are remembered.
+KEPT = 64
 
 _BINARY = (casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, casadi.OP_FMIN, casadi.OP_FMAX)
 _UNARY = (casadi.OP_FABS, casadi.OP_SIGN)
@@ -105,8 +109,9 @@ class SiteJacobians:
         return bool(self.function.is_a("SXFunction"))
 
 
+@functools.lru_cache(maxsize=KEPT)
 def jacobians(kind: Kind) -> SiteJacobians:
-    """Build a kind's Jacobian functions; do it once and keep the result, `linearize` is then cheap.
+    """Build a kind's Jacobian functions, once for as long as it is remembered; `linearize` is then cheap.
 
     Raises
     ------

@@ -10,13 +10,14 @@ Does not: look at numbers other than times.
 from __future__ import annotations
 
 import decimal
+import functools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.hyperperiod import ClockGrid, Times, times_in_use
@@ -37,6 +38,9 @@ from apc.frame.schedule import (
     remembered,
 )
 from apc.frame.site import LinearSite
+
+# Schedules of scenes that are remembered.
+KEPT = 16
 
 MOST_PACKETS = 100_000  # of one peer: each has a name
 MOST_HELD = (
@@ -82,8 +86,46 @@ def build_schedules(
         E801 a mean, maximum or minimum over nobody; E805 too many ticks, packets or delayed values.
     """
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
+    return _schedules(
+        _Timed(
+            clocks=system.clocks,
+            links=system.links,
+            kinds=system.kinds,
+            groups=tuple((group.name, group.count, group.kind) for group in system.groups),
+            timings=tuple(timings.items()),
+            order=tuple(order),
+            kept=tuple((kept or {}).items()),
+            known=tuple(map(id, patterns)),
+            system=system,
+            patterns=tuple(patterns),
+        )
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Timed:
+    """All that schedules follow from: scenes that differ in other numbers only are the same.
+
+    `known` are the identities of the patterns, which are kept here.
+    """
+
+    clocks: tuple[Clock, ...]
+    links: tuple[Link, ...]
+    kinds: tuple[Kind, ...]
+    groups: tuple[tuple[str, int, int], ...]
+    timings: tuple[tuple[str, Fraction], ...]
+    order: tuple[str, ...]
+    kept: tuple[tuple[str, int], ...]
+    known: tuple[int, ...]
+    system: CompiledSystem = field(compare=False)
+    patterns: tuple[LinearSite, ...] = field(compare=False)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _schedules(of: _Timed) -> tuple[Schedule, ...]:
+    """Build the schedules, see `build_schedules`."""
+    system, patterns, timings, order, kept = of.system, of.patterns, dict(of.timings), of.order, dict(of.kept)
     rank = {name: place for place, name in enumerate(order)}
-    kept = kept or {}
     exchange = build_exchange(system, timings)
     live = [live_outputs(pattern) for pattern in patterns]
     read = [live_receives(pattern, outputs) for pattern, outputs in zip(patterns, live, strict=True)]
