@@ -12,6 +12,7 @@ The ε-pseudospectrum holds the eigenvalues of all matrices within ε (in the 2-
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ POWERS, FEWER_POWERS, LARGE = 64, 16, 300
 SQUARINGS = 24
 
 # Bounds tried: from the largest, the norm, towards the estimate, each time nearer by this factor.
-RADII, NEARER = 220, 2.0**-0.25
+RADII, STRIDE, NEARER = 224, 16, 2.0**-0.25
 
 # Relative error charged to ‖M^k‖ R^(−k) by way of logarithms: k·|log| below 10¹⁰, times UNIT.
 LOGARITHMS = 1e-5
@@ -104,6 +105,8 @@ def pseudospectral_radius(matrix: Matrix, error: float) -> float:
     n = len(matrix)
     if not n:
         return 0.0
+    if n == 1:
+        return float((abs(matrix[0, 0]) + error) * (1 + 4 * UNIT))
     largest = float(norms(matrix)) * (1 + UNIT) + error  # no eigenvalue is larger than the norm
     if not 0 < largest < np.inf:
         return largest
@@ -112,17 +115,26 @@ def pseudospectral_radius(matrix: Matrix, error: float) -> float:
     unit = 2.0 ** np.ceil(np.log2(max(nearest, largest * 2.0**-8)))
     exponents, logs = _powers(matrix / unit)
     steps = (largest - nearest) * NEARER ** np.arange(RADII)
-    radii = np.append(nearest + steps, 1.0)  # 1 itself: there the verdict falls
+
+    def least(radii: Floats) -> float:
+        return float(radii[_outside(exponents, logs, radii, unit, error, _base(n))].min(initial=largest))
+
+    # Bounds far apart first, then those between the least that serves and the next, which does not.
+    coarse = nearest + steps[::STRIDE]
+    place = STRIDE * int((coarse > least(coarse)).sum())
+    return min(least(nearest + steps[place : place + STRIDE]), least(np.array([1.0])), largest)
+
+
+def _outside(
+    exponents: Floats, logs: Floats, radii: Floats, unit: float, error: float, base: int
+) -> NDArray[np.bool_]:
+    """Say of each R whether the powers prove that no eigenvalue is beyond it."""
     depth = np.log(radii / unit)[:, None]
-    base = _base(n)
-    passing = radii >= largest
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):
         terms = np.exp(logs - exponents * depth) * (1 + LOGARITHMS)
-        bound = terms[:, :base].sum(axis=1) / radii * (1 + 8 * base * UNIT)
-        for q in terms[:, base:].T:
-            passing |= (q < 1) & (bound * error < (1 - q) * (1 - LOGARITHMS))
-            bound = bound * (1 + q)
-    return float(min(largest, radii[passing].min(initial=largest)))
+        first, q = terms[:, :base].sum(axis=1) / radii * (1 + 8 * base * UNIT), terms[:, base:]
+        bound = first[:, None] * np.cumprod(1 + q, axis=1) / (1 + q) * (1 + LOGARITHMS)
+        return np.asarray(((q < 1) & (bound * error < (1 - q) * (1 - LOGARITHMS))).any(axis=1))
 
 
 def _base(n: int) -> int:
@@ -151,22 +163,22 @@ def _powers(matrix: Matrix) -> tuple[Floats, Floats]:
         while len(stack) < base:
             last, last_size, last_off = stack[-1], float(size[-1]), float(off[-1])
             off = np.append(off, worse(off, size, last_off, last_size))
-            stack = np.concatenate([stack, stack @ last])
-            size = norms(stack)
-        logs = [0.0, *np.log(size + off)]
+            further = stack @ last
+            stack, size = np.concatenate([stack, further]), np.append(size, norms(further))
+        logs = [0.0, *np.log(size + off).tolist()]
         exponents = list(range(base + 1))
-        power, power_off = stack[-1], float(off[-1])
+        power, power_off, power_size = stack[-1], float(off[-1]), float(size[-1])
         shift = 0.0  # the power is 2^shift times what is kept of it, near 1 so that nothing is lost
         for _ in range(SQUARINGS):
-            power_size = float(norms(power))
             if not SMALLEST < power_size < np.inf:  # nothing of it is left to square
                 break
-            step = -float(np.round(np.log2(power_size)))
+            step = -round(math.log2(power_size))
             power, power_size, power_off = power * 2.0**step, power_size * 2.0**step, power_off * 2.0**step
             shift = 2 * (shift - step)
             power_off = float(worse(power_off, power_size, power_off, power_size))
             power = power @ power
-            logs.append(np.log(float(norms(power)) + power_off) + shift * np.log(2.0))
+            power_size = float(norms(power))
+            logs.append(float(np.log(power_size + power_off)) + shift * math.log(2.0))
             exponents.append(2 * exponents[-1])
             if not power_off < 1:  # nothing is known any more
                 break

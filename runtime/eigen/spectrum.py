@@ -10,6 +10,8 @@ Does not: close the loop (see `modes`).
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,13 +24,15 @@ from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import Eigenpairs
 from apc.eigen.enclosure import SMALL, WIDE, components, discs, enclose_eigenvalues
-from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.relative import Relative, independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.course import turns
 from apc.frame.schedule import Propagate
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+Integers = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
 
 STABLE = "stable"
@@ -122,7 +126,7 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
             notes.append(f"{system.name}: not proved, as {reason}")
         if drifting and (free := find_rigid_modes(system)).drifts:
             solved[place] = _solve(system, free)
-    found = [mode for one in solved for mode in one.modes]
+    found = _modes(systems, solved)
     found.sort(key=lambda mode: (-mode.magnitude, mode.shape, mode.eigenvalue.real, -mode.eigenvalue.imag))
     low = max((one.low for one in solved), default=0.0)
     high = max((one.high for one in solved), default=0.0)
@@ -148,14 +152,16 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """One closed system: its modes and bounds on its spectral radius.
+    """One closed system: its eigenvalues, each with its error, and bounds on its spectral radius.
 
     `inside` says whether all its eigenvalues but the rigid ones are inside the unit circle; `bits` with how
     many bits that was proved, 0 for floats.
     """
 
     free: RigidModes
-    modes: list[Mode]
+    at: Relative
+    pairs: Eigenpairs  # of the relative coordinates
+    errors: Floats  # (k,)
     low: float
     high: float
     inside: bool | None
@@ -169,7 +175,7 @@ def _tied(system: ClosedSystem) -> int:
 
 def _clear_of_one(one: _Solved) -> bool:
     """Say whether no eigenvalue can be 1."""
-    return all(abs(mode.eigenvalue - 1) > mode.error for mode in one.modes)
+    return bool((np.abs(one.pairs.values - 1) > one.errors).all())
 
 
 def _is_open(one: _Solved, lowest: float) -> bool:
@@ -196,7 +202,7 @@ def _proof_in_words(solved: Sequence[_Solved], drifts: int) -> str:
         return f"proved unstable with {max(unstable)} bits"
     if any(one.inside is None for one in solved):
         return f"undecided at {bits} bits"
-    if unstable or not all(one.bits for one in solved if one.modes):
+    if unstable or not all(one.bits for one in solved if len(one.errors)):
         return f"decided with {bits} bits where floats left it open"
     return f"proved {TO_DRIFT if drifts else 'stable'} with {bits} bits"
 
@@ -214,13 +220,14 @@ def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[str, 
 
 def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
     """Solve one system in floats."""
-    if free.basis.shape[1] == len(system.names):
-        return _Solved(free, [], 0.0, 0.0, True, 0)
     at = relative_coordinates(free.basis)
+    if not len(at.rest):
+        none = np.zeros((0, 0), dtype=np.complex128)
+        return _Solved(free, at, Eigenpairs(none[0], none, none), np.zeros(0), 0.0, 0.0, True, 0)
     reduced, reduced_error = relative_bounded(system.matrix, system.error, at)
     pairs, found = enclose_eigenvalues(reduced, reduced_error, whole=len(at.held) > 0)
     inside = False if found.low > 1 else True if found.high < 1 else None  # NaN decides nothing
-    return _Solved(free, _modes(system, free, pairs, found.errors), found.low, found.high, inside, 0)
+    return _Solved(free, at, pairs, found.errors, found.low, found.high, inside, 0)
 
 
 def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
@@ -235,48 +242,58 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     if not len(proof.values):
         return replace(estimate, inside=inside, bits=bits)
     found = discs(proof.values, proof.values, proof.radii)
-    modes = estimate.modes
-    known = not found.high - found.low > estimate.high - estimate.low
-    if known and proof.right is not None and proof.left is not None:
-        pairs = Eigenpairs(proof.values, proof.right, proof.left)
-        modes = _modes(system, proof.free, pairs, found.errors)
     low, high = max(estimate.low, found.low), min(estimate.high, found.high)
-    return _Solved(proof.free, modes, low, high, inside, bits)
+    known = not found.high - found.low > estimate.high - estimate.low
+    if not known or proof.right is None or proof.left is None:
+        return replace(estimate, low=low, high=high, inside=inside, bits=bits)
+    pairs = Eigenpairs(proof.values, proof.right, proof.left)
+    at = relative_coordinates(proof.free.basis)
+    return _Solved(proof.free, at, pairs, found.errors, low, high, inside, bits)
 
 
-def _modes(
-    system: ClosedSystem,
-    free: RigidModes,
-    pairs: Eigenpairs,
-    errors: Floats,
-) -> list[Mode]:
-    """Describe eigenvalues of the relative coordinates."""
-    vectors, shares = whole_vectors(system, free, pairs)
-    values = pairs.values
-    magnitudes = np.abs(values)
-    gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(errors, SMALL))
-    angles = np.zeros(len(values))
-    angles[~gone] = angles_in_frame(system, values[~gone], vectors[:, ~gone], shares[:, ~gone])
-    # What ends in finite time has no frequency; but what is never computed anew can't end.
-    angles[gone] = 0.0 if _ticks(system) else np.nan
+def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> list[Mode]:
+    """Describe the eigenvalues of all systems."""
+    vague: list[Floats] = []
+    parts: list[tuple[ClosedSystem, Complexes, Complexes, Floats]] = []
+    described: list[Floats] = []
+    for system, one in zip(systems, solved, strict=True):
+        vectors, shares = whole_vectors(system, one.at, one.pairs)
+        described.append(shares)
+        magnitudes = np.abs(one.pairs.values)
+        gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(one.errors, SMALL))
+        vague.append(gone)
+        parts.append((system, one.pairs.values[~gone], vectors[:, ~gone], shares[:, ~gone]))
     modes = []
-    for place, (value, angle, bound) in enumerate(zip(values, angles, errors, strict=True)):
-        magnitude = abs(complex(value))
-        frequency, damping = 0.0, 1.0
-        if not gone[place] or np.isnan(angle):
-            frequency, damping = oscillation(magnitude, float(angle), system.frame_s)
-        modes.append(
-            Mode(
-                eigenvalue=complex(value),
-                magnitude=magnitude,
-                multiplicity=system.multiplicity,
-                frequency_hz=frequency,
-                damping_ratio=damping,
-                shape=system.name,
-                participation=tuple(zip(system.names, shares[:, place].tolist(), strict=True)),
-                error=float(bound),
-            )
+    for system, one, shares, gone, known in zip(
+        systems, solved, described, vague, angles_in_frame(parts), strict=True
+    ):
+        # What ends in finite time has no frequency; but what is never computed anew can't end.
+        angles = np.full(len(gone), 0.0 if _ticks(system) else np.nan)
+        angles[~gone] = known
+        listed = zip(
+            one.pairs.values.tolist(),
+            angles.tolist(),
+            gone.tolist(),
+            one.errors.tolist(),
+            shares.T.tolist(),
+            strict=True,
         )
+        for value, angle, ends, bound, taking in listed:
+            frequency, damping = 0.0, 1.0
+            if not ends or math.isnan(angle):
+                frequency, damping = oscillation(abs(value), angle, system.frame_s)
+            modes.append(
+                Mode(
+                    eigenvalue=value,
+                    magnitude=abs(value),
+                    multiplicity=system.multiplicity,
+                    frequency_hz=frequency,
+                    damping_ratio=damping,
+                    shape=system.name,
+                    participation=tuple(zip(system.names, taking, strict=True)),
+                    error=bound,
+                )
+            )
     return modes
 
 
@@ -289,7 +306,7 @@ def _ticks(system: ClosedSystem) -> bool:
 
 def whole_vectors(
     system: ClosedSystem,
-    free: RigidModes,
+    at: Relative,
     pairs: Eigenpairs,
     *,
     aside: float = 0.0,
@@ -298,15 +315,15 @@ def whole_vectors(
 
     Parameters
     ----------
-    system, free
-        The closed system and its rigid motions.
+    system, at
+        The closed system and its relative coordinates.
     pairs
         Eigenvalues (k,) of the relative coordinates, with their vectors.
     aside
         By how much larger, relatively, each eigenvalue is taken: one of 1 leaves open how far the peers stand
         aside together.
     """
-    matrix, at = system.matrix, relative_coordinates(free.basis)
+    matrix = system.matrix
     held, rest, weights, count = at.held, at.rest, at.weights, len(at.held)
     # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
     corner = matrix[np.ix_(held, held)] + matrix[np.ix_(held, rest)] @ weights
@@ -331,8 +348,8 @@ def oscillation(magnitude: float, angle: float, frame_s: float) -> tuple[float, 
 
     Both are NaN for an angle that is.
     """
-    if np.isnan(angle):
-        return np.nan, np.nan
+    if math.isnan(angle):
+        return math.nan, math.nan
     turn = angle if abs(angle) > STRAIGHT else 0.0  # a real eigenvalue's, in more digits than a float has
     rate = complex(np.log(magnitude), turn) / frame_s
     return abs(rate.imag) / (2 * np.pi), float(-rate.real / abs(rate)) if rate else 1.0
@@ -343,36 +360,52 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes, shares: Floats) -> Floats:
-    """Return by how much modes turn in a frame (k,), in radians, with whole turns; NaN if it can't be told.
+def angles_in_frame(parts: Sequence[tuple[ClosedSystem, Complexes, Complexes, Floats]]) -> list[Floats]:
+    """Return by how much modes turn in a frame, in radians, with whole turns; NaN if it can't be told.
 
     The eigenvalue knows the angle up to whole turns; these are counted on the continuous state that takes
     most part. Where none does, as in what only packets carry, the angle is the eigenvalue's.
 
     Parameters
     ----------
-    system
-        The closed system.
-    values, vectors
-        Eigenvalues (k,) and their vectors (n, k) over the state.
-    shares
-        How much each state takes part (n, k).
+    parts
+        Closed systems, each with eigenvalues (k,), their vectors (n, k) over the state, and how much each
+        state takes part (n, k).
+
+    Returns
+    -------
+    Of each the angles (k,).
     """
-    angles: Floats = np.angle(values)
-    if not system.motion or not len(values):
-        return angles
-    motion = np.array(system.motion)
-    dominant = motion[np.argmax(shares[motion], axis=0)]
-    moving = shares[dominant, np.arange(len(values))] > LEAST_SHARE
-    if not system.sites:
-        return np.where(moving, np.nan, angles)
-    site_of = np.searchsorted(system.offsets, dominant, side="right") - 1
-    for g, (group, offset, heard) in enumerate(zip(system.sites, system.offsets, system.heard, strict=True)):
-        own = np.flatnonzero(moving & (site_of == g))
-        if len(own):
+    found = [np.angle(values) for _, values, _, _ in parts]
+    sites: dict[tuple[int, int], list[tuple[PeerGroup, Complexes, Complexes, Integers, Complexes]]] = {}
+    places: dict[tuple[int, int], list[tuple[Floats, Integers]]] = {}
+    for (system, values, vectors, shares), angles in zip(parts, found, strict=True):
+        if not system.motion or not len(values):
+            continue
+        motion = np.array(system.motion)
+        dominant = motion[np.argmax(shares[motion], axis=0)]
+        moving = shares[dominant, np.arange(len(values))] > LEAST_SHARE
+        if not system.sites:
+            angles[moving] = np.nan
+            continue
+        site_of = np.searchsorted(system.offsets, dominant, side="right") - 1
+        for g, (group, offset, heard) in enumerate(
+            zip(system.sites, system.offsets, system.heard, strict=True)
+        ):
+            own = np.flatnonzero(moving & (site_of == g))
+            if not len(own):
+                continue
             start = vectors[offset : offset + len(group.lifted.z_names), own]
-            received = heard @ vectors[:, own]
-            angles[own] = turns(
-                group.site, group.schedule, start, received, dominant[own] - offset, values[own]
+            key = id(group.site), id(group.schedule)
+            sites.setdefault(key, []).append(
+                (group, start, heard @ vectors[:, own], dominant[own] - offset, values[own])
             )
-    return angles
+            places.setdefault(key, []).append((angles, own))
+    # What moves on like sites is followed together.
+    for key, listed in sites.items():
+        group = listed[0][0]
+        columns = [np.concatenate(one, axis=-1) for one in list(zip(*listed, strict=True))[1:]]
+        turned = iter(turns(group.site, group.schedule, *columns))
+        for angles, own in places[key]:
+            angles[own] = list(itertools.islice(turned, len(own)))
+    return found

@@ -70,26 +70,26 @@ def turns(
     found = np.full(len(values), np.nan)
     swing = float(np.abs(np.linalg.eigvals(site.a).imag).max(initial=0.0)) / (2 * np.pi)
     left = np.arange(len(values))
-    before = np.full(len(values), np.nan)
-    for doubled in range(DOUBLINGS + 1):
+    durations = [event.duration for event in schedule.events if isinstance(event, Propagate)]
+    for doubled in range(1, DOUBLINGS + 1):
         points = {
-            event.duration: _power_of_two(A_TURN * swing * float(event.duration * schedule.quantum), doubled)
-            for event in schedule.events
-            if isinstance(event, Propagate)
+            duration: _power_of_two(A_TURN * swing * float(duration * schedule.quantum), doubled)
+            for duration in set(durations)
         }
-        most = sum(points[event.duration] for event in schedule.events if isinstance(event, Propagate))
+        most = sum(points[duration] for duration in durations)
         height = max(sum(site.b.shape), 1)
         if not most * height <= MOST or not len(left):
             break
-        chunk = MOST // (most * height)
+        chunk, seen = MOST // (most * height), np.zeros(len(values), dtype=np.bool_)
         for first in range(0, len(left), chunk):
             some = left[first : first + chunk]
             course = _course(site, schedule, points, start[:, some], heard[:, some], states[some])
             angle, widest = turned_along(course)
-            agreed = (np.abs(angle - before[some]) < OFF) | (widest < CLOSE)
+            before, _ = turned_along(course[::2])  # half as finely
+            agreed = (np.abs(angle - before) < OFF) | (widest < CLOSE)
             found[some[agreed]] = _of_eigenvalue(angle[agreed], values[some[agreed]])
-            before[some] = np.where(agreed, np.inf, angle)
-        left = left[before[left] < np.inf]
+            seen[some[agreed]] = True
+        left = left[~seen[left]]
     return found
 
 

@@ -59,7 +59,8 @@ def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenval
     """
     best: tuple[float, Marginal] | None = None
     for system, free in systems:
-        reduced = relative(system.matrix, relative_coordinates(free.basis))
+        at = relative_coordinates(free.basis)
+        reduced = relative(system.matrix, at)
         if not len(reduced):
             continue
         pairs = eigenpairs(reduced)
@@ -68,8 +69,8 @@ def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenval
         if best is not None and off >= best[0]:
             continue
         one = pairs.at(np.array([place]))
-        vector, shares = whole_vectors(system, free, one, aside=ASIDE)
-        turn = float(angles_in_frame(system, one.values, vector, shares)[0])
+        vector, shares = whole_vectors(system, at, one, aside=ASIDE)
+        turn = float(angles_in_frame([(system, one.values, vector, shares)])[0][0])
         best = off, Marginal(system.name, turn, system.frame_s)
     assert best is not None, "something moves where something neither grows nor dies out"
     return best[1]
