@@ -14,7 +14,6 @@ have nothing to do with the next part's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,35 +135,34 @@ def _enclose(
     of T about zero. Discs that touch hold together as many eigenvalues as there are of them.
     """
     n = len(matrix)
-    clusters = _close(values[:large])
-    blocks = [*clusters, np.arange(large, n)] if large < n else clusters
-    basis = _basis(right, left, clusters, large)
-    found = None if basis is None else _block_diagonal(matrix, error, basis, blocks, large)
+    # What block each place is of: the small ones are all of the last.
+    label = np.append(_clusters(values[:large]), np.full(n - large, large))
+    basis = _basis(right, left, label, large)
+    found = None if basis is None else _block_diagonal(matrix, error, basis, label, large)
     if found is None:
         return Enclosure(0.0, np.inf, np.full(n, np.inf))
     form, left_over = found
-    real = np.isrealobj(matrix)
-    centres, radii = np.zeros(n, dtype=np.complex128), np.zeros(n)
-    for block, total in zip(blocks, _totals(left_over, blocks, large), strict=True):
-        own = form[np.ix_(block, block)]
-        if block[0] >= large:
-            radii[block] = pseudospectral_radius(own.real if real else own, float(total))
-        else:
-            centres[block], radii[block] = _blockdiscs(own, float(total))
+    # A block of one is its own centre.
+    centres, radii = np.diagonal(form).astype(np.complex128), _totals(left_over, label, large)
+    for block in _several(label[:large]):
+        centres[block], radii[block] = _blockdiscs(form[np.ix_(block, block)], float(radii[block[0]]))
+    if large < n:
+        own = form[large:, large:]
+        centres[large:] = 0.0
+        radii[large:] = pseudospectral_radius(own.real if np.isrealobj(matrix) else own, float(radii[-1]))
     return discs(values, centres, radii)
 
 
-def _basis(right: Complexes, left: Complexes, clusters: Sequence[Places], large: int) -> Matrix | None:
+def _basis(right: Complexes, left: Complexes, label: Places, large: int) -> Matrix | None:
     """Return X = [X₁ X₂] (n, n), or None where vectors are too alike to tell apart."""
     n = len(right)
     basis: Matrix = np.zeros((n, n), dtype=np.complex128)
     free = np.arange(n)
     rows = left[:large].copy()
-    for cluster in clusters:
-        span = right[:, cluster]
-        basis[:, cluster] = np.linalg.qr(span)[0] if len(cluster) > 1 else span
-        if len(cluster) > 1:
-            rows[cluster] = np.linalg.qr(rows[cluster].T)[0].T
+    basis[:, :large] = right[:, :large]
+    for cluster in _several(label[:large]):
+        basis[:, cluster] = np.linalg.qr(right[:, cluster])[0]
+        rows[cluster] = np.linalg.qr(rows[cluster].T)[0].T
     if large:
         held = independent_places(rows)
         free = np.delete(free, held)
@@ -179,7 +177,7 @@ def _basis(right: Complexes, left: Complexes, clusters: Sequence[Places], large:
 
 
 def _block_diagonal(
-    matrix: Matrix, error: Floats, basis: Matrix, blocks: Sequence[Places], large: int
+    matrix: Matrix, error: Floats, basis: Matrix, label: Places, large: int
 ) -> tuple[Matrix, Floats] | None:
     """Return diag(T₁, …, T_k, T) and a bound on |G|, the products' roundings included; None without X⁻¹."""
     n = len(matrix)
@@ -190,9 +188,7 @@ def _block_diagonal(
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
     moved = matrix @ basis
     product = inverse @ moved
-    form = np.zeros_like(product)
-    for block in blocks:
-        form[np.ix_(block, block)] = product[np.ix_(block, block)]
+    form = np.where(label[:, None] == label, product, 0.0)
     if np.isrealobj(matrix):  # the large ones are whole conjugate pairs, so what is left is real
         form[large:, large:] = form[large:, large:].real
     size, weight = np.abs(basis), np.abs(inverse)
@@ -208,19 +204,18 @@ def _block_diagonal(
     return (form, left_over) if np.isfinite(left_over).all() else None
 
 
-def _totals(left_over: Floats, blocks: Sequence[Places], large: int) -> Floats:
-    """Return Σ_b ‖G_cb‖ for every block c, each norm that of Frobenius."""
+def _totals(left_over: Floats, label: Places, large: int) -> Floats:
+    """Return Σ_b ‖G_cb‖ for the block c of every place, each norm that of Frobenius."""
     n = len(left_over)
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
-    member = np.zeros((n, len(blocks)))
-    for place, block in enumerate(blocks):
-        member[block, place] = 1.0
+    member = (label[:, None] == label).astype(np.float64)
     peak = float(left_over.max(initial=0.0))  # relative to it no square is lost
     squares = np.square(left_over / peak) if peak > 0 else left_over
-    sizes = peak * (1 + charge) * (np.sqrt(member.T @ squares @ member) + 1e-150)
+    sizes = peak * (1 + charge) * (np.sqrt(member @ squares @ member) + 1e-150)
     if large < n:
-        sizes[-1, -1] = norms(left_over[large:, large:])  # often much less: many entries, few in a row
-    return np.asarray(sizes.sum(axis=1))
+        sizes[large:, large:] = norms(left_over[large:, large:])  # often much less: few entries in a row
+    first = label == np.arange(n)  # each block once
+    return np.asarray(sizes[:, first].sum(axis=1))
 
 
 def _blockdiscs(block: Matrix, error: float) -> tuple[Complexes, float]:
@@ -233,8 +228,6 @@ def _blockdiscs(block: Matrix, error: float) -> tuple[Complexes, float]:
     hardly vectors of their own, one disc about their mean c that holds the pseudospectrum of T − c.
     """
     m = len(block)
-    if m == 1:
-        return block[0].astype(np.complex128), error
     values, vectors = (part.astype(np.complex128) for part in np.linalg.eig(block))
     charge = PRODUCT_ROUNDINGS * (m + 2) * UNIT
     size = float(norms(vectors))
@@ -256,14 +249,19 @@ def _blockdiscs(block: Matrix, error: float) -> tuple[Complexes, float]:
     return np.full(m, centre), around
 
 
-def _close(values: Complexes) -> list[Places]:
-    """Return the places of eigenvalues that are nearly equal, chain by chain."""
-    near = np.abs(values[:, None] - values[None, :]) <= CLOSE * np.abs(values)[:, None]
-    label = _connected(near)
-    return [np.flatnonzero(label == one) for one in sorted(set(label.tolist()))]
+def _clusters(values: Complexes) -> Places:
+    """Return for each eigenvalue the first of those that are nearly equal to it, chain by chain."""
+    return _connected(np.abs(values[:, None] - values[None, :]) <= CLOSE * np.abs(values)[:, None])
 
 
-def _connected(touching: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _several(label: Places) -> list[Places]:
+    """Return the places of each cluster of two or more."""
+    return (
+        [np.flatnonzero(label == one) for one in np.flatnonzero(np.bincount(label) > 1)] if len(label) else []
+    )
+
+
+def _connected(touching: NDArray[np.bool_]) -> Places:
     """Return for each place the least place that it hangs together with."""
     n = len(touching)
     touching = touching | touching.T

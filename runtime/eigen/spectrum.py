@@ -253,7 +253,7 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
 
 def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> list[Mode]:
     """Describe the eigenvalues of all systems."""
-    vague: list[Floats] = []
+    vague: list[NDArray[np.bool_]] = []
     parts: list[tuple[ClosedSystem, Complexes, Complexes, Floats]] = []
     described: list[Floats] = []
     for system, one in zip(systems, solved, strict=True):

@@ -68,7 +68,7 @@ def radius_of(matrix: Matrix) -> Matrix:
 
 def magnitude(value: Matrix) -> Matrix:
     """Return |value|, or |value| + i·h·|slope| of numbers with a complex step."""
-    if np.iscomplexobj(value):
+    if value.dtype.kind == "c":
         return np.asarray(np.abs(value.real) + 1j * np.abs(value.imag))
     return np.asarray(np.abs(value))
 
@@ -80,7 +80,7 @@ def _multiply(left: Matrix, right: Matrix) -> Matrix:
     if terms > FEW:  # a term is none where its factor is exactly 0
         terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
     product = a @ b
-    terms = 2 + (2 * terms if np.iscomplexobj(product) else terms)  # of a complex step each is a sum of two
+    terms = 2 + (2 * terms if product.dtype.kind == "c" else terms)  # of a complex step each is a sum of two
     charge = terms * UNIT / (1 - terms * UNIT)
     size_a, size_b = magnitude(a), magnitude(b)
     # Each radius is as much larger as adding it up may have rounded it down.
