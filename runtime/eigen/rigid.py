@@ -39,6 +39,9 @@ Floats = NDArray[np.float64]
 # The units of what moves.
 LENGTHS = ("m", "rad")
 
+# What most entries of forms are: to multiply by it is worth sparing.
+ONE = Fraction(1)
+
 # A linear form in the unknowns, sparse.
 Form = dict[int, Fraction]
 
@@ -250,7 +253,8 @@ def _add(form: Form, weight: Any, other: Mapping[int, Fraction]) -> None:
     """Add weight · other to a form in place."""
     if weight:
         for index, value in other.items():
-            form[index] = form.get(index, Fraction(0)) + weight * value
+            more = weight if value is ONE else weight * value
+            form[index] = form[index] + more if index in form else more
 
 
 def _combine(terms: Iterable[tuple[Any, Form]]) -> Form:
@@ -269,7 +273,7 @@ def _standing(system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: 
         for row_a, row_b in zip(site.a, site.b, strict=True):
             yield _combine([*zip(row_a, x, strict=True), *zip(row_b, u, strict=True)])
         for p, (tick, partition) in enumerate(zip(site.ticks, site.kind.clocks, strict=True)):
-            y = [{number.outputs[g][p] + o: Fraction(1)} for o in range(len(partition.outputs))]
+            y = [{number.outputs[g][p] + o: ONE} for o in range(len(partition.outputs))]
             m = [y[o] for o in partition.memories]
             schedule = system.sites[g].schedule
             r = [
@@ -289,9 +293,9 @@ def _standing(system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: 
 def _standing_inputs(site: LinearSite, number: _Numbering, g: int) -> tuple[list[Form], list[Form]]:
     """Return x and u of a site as forms in the unknowns of the standing solution."""
     partition_of = {partition.clock: p for p, partition in enumerate(site.kind.clocks)}
-    x: list[Form] = [{number.states[g] + i: Fraction(1)} for i in range(len(site.kind.states))]
+    x: list[Form] = [{number.states[g] + i: ONE} for i in range(len(site.kind.states))]
     u: list[Form] = [
-        {number.outputs[g][partition_of[hold.clock]] + hold.output: Fraction(1)} for hold in site.kind.holds
+        {number.outputs[g][partition_of[hold.clock]] + hold.output: ONE} for hold in site.kind.holds
     ]
     return x, u
 
