@@ -69,7 +69,7 @@ HOUSE = (
     (
         "apc.analysis",
         """
-        methods switches plan selfcheck analysis needs ranges box box_proof openloop paper conventions
+        methods switches plan selfcheck analysis needs box box_proof openloop paper conventions
         contact_modes
         """,
     ),

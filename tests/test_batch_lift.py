@@ -14,6 +14,7 @@ from apc.frame.discretize import UNIT, discretize
 from apc.frame.jacobians import jacobians
 from apc.frame.lift import FrameMap, compose, lift
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Propagate
@@ -97,7 +98,7 @@ def _true_frame(population: Population, vector: Any) -> FrameMap:
     ],
 )
 def test_the_estimate_covers_the_error_against_eighty_digits(grams: str, seed: int, values: Any) -> None:
-    system = apply(different(6, seed=seed, **values), [Override("cube.mass", None, Fraction(grams) / 1000)])
+    system = apply(different(6, seed=seed, **values), [Override(Free("cube.mass"), Fraction(grams) / 1000)])
     [population], _ = crowded(system)
     lifted = population.lifted
     assert lifted.estimated
@@ -111,7 +112,7 @@ def test_the_estimate_covers_the_error_against_eighty_digits(grams: str, seed: i
 
 def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
     """A copy of a tenth of a gram: magnitudes grow without measure over a frame, the errors don't."""
-    system = apply(different(6), [Override("cube.mass", None, Fraction(1, 10**4))])
+    system = apply(different(6), [Override(Free("cube.mass"), Fraction(1, 10**4))])
     [population], _ = crowded(system)
     assert population.lifted.estimated
     for row, vector in enumerate(population.parameters):

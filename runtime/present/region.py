@@ -37,7 +37,7 @@ from apc.tables import SUFFIXES, Column, Row, check_table_path, write_table
 if TYPE_CHECKING:
     import pandas
 
-    from apc.analysis.ranges import Range
+    from apc.frame.names import Range
     from apc.regions.panels import Panel, Panels
     from apc.regions.region import Curve, Region
 
@@ -64,14 +64,14 @@ NO_BREAK = "\N{NO-BREAK SPACE}"
 
 def region_text(found: Region) -> str:
     """Return what `apc region` prints of one region."""
-    width = max(len(found.x.label), len(found.y.label))
+    width = max(len(found.x.free.label), len(found.y.free.label))
     lines = [f"{found.topology}: {_words(found)}"]
     for text in found.left_out:
         lines += note(text)
     lines.append("")
     for letter, axis in (("x", found.x), ("y", found.y)):
         span = with_unit(f"{float(axis.low):.6g} to {float(axis.high):.6g}", axis.unit)
-        lines.append(f"  {letter}  {axis.label:<{width}}  {span}")
+        lines.append(f"  {letter}  {axis.free.label:<{width}}  {span}")
     whole = float(found.rectangle.width.prod())
     share = 100 * found.stable_area / whole
     off = found.stable_area_error
@@ -288,7 +288,7 @@ def _frame(ax: Any, x: Range, y: Range, gain: int = 1) -> None:
 
 def _label(axis: Range) -> str:
     unit = axis.unit.replace("*", "·")
-    return axis.label if unit == "1" else f"{axis.label} [{unit}]"
+    return axis.free.label if unit == "1" else f"{axis.free.label} [{unit}]"
 
 
 def _draw(ax: Any, found: Region, gain: int, place: int) -> None:
@@ -466,7 +466,7 @@ def _origins(found: Panels) -> dict[str, Any]:
 
 def _columns(found: Region) -> list[Column]:
     """Return the columns of a table of boundary points."""
-    x, y = (Column(one.label, "" if one.unit == "1" else one.unit) for one in (found.x, found.y))
+    x, y = (Column(one.free.label, "" if one.unit == "1" else one.unit) for one in (found.x, found.y))
     words = (Column("panel", kind="text"), Column("topology", kind="text"))
     curve = (Column("curve", kind="count"), Column("mode", kind="text"))
     return [*words, *curve, x, y, Column("tangent x"), Column("tangent y"), Column("error")]

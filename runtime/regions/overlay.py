@@ -97,17 +97,17 @@ def _role(system: CompiledSystem, symbol: str, player: str) -> Role:
     if player[0] in "+-.0123456789":
         value = quantity(player, _PLACE, what=symbol, unit=UNITS[symbol]).value
         return Role(symbol, None, None, float(value))
-    name, group = find(system, player, _PLACE)
-    unit = unit_of(system, name)
+    free = find(system, player, _PLACE)
+    name, unit = free.name, unit_of(system, free.name)
     if parse_unit(unit, _PLACE).dimension != parse_unit(UNITS[symbol], _PLACE).dimension:
         what = f"{symbol}, the {MEANINGS[symbol]},"
         raise ApcError(Mistake("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))
-    if group is None:
+    if free.group is None:
         own = [one for one in system.groups if name in _own_names(one)]
         if own:
             what = f"{name} differs between peers, and {symbol} is one number"
             raise ApcError(Mistake("E886", _PLACE, what, hint=f"{symbol}={own[0].name}.{name}"))
-    return Role(symbol, name, group, None)
+    return Role(symbol, name, free.group, None)
 
 
 def _own_names(group: Group) -> set[str]:
@@ -171,7 +171,7 @@ def overlay_points(
 
     def margin(at_x: float, at_y: float) -> float:
         places = zip(axes, (at_x, at_y), strict=True)
-        overrides = [Override(name, group, Fraction(value)) for (name, group), value in places]
+        overrides = [Override(free, Fraction(value)) for free, value in places]
         return float(overlay.condition.margin(*symbol_values(apply(system, overrides), overlay)))
 
     def crossing(along: Callable[[float], float], low: float, high: float) -> float | None:

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
-from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
-from apc.frame.names import Free, parameter_of
+from apc.frame.names import Free, Range, parameter_of
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace
 from apc.regions.cells import HALVINGS, survey
@@ -115,7 +114,7 @@ def trace_strips(
         E844 a time that no delay is linear in.
     """
     delay, other = axes[axis], axes[1 - axis]
-    free = (Free(delay.name, delay.group), Free(other.name, other.group))
+    free = (delay.free, other.free)
     longest = system_with_delay(
         system, free[0], delay.high
     )  # what is too much is so before any strip is looked at

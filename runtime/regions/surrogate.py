@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.ranges import Range
 from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
+from apc.frame.names import Range
 from apc.regions.eigenpairs import Family
 from apc.vary.batch import Evaluator
 
