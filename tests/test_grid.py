@@ -55,7 +55,7 @@ def test_the_last_axis_turns_fastest() -> None:
     assert grid.points == 6
     rows = [tuple(float(value) for value in grid.values(point)) for point in range(6)]
     assert rows == [(k, t) for k in (1, 2) for t in (0, 0.008, 0.016)]
-    assert [(one.name, one.value) for one in grid.overrides(4)] == [
+    assert [(one.free.label, one.value) for one in grid.overrides(4)] == [
         ("contact.stiffness", 2),
         ("lan.delay", Fraction(8, 1000)),
     ]

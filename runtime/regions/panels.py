@@ -27,6 +27,7 @@ from apc.regions.axes import PLACE, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.region import CELLS, Floats, Region, region
 from apc.result import Result
+from apc.sweeps.grid import with_last_unit
 from apc.vary.search import Told
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
@@ -87,15 +88,11 @@ def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
         E907 it isn't of that form.
     """
     name, equals, values = (part.strip() for part in text.partition("="))
-    listed = [value.strip() for value in values.split(",")]
+    listed = with_last_unit(values.split(","))
     if not (equals and name and all(listed)):
         form = "--vary lan.delay=0,8 ms"
         raise ApcError(Mistake("E907", Place("--vary"), "--vary", "NAME=VALUE,VALUE,…", text[:80], form))
-    unit = listed[-1].lstrip("+-.0123456789eE").strip()
-    bare = "+-.0123456789eE"
-    return tuple(
-        (f"{name}={value} {unit}" if not value.strip(bare) else f"{name}={value}",) for value in listed
-    )
+    return tuple((f"{name}={value}",) for value in listed)
 
 
 # A scene with a panel's settings, its axes, and what its y is multiplied by.
@@ -152,11 +149,8 @@ def compare_regions(
     found = []
     for title, work, laid in jobs:
         regions = tuple(region(system, axes, cells=cells, told=told) for system, axes, _ in work)
-        ranges = [(axis.free.label, float(axis.low), float(axis.high)) for axis in work[0][1]]
-        lines = tuple(
-            (one.label, overlay_points(work[0][0], one, ranges[0], ranges[1]) * [1.0, work[0][2]])
-            for one in laid
-        )
+        first, axes, gain = work[0]
+        lines = tuple((one.label, overlay_points(first, one, *axes) * [1.0, gain]) for one in laid)
         found.append(Panel(title, regions, tuple(gain for _, _, gain in work), lines))
     return Panels(tuple(found), normalize)
 

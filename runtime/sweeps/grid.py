@@ -1,7 +1,7 @@
 """Which parameters a sweep varies, and every combination of their values.
 
 Takes: a `CompiledSystem`, names of parameters, and texts such as `0 N/m:3000 N/m:11` or `0, 8 ms`.
-Gives: `GridAxis`, `Grid`, `parse_axis`, `build_grid`, `check_size`.
+Gives: `GridAxis`, `Grid`, `parse_axis`, `with_last_unit`, `build_grid`, `check_size`.
 Guarantees: values are exact rationals in SI; the order of points is that of the axes as given, the last one
 turning fastest; what can be known to be out of bounds is told before any point is computed.
 Does not: compute points.
@@ -189,9 +189,13 @@ def _quantities(label: str, unit: str, texts: Sequence[str]) -> tuple[Fraction, 
     """Read quantities; one without a unit takes that of the last."""
     from apc.compiler.language.units import quantity
 
+    return tuple(quantity(text, PLACE, what=label, unit=unit).value for text in with_last_unit(texts))
+
+
+def with_last_unit(texts: Sequence[str]) -> list[str]:
+    """Return the texts of quantities, those of numbers alone with the unit of the last: `0,8 ms`."""
     last = _NUMBER.sub("", texts[-1], count=1).strip()
-    complete = [f"{text.strip()} {last}" if last and _NUMBER.fullmatch(text) else text for text in texts]
-    return tuple(quantity(text, PLACE, what=label, unit=unit).value for text in complete)
+    return [f"{text.strip()} {last}" if last and _NUMBER.fullmatch(text) else text.strip() for text in texts]
 
 
 def _check_bounds(system: CompiledSystem, axis: GridAxis, value: Fraction) -> None:
