@@ -11,7 +11,7 @@ from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
-from apc.present.region import stable_outlines
+from apc.present.region_picture import stable_outlines
 from apc.regions.axes import parse_axes
 from apc.regions.region import Region, region
 from apc.vary.critical import critical

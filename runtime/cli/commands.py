@@ -156,7 +156,7 @@ def compile_command(file: str | None, until: str, force: bool, timings: bool) ->
     path = Path(file) if file else find_input(compiled_too=False)
     if until != "compiled":
         from apc.compiler.pipeline import run_stages
-        from apc.compiler.view.listing import describe
+        from apc.compiler.view.stages import describe
 
         tell(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
         return
