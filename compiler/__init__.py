@@ -23,5 +23,5 @@ compiled, plain, formula    the compiled model; its functions as data; numbers t
 store                       the compiled model on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another
-view                        schema; diagram; svg, layers, picture; listing
+view                        schema; diagram; svg, layers, picture; stages, listing
 """

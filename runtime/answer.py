@@ -24,7 +24,7 @@ from apc.vary.sensitivity import Sensitivities, sensitivities
 
 if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
-    from apc.analysis.ranges import Range
+    from apc.frame.names import Range
 
 # How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
 # well-conditioned frame stay below 1e-12; beyond ten times that, floats have lost what derivatives need.

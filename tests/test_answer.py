@@ -14,6 +14,7 @@ from apc.analysis.box import parse_range
 from apc.answer import answer, judge, sensitivities_of
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply, parse_override
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
@@ -104,7 +105,7 @@ def test_a_stiffness_of_zero_lets_copies_apart_and_the_rest_is_told_all_the_same
     assert found.sensitivities.radius == pytest.approx(found.analysis.spectral_radius, abs=1e-12)
     step = Fraction(1, 10**6)
     moved = [
-        analyze(apply(alone, [Override("device.mass", None, Fraction(1, 10) + side)])).spectral_radius
+        analyze(apply(alone, [Override(Free("device.mass"), Fraction(1, 10) + side)])).spectral_radius
         for side in (-step, step)
     ]
     slope = {row.parameter: row.derivative for row in found.sensitivities.rows}["device.mass"]

@@ -39,7 +39,7 @@ HOUSE = (
     ),
     ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
-    ("apc.compiler.view", "schema diagram svg layers picture listing"),
+    ("apc.compiler.view", "schema diagram svg layers picture stages listing"),
     ("apc", "threads finite_equations distribution suffixes optional option_value result tables processes"),
     (
         "apc.frame",
@@ -69,7 +69,7 @@ HOUSE = (
     (
         "apc.analysis",
         """
-        methods switches plan selfcheck analysis needs ranges box box_proof openloop paper conventions
+        methods switches plan selfcheck analysis needs box box_proof openloop paper conventions
         contact_modes
         """,
     ),
@@ -97,7 +97,7 @@ HOUSE = (
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
-    ("apc.present", "forms pictures analysis vary region simulation still recording bench"),
+    ("apc.present", "forms pictures analysis vary region_picture region simulation still recording bench"),
     # what a person calls
     (
         "apc",

@@ -38,7 +38,7 @@ def test_a_batch_has_the_radii_of_single_analyses(text: str) -> None:
     values = points(system, NAMES)
     found = family.matrices(values)
     for k, row in enumerate(values):
-        overrides = [Override(n, None, Fraction(float(v))) for n, v in zip(NAMES, row, strict=True)]
+        overrides = [Override(Free(n), Fraction(float(v))) for n, v in zip(NAMES, row, strict=True)]
         alone = analyze(apply(system, overrides))
         radius = max(float(np.abs(np.linalg.eigvals(one[k])).max()) for one in found)
         assert abs(radius - alone.spectral_radius) <= 1e-11 * max(1, radius)
@@ -51,7 +51,7 @@ def test_other_graphs_clocks_and_groups_are_batched_alike(name: str) -> None:
     values = np.array([[400.0], [900.0]])
     found = family.matrices(values)
     for k, value in enumerate(values[:, 0]):
-        alone = analyze(apply(system, [Override("contact.stiffness", None, Fraction(value))]))
+        alone = analyze(apply(system, [Override(Free("contact.stiffness"), Fraction(value))]))
         radius = max(float(np.abs(np.linalg.eigvals(one[k])).max()) for one in found)
         assert abs(radius - alone.spectral_radius) <= 1e-9
 
@@ -97,7 +97,7 @@ def test_error_bounds_hold_the_true_matrices() -> None:
 def test_closed_systems_at_a_point_are_those_of_an_analysis() -> None:
     system = compiled(AVERAGE)
     family = evaluator(system, [Free("contact.stiffness")])
-    there = apply(system, [Override("contact.stiffness", None, Fraction(700))])
+    there = apply(system, [Override(Free("contact.stiffness"), Fraction(700))])
     for mine, other in zip(family.closed_at([700.0]), split(*lifted_groups(there)).systems, strict=True):
         assert np.array_equal(mine.matrix, other.matrix)
         assert np.array_equal(mine.error, other.error)

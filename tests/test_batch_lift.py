@@ -14,6 +14,7 @@ from apc.frame.discretize import UNIT, discretize
 from apc.frame.jacobians import jacobians
 from apc.frame.lift import FrameMap, compose, lift
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Propagate
@@ -100,7 +101,7 @@ def _true_frame(population: Population, vector: Any) -> FrameMap:
     ],
 )
 def test_bound_and_estimate_cover_the_error_against_eighty_digits(grams: str, seed: int, values: Any) -> None:
-    system = apply(different(6, seed=seed, **values), [Override("cube.mass", None, Fraction(grams) / 1000)])
+    system = apply(different(6, seed=seed, **values), [Override(Free("cube.mass"), Fraction(grams) / 1000)])
     [population], _ = crowded(system)
     lifted = population.lifted
     assert lifted.estimated == (Fraction(grams) < Fraction("0.1"))
@@ -114,7 +115,7 @@ def test_bound_and_estimate_cover_the_error_against_eighty_digits(grams: str, se
 
 def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
     """A copy of a milligram: radii grow without measure over a frame, the errors don't."""
-    system = apply(different(6), [Override("cube.mass", None, Fraction(1, 10**6))])
+    system = apply(different(6), [Override(Free("cube.mass"), Fraction(1, 10**6))])
     [population], _ = crowded(system)
     assert population.lifted.estimated
     for row, vector in enumerate(population.parameters):

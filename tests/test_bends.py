@@ -96,7 +96,7 @@ def test_a_bump_between_two_samples_is_found_at_its_closed_form(tmp_path: Path) 
     """k(u) crosses the spring's own limit K at u₀ ± w (h/(K − low) − 1)^¼."""
     system = scene(tmp_path, BUMP)
     plain = scene(tmp_path, "u")
-    bound = critical(apply(plain, [Override("c.high", None, Fraction(1))]), "c.u").value
+    bound = critical(apply(plain, [Override(Free("c.high"), Fraction(1))]), "c.u").value
     assert bound is not None
     reach = 50 * (8000 / bound - 1) ** 0.25
     for name in ("c.u", "dial"):
@@ -132,7 +132,7 @@ def test_steps_kinks_and_other_functions_hide_nothing_either(
     assert found.crossings[0].value == pytest.approx(place, abs=2)
     middle = sum(one.value for one in found.crossings) / 2
     for value, stable in ((700.0, True), (middle, False), (1500.0, True)):
-        assert analyze(apply(system, [Override("dial", None, Fraction(value))])).stable is stable
+        assert analyze(apply(system, [Override(Free("dial"), Fraction(value))])).stable is stable
     assert found.known
 
 

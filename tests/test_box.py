@@ -13,6 +13,7 @@ from apc.analysis.box import parse_range
 from apc.analysis.box_proof import BoxProof, prove_box
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from tests.sites import columned, derived, grouped, paper
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, library, replaced
@@ -50,7 +51,7 @@ def test_a_box_is_proved_and_every_point_of_it_is_stable(texts: list[str]) -> No
     for _ in range(5):
         shares = [Fraction(float(one)) for one in generator.choice([0.0, 1.0, 0.3, 0.77], len(ranges))]
         point = [
-            Override(one.name, one.group, one.low + share * (one.high - one.low))
+            Override(one.free, one.low + share * (one.high - one.low))
             for one, share in zip(ranges, shares, strict=True)
         ]
         assert analyze(apply(system, point)).stable
@@ -65,7 +66,7 @@ def test_a_box_beyond_the_limit_is_unstable_at_a_point_and_one_below_it_is_stabl
     assert above.stable is False
     [point] = above.point
     assert 1096.41 < point <= 1096.5
-    assert analyze(apply(system, [Override("coordination.stiffness", None, Fraction(point))])).stable is False
+    assert analyze(apply(system, [Override(Free("coordination.stiffness"), Fraction(point))])).stable is False
     assert "proved unstable at" in str(above)
 
 

@@ -16,7 +16,7 @@ from apc.compiler.language.tables import MOST_MISTAKES
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.scene.channels import SceneChannel
 from apc.compiler.store import load, save
-from apc.compiler.view.listing import describe
+from apc.compiler.view.stages import describe
 from tests.topologies import AVERAGE, compiled, replaced, scene, told
 
 LINK = "  lan: {clock: network, delay: 8 ms}"

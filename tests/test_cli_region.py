@@ -12,7 +12,7 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.present.region import panel_letter, stable_outlines
+from apc.present.region_picture import panel_letter, stable_outlines
 from apc.regions.axes import parse_axes
 from apc.regions.panels import (
     compare_regions,

@@ -14,6 +14,7 @@ from apc.__main__ import run
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.critical import critical
 from apc.vary.crossings import scan, scan_lines
@@ -37,11 +38,11 @@ def scene(
 
 
 def with_values(system: CompiledSystem, values: dict[str, str]) -> CompiledSystem:
-    return apply(system, [Override(name, None, Fraction(value)) for name, value in values.items()])
+    return apply(system, [Override(Free(name), Fraction(value)) for name, value in values.items()])
 
 
 def stable_at(system: CompiledSystem, name: str, value: float) -> bool | None:
-    return analyze(apply(system, [Override(name, None, Fraction(value))])).stable
+    return analyze(apply(system, [Override(Free(name), Fraction(value))])).stable
 
 
 @pytest.mark.parametrize(("delayed", "delays", "b", "k_c", "average", "mesh"), LIMITS)
@@ -174,7 +175,7 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
     ticks = first.value / 1e-3
     assert ticks == pytest.approx(round(ticks), abs=1e-9)
     sides = [
-        analyze(apply(system, [Override("lan.delay", None, Fraction(round(ticks), 1000) + shift)])).stable
+        analyze(apply(system, [Override(Free("lan.delay"), Fraction(round(ticks), 1000) + shift)])).stable
         for shift in (Fraction(-1, 10**7), Fraction(1, 10**7))
     ]
     assert sides == ([True, False] if first.stable_side == "below" else [False, True])
@@ -204,7 +205,7 @@ def test_groups_alike_at_present_only_are_kept_apart() -> None:
     assert alone.parameter == "one.contact.stiffness"
     assert alone.value is not None
     for shift, stable in ((1 - 1e-9, True), (1 + 1e-9, False)):
-        changed = apply(system, [Override("contact.stiffness", "one", Fraction(alone.value * shift))])
+        changed = apply(system, [Override(Free("contact.stiffness", "one"), Fraction(alone.value * shift))])
         assert analyze(changed).stable is stable
     together = critical(system, "contact.stiffness")
     assert together.value == pytest.approx(1645.35314612339, rel=1e-12)
@@ -296,12 +297,12 @@ def test_verdicts_on_both_sides_of_a_delay_are_those_of_linearizations_there() -
     text = (SCENES / "finger.yaml").read_text(encoding="utf-8").partition("\n")[2]
     limit = critical(compiled(text), "wall.stiffness", lower="2000 N/m", upper="9000 N/m").value
     assert limit is not None
-    system = apply(compiled(text), [Override("wall.stiffness", None, Fraction(0.8 * limit))])
+    system = apply(compiled(text), [Override(Free("wall.stiffness"), Fraction(0.8 * limit))])
     found = critical(system, "wall.delay", upper="3 ms")
     assert found.crossings
     for one in found.crossings:
         for side, factor in (("below", 1 - 1e-6), ("above", 1 + 1e-6)):
-            beside = Override("wall.delay", None, Fraction(one.value * factor))
+            beside = Override(Free("wall.delay"), Fraction(one.value * factor))
             assert analyze(apply(system, [beside])).stable is (one.stable_side == side)
 
 
@@ -388,7 +389,7 @@ def test_a_scan_of_a_delay_goes_beyond_the_present_value(name: str, times: tuple
     for one in found.crossings[:1]:
         for way in (-1, 1):
             value = Fraction(one.value) * (1 + way * Fraction(1, 10**7))
-            stable = analyze(apply(system, [Override(name, None, value)])).stable
+            stable = analyze(apply(system, [Override(Free(name), value)])).stable
             assert stable is ((way < 0) == (one.stable_side == "below"))
 
 
@@ -411,7 +412,7 @@ def test_a_delay_that_stands_in_a_force_moves_the_force_as_well(tmp_path: Path) 
     assert only.proof.startswith("proved")
     for way, stable in ((-1, True), (1, False)):
         value = Fraction(only.value) * (1 + way * Fraction(1, 10**9))
-        assert analyze(apply(system, [Override("c.delay", None, value)])).stable is stable
+        assert analyze(apply(system, [Override(Free("c.delay"), value)])).stable is stable
 
 
 def test_a_present_value_on_a_jump_is_on_the_side_of_its_own_verdict() -> None:

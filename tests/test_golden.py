@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from apc.compiler.pipeline import Stage, run_stages
-from apc.compiler.view.listing import describe
+from apc.compiler.view.stages import describe
 from tests.topologies import ROOT, SCENES
 
 GOLDEN = ROOT / "tests" / "golden"
@@ -26,7 +26,7 @@ STAGES: tuple[Stage, ...] = ("flat", "sorted")
 DIGEST = f"""
 import hashlib, pathlib
 from apc.api import save, schema, show
-from apc.compiler.view.listing import describe
+from apc.compiler.view.stages import describe
 from apc.compiler.pipeline import each_stage
 whole = hashlib.sha256(repr(schema()).encode())
 for name in {NAMES!r}:

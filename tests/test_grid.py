@@ -6,6 +6,7 @@ from fractions import Fraction
 
 import pytest
 
+from apc.frame.names import Free
 from apc.sweeps.grid import GridAxis, build_grid, check_size, parse_axis
 from tests.topologies import AVERAGE, compiled, told
 
@@ -29,7 +30,7 @@ GROUPS = compiled(AVERAGE.replace("user: {count: 3}", "a: {count: 1}\n  b: {coun
 )
 def test_a_range_or_list_gives_exact_values(text: str, values: list[Fraction]) -> None:
     axis = parse_axis(MODEL, "contact.stiffness", text)
-    assert (axis.name, axis.group, axis.unit) == ("contact.stiffness", None, "N/m")
+    assert (axis.free, axis.unit) == (Free("contact.stiffness"), "N/m")
     assert axis.heading == "contact.stiffness [N/m]"
     assert list(axis.values) == values
 
@@ -45,7 +46,7 @@ def test_equal_ratios_have_the_ends_given_and_short_decimals_between() -> None:
 def test_a_name_may_have_its_section_or_group_before_it() -> None:
     assert parse_axis(MODEL, "links.lan.delay", "0,8 ms").values == (0, Fraction(8, 1000))
     axis = parse_axis(GROUPS, "b.device.mass", "0.1,0.2 kg")
-    assert (axis.name, axis.group, axis.heading) == ("device.mass", "b", "b.device.mass [kg]")
+    assert (axis.free, axis.heading) == (Free("device.mass", "b"), "b.device.mass [kg]")
 
 
 def test_the_last_axis_turns_fastest() -> None:
@@ -54,7 +55,7 @@ def test_the_last_axis_turns_fastest() -> None:
     assert grid.points == 6
     rows = [tuple(float(value) for value in grid.values(point)) for point in range(6)]
     assert rows == [(k, t) for k in (1, 2) for t in (0, 0.008, 0.016)]
-    assert [(one.name, one.value) for one in grid.overrides(4)] == [
+    assert [(one.free.label, one.value) for one in grid.overrides(4)] == [
         ("contact.stiffness", 2),
         ("lan.delay", Fraction(8, 1000)),
     ]
@@ -168,7 +169,7 @@ def test_a_grid_needs_axes_each_once_and_not_too_many_points() -> None:
     axis = parse_axis(MODEL, "contact.stiffness", "1,2 N/m")
     assert told(build_grid, []) == [f"sweep: E883 nothing is swept. Write: {FORM}"]
     assert told(build_grid, [axis, axis]) == ["sweep: E883 contact.stiffness is swept twice."]
-    many = [GridAxis(f"p{i}", None, "1", tuple(Fraction(v) for v in range(1000))) for i in range(3)]
+    many = [GridAxis(Free(f"p{i}"), "1", tuple(Fraction(v) for v in range(1000))) for i in range(3)]
     assert told(build_grid, many) == [
         "sweep: E883 a sweep wants at most 10,000,000 points, got 1,000 × 1,000 × 1,000 = 1,000,000,000."
     ]

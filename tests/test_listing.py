@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from apc.compiler.view.listing import describe
+from apc.compiler.view.stages import describe
 from tests.topologies import AVERAGE, clocked, compiled, flat, ordered, scene, source
 
 

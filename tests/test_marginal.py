@@ -7,6 +7,7 @@ from fractions import Fraction
 import pytest
 
 from apc.analysis.analysis import analyze
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.critical import critical
 from tests.topologies import AVERAGE, SCENES, compiled
@@ -20,7 +21,7 @@ def test_a_change_of_sign_at_every_tick_is_not_taken_for_a_rigid_motion() -> Non
     [one] = found.crossings
     assert one.frequency_hz == pytest.approx(500, rel=1e-9)
     beside = apply(
-        scene, [Override("coordination.damping", None, Fraction(one.value) * Fraction(1001, 1000))]
+        scene, [Override(Free("coordination.damping"), Fraction(one.value) * Fraction(1001, 1000))]
     )
     assert analyze(beside).modes[0].frequency_hz == pytest.approx(500, rel=1e-9)
 
@@ -29,5 +30,5 @@ def test_a_change_of_sign_at_every_tick_is_not_taken_for_a_rigid_motion() -> Non
 def test_the_frequency_is_that_of_the_leading_mode_of_an_analysis(name: str) -> None:
     scene = compiled(AVERAGE)
     [one, *_] = critical(scene, name).crossings
-    here = analyze(apply(scene, [Override(name, None, Fraction(one.value))]))
+    here = analyze(apply(scene, [Override(Free(name), Fraction(one.value))]))
     assert one.frequency_hz == pytest.approx(here.modes[0].frequency_hz, rel=1e-6)

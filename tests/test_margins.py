@@ -6,6 +6,7 @@ import re
 from fractions import Fraction
 
 from apc.analysis.analysis import analyze
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.margins import margins
 from tests.topologies import AVERAGE, compiled, replaced
@@ -26,7 +27,7 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_margin_that_holds(
         assert one.error <= 1e-12 * one.value
         for side, stable in ((-1e-9, True), (1e-9, False)):
             value = Fraction(one.value * (1 + side))
-            assert analyze(apply(system, [Override(name, None, value)])).stable is stable
+            assert analyze(apply(system, [Override(Free(name), value)])).stable is stable
         assert one.factor == (one.value / one.present if one.present else None)
 
 

@@ -21,13 +21,13 @@ from tests.topologies import AVERAGE, MESH, compiled, replaced
 @pytest.mark.parametrize(
     ("written", "meant"),
     [
-        ("contact.stiffness", ("contact.stiffness", None)),
-        ("couplers.contact.stiffness", ("contact.stiffness", None)),
-        ("links.lan.delay", ("lan.delay", None)),
-        ("left.contact.stiffness", ("contact.stiffness", "left")),
+        ("contact.stiffness", Free("contact.stiffness")),
+        ("couplers.contact.stiffness", Free("contact.stiffness")),
+        ("links.lan.delay", Free("lan.delay")),
+        ("left.contact.stiffness", Free("contact.stiffness", "left")),
     ],
 )
-def test_a_name_may_start_with_its_group_or_its_section(written: str, meant: tuple[str, str | None]) -> None:
+def test_a_name_may_start_with_its_group_or_its_section(written: str, meant: Free) -> None:
     system = grouped(paper(), ("left", 1, {}), ("right", 2, {}))
     assert find(system, written) == meant
 
@@ -74,7 +74,7 @@ def test_the_derivatives_of_a_star_are_those_of_its_radius() -> None:
     for name in ("coordination.stiffness", "contact.stiffness", "device.mass"):
         value = parameter_of(star, Free(name)).value
         ends = [
-            analyze(apply(star, [Override(name, None, Fraction(value * (1 + way * 1e-5)))])).spectral_radius
+            analyze(apply(star, [Override(Free(name), Fraction(value * (1 + way * 1e-5)))])).spectral_radius
             for way in (1, -1)
         ]
         assert rows[name].derivative == pytest.approx((ends[0] - ends[1]) / (2e-5 * value), rel=1e-4)

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
+from apc.frame.names import Free, Range
 from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
 from tests.topologies import AVERAGE, compiled, told, wall
 
 COLGATE = "colgate:K=it.stiffness,B=it.damping,b=device.damping,T=tick.period"
+
+
+def _on(name: str, low: float, high: float) -> Range:
+    return Range(Free(name), "", Fraction(low), Fraction(high))
+
+
 GIL = "gil:K=it.stiffness,B=it.damping,b=device.damping,T=tick.period,t_d=it.delay"
 
 
@@ -25,7 +34,7 @@ def test_an_overlay_follows_expressions_and_groups() -> None:
     words = "colgate:K=contact.stiffness,B=0 N*s/m,b=a.device.damping,T=haptic.period"
     overlay = parse_overlay(model, words)
     assert symbol_values(model, overlay) == (900.0, 7.0, 0.0, 0.001)
-    curve = overlay_points(model, overlay, ("kc", 10.0, 20_000.0), ("haptic.period", 0.0005, 0.002))
+    curve = overlay_points(model, overlay, _on("kc", 10.0, 20_000.0), _on("haptic.period", 0.0005, 0.002))
     assert curve[:, 0] * curve[:, 1] == pytest.approx(2 * 7, rel=1e-12)
     message = told(parse_overlay, model, words.replace("a.device", "device"))
     assert message == [
@@ -36,24 +45,24 @@ def test_an_overlay_follows_expressions_and_groups() -> None:
 def test_the_curve_of_an_overlay_runs_from_border_to_border() -> None:
     model = wall(0.1, 5.0, 0.001, 900.0)
     overlay = parse_overlay(model, GIL)
-    curve = overlay_points(model, overlay, ("it.stiffness", 0.0, 4000.0), ("it.damping", 0.0, 3.0))
+    curve = overlay_points(model, overlay, _on("it.stiffness", 0.0, 4000.0), _on("it.damping", 0.0, 3.0))
     # K = (5 + B)/1.5e-3 from (3333.3, 0) to (4000, 1).
     assert curve[0] == pytest.approx([5 / 1.5e-3, 0], rel=1e-12)
     assert curve[-1] == pytest.approx([4000, 1], rel=1e-12)
     assert curve[:, 0] == pytest.approx((5 + curve[:, 1]) / 1.5e-3, rel=1e-12)
     assert (np.diff(curve, axis=0) >= 0).all()
-    swapped = overlay_points(model, overlay, ("it.damping", 0.0, 3.0), ("it.stiffness", 0.0, 4000.0))
+    swapped = overlay_points(model, overlay, _on("it.damping", 0.0, 3.0), _on("it.stiffness", 0.0, 4000.0))
     assert swapped[:, ::-1] == pytest.approx(curve, rel=1e-12)
 
 
 def test_a_falling_curve_and_one_parallel_to_an_axis_are_in_order() -> None:
     model = wall(0.1, 5.0, 0.001, 900.0)
     overlay = parse_overlay(model, COLGATE)
-    curve = overlay_points(model, overlay, ("it.stiffness", 0.0, 20_000.0), ("it.damping", 0.0, 8.0))
+    curve = overlay_points(model, overlay, _on("it.stiffness", 0.0, 20_000.0), _on("it.damping", 0.0, 8.0))
     assert curve[0] == pytest.approx([0, 5], rel=1e-12)
     assert curve[-1] == pytest.approx([10_000, 0], rel=1e-12)
     assert (np.diff(curve[:, 0]) >= 0).all() and (np.diff(curve[:, 1]) <= 0).all()
-    line = overlay_points(model, overlay, ("device.mass", 0.1, 1.0), ("it.stiffness", 0.0, 20_000.0))
+    line = overlay_points(model, overlay, _on("device.mass", 0.1, 1.0), _on("it.stiffness", 0.0, 20_000.0))
     assert line[:, 1] == pytest.approx(10_000, rel=1e-12)
     assert (line[0, 0], line[-1, 0]) == (0.1, 1.0)
 
@@ -61,7 +70,9 @@ def test_a_falling_curve_and_one_parallel_to_an_axis_are_in_order() -> None:
 def test_a_condition_that_holds_in_the_whole_window_has_no_curve() -> None:
     model = wall(0.1, 5.0, 0.001, 900.0)
     overlay = parse_overlay(model, COLGATE)
-    assert overlay_points(model, overlay, ("it.stiffness", 0.0, 100.0), ("it.damping", 0.0, 1.0)).shape == (
+    assert overlay_points(
+        model, overlay, _on("it.stiffness", 0.0, 100.0), _on("it.damping", 0.0, 1.0)
+    ).shape == (
         0,
         2,
     )

@@ -12,6 +12,7 @@ import pytest
 from apc.compiler.compiled import PEERS, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from tests.sites import NAMES, columned, derived, grouped, paper
@@ -39,7 +40,7 @@ def _column(system: CompiledSystem, name: str) -> list[float]:
 def test_an_override_reaches_every_group(name: str) -> None:
     system = grouped(paper(), ("left", 1, {"contact.stiffness": 7.0}), ("right", 1, {}))
     override = parse_override(system, f"{name}=0.8 N/mm")
-    assert override == Override("contact.stiffness", None, Fraction(800))
+    assert override == Override(Free("contact.stiffness"), Fraction(800))
     changed = apply(system, [override])
     assert [_value(changed, "contact.stiffness", group) for group in (0, 1)] == [800.0, 800.0]
 
@@ -52,27 +53,28 @@ def test_an_override_of_a_group_leaves_the_others() -> None:
 
 def test_what_depends_on_a_parameter_follows_it() -> None:
     system = derived(paper(), coordination__stiffness="kt/(peers - 1)", lan__delay="2*wait")
-    changed = apply(system, [Override("kt", None, Fraction(3000)), Override("wait", None, Fraction(1, 90))])
+    changed = apply(system, [Override(Free("kt"), Fraction(3000)), Override(Free("wait"), Fraction(1, 90))])
     assert _value(changed, "coordination.stiffness") == 1500.0
     assert resolve(changed).timings["lan.delay"] == Fraction(1, 45)
 
 
 def test_what_no_override_reaches_keeps_its_very_number() -> None:
     system = derived(paper(kt=0.1 + 0.2), coordination__stiffness="kt/(peers - 1)")
-    changed = apply(system, [Override("contact.stiffness", None, Fraction(800))])
+    changed = apply(system, [Override(Free("contact.stiffness"), Fraction(800))])
     assert _value(changed, "coordination.stiffness") == 0.1 + 0.2
 
 
 def test_a_decimal_in_the_text_is_a_decimal_again_for_times() -> None:
     system = derived(paper(), lan__delay="2*wait + kt*wait/kt")
-    changed = apply(system, [Override("kt", None, Fraction(7))])
+    changed = apply(system, [Override(Free("kt"), Fraction(7))])
     assert resolve(changed).timings["lan.delay"] == Fraction(24, 1000)
 
 
 def test_a_group_value_can_change_what_everybody_derives_from_it() -> None:
     system = derived(paper(), coordination__stiffness="2*kt")
     changed = apply(
-        replace(grouped(system, ("left", 1, {}), ("right", 2, {}))), [Override("kt", "left", Fraction(10))]
+        replace(grouped(system, ("left", 1, {}), ("right", 2, {}))),
+        [Override(Free("kt", "left"), Fraction(10))],
     )
     assert [_value(changed, "coordination.stiffness", group) for group in (0, 1)] == [20.0, 500.0]
 
@@ -80,8 +82,8 @@ def test_a_group_value_can_change_what_everybody_derives_from_it() -> None:
 def test_a_group_takes_over_only_what_its_own_value_reaches() -> None:
     system = grouped(derived(paper(), coordination__stiffness="2*kt"), ("left", 1, {}), ("right", 2, {}))
     overrides = [
-        Override("coordination.stiffness", None, Fraction(7)),
-        Override("device.mass", "left", Fraction(1)),
+        Override(Free("coordination.stiffness"), Fraction(7)),
+        Override(Free("device.mass", "left"), Fraction(1)),
     ]
     changed = apply(system, overrides)
     assert [[value.name for value in group.values] for group in changed.groups] == [["device.mass"], []]
@@ -90,8 +92,8 @@ def test_a_group_takes_over_only_what_its_own_value_reaches() -> None:
 
 def test_setting_a_dependent_parameter_ends_its_dependence() -> None:
     system = derived(paper(), coordination__stiffness="2*kt")
-    once = apply(system, [Override("coordination.stiffness", None, Fraction(5))])
-    again = apply(once, [Override("kt", None, Fraction(1))])
+    once = apply(system, [Override(Free("coordination.stiffness"), Fraction(5))])
+    again = apply(once, [Override(Free("kt"), Fraction(1))])
     assert _value(again, "coordination.stiffness") == 5.0
 
 
@@ -126,7 +128,7 @@ def test_what_has_no_value_any_more_is_told_with_its_place(text: str, setting: s
 def test_what_is_not_asked_for_does_no_harm_and_rationals_stay_exact(text: str, value: float) -> None:
     system = derived(paper(), coordination__stiffness=text, coordination__damping="0*kt")
     free = replace(system, parameters=tuple(replace(one, minimum=None) for one in system.parameters))
-    changed = apply(free, [Override("kt", None, Fraction(0))])
+    changed = apply(free, [Override(Free("kt"), Fraction(0))])
     assert _value(changed, "coordination.stiffness") == value
     found = next(one for one in changed.parameters if one.name == "coordination.stiffness")
     assert found.exact == Fraction(value)
@@ -134,7 +136,7 @@ def test_what_is_not_asked_for_does_no_harm_and_rationals_stay_exact(text: str, 
 
 def test_a_time_is_exact() -> None:
     override = parse_override(paper(), "clocks.network.period=1/90 s")
-    assert override == Override("network.period", None, Fraction(1, 90))
+    assert override == Override(Free("network.period"), Fraction(1, 90))
 
 
 def test_mistakes_say_what_to_write() -> None:
@@ -198,15 +200,15 @@ def _own_values(system: CompiledSystem) -> list[Override]:
     """Return every number and time of a scene as an override that sets it to what it is."""
     own = {value.name for group in system.groups for value in group.values}
     own |= {column.name for group in system.groups for column in group.columns}
-    found = [Override(one.name, None, one.number) for one in system.parameters if one.name not in own]
-    found += [Override(one.name, None, one.value) for one in system.timings]
+    found = [Override(Free(one.name), one.number) for one in system.parameters if one.name not in own]
+    found += [Override(Free(one.name), one.value) for one in system.timings]
     found += [
-        Override(one.name, group.name, one.number)
+        Override(Free(one.name, group.name), one.number)
         for group in system.groups
         for one in group.values
         if one.formula is None
     ]
-    return [one for one in found if one.name != PEERS]
+    return [one for one in found if one.free.name != PEERS]
 
 
 @pytest.mark.parametrize("scene", sorted(path.name for path in SCENES.glob("*.yaml")))

@@ -39,7 +39,7 @@ def test_what_depends_on_a_column_is_worked_out_peer_by_peer() -> None:
     )
     system = columned(derived(paper(), coordination__stiffness=text), device__mass=[0.1, 0.2, 0.4])
     assert _column(system, "coordination.stiffness") == pytest.approx([250.0, 150.0, 200.0], rel=1e-15)
-    doubled = apply(system, [Override("kt", None, Fraction(1000))])
+    doubled = apply(system, [Override(Free("kt"), Fraction(1000))])
     assert _column(doubled, "coordination.stiffness") == pytest.approx([500.0, 300.0, 400.0], rel=1e-15)
 
 
@@ -65,7 +65,7 @@ def test_free_values_give_the_rows_that_overrides_give_what_depends_on_them_incl
     values = np.array([100.0, 300.0, 700.0])
     rows = free_rows(system, system.groups[0], 0, {Free("kt"): values})
     for value, row in zip(values, rows, strict=True):
-        changed = apply(system, [Override("kt", None, Fraction(value))])
+        changed = apply(system, [Override(Free("kt"), Fraction(value))])
         assert row.tolist() == resolve(changed).parameters[0][0].tolist()
 
 

@@ -15,6 +15,7 @@ import pytest
 import apc
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, RADII
 from tests.topologies import AVERAGE, MESH, compiled, replaced
@@ -37,7 +38,7 @@ def model(scheme: str, peers: int = 3, delays: str = "all") -> CompiledSystem:
 
 
 def changed(system: CompiledSystem, values: dict[str, float]) -> CompiledSystem:
-    return apply(system, [Override(name, None, Fraction(repr(value))) for name, value in values.items()])
+    return apply(system, [Override(Free(name), Fraction(repr(value))) for name, value in values.items()])
 
 
 @cache

@@ -107,7 +107,7 @@ def test_a_mean_of_three_allows_twice_the_gain_of_their_sum_all_along_the_curve(
 def test_what_is_inside_is_what_an_analysis_calls_stable(paper: Region, average: CompiledSystem) -> None:
     random = np.random.default_rng(7)
     for x, y in random.uniform(10, 3000, (25, 2)).tolist():
-        overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((paper.x, x), (paper.y, y))]
+        overrides = [Override(axis.free, Fraction(v)) for axis, v in ((paper.x, x), (paper.y, y))]
         assert paper.contains(x, y) == analyze(apply(average, overrides)).stable
     grid = np.linspace(10, 3000, 60)
     share = paper.contains(*np.meshgrid(grid, grid)).mean()
@@ -163,7 +163,7 @@ def test_a_mass_and_a_damping_can_be_axes(average: CompiledSystem) -> None:
     assert all(curve.error <= 1e-9 for curve in found.curves)
     random = np.random.default_rng(3)
     for x, y in zip(random.uniform(0.02, 0.3, 15), random.uniform(0.5, 8, 15), strict=True):
-        overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
+        overrides = [Override(axis.free, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
         assert found.contains(x, y) == analyze(apply(average, overrides)).stable
 
 
@@ -176,7 +176,7 @@ def test_a_scene_linearized_at_its_start_has_a_region_too() -> None:
     assert "holds near its start values only" in str(found)
     random = np.random.default_rng(2)
     for x, y in random.uniform([100, 100], [6000, 4000], (8, 2)).tolist():
-        overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
+        overrides = [Override(axis.free, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
         assert found.contains(x, y) == analyze(apply(system, overrides)).stable
 
 
@@ -195,7 +195,7 @@ def test_the_document_is_the_contract(paper: Region) -> None:
 def test_the_frequency_is_that_of_the_mode_on_the_boundary(paper: Region, average: CompiledSystem) -> None:
     [curve] = paper.curves
     x, y = curve.knots[len(curve.knots) // 2]
-    overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((paper.x, x), (paper.y, y))]
+    overrides = [Override(axis.free, Fraction(v)) for axis, v in ((paper.x, x), (paper.y, y))]
     mode = analyze(apply(average, overrides)).modes[0]
     low, high = curve.frequency_hz
     assert low <= mode.frequency_hz * (1 + 1e-9)
@@ -250,8 +250,8 @@ def test_an_axis_that_cannot_be_is_told(
 
 def test_the_scenes_own_axes_are_taken_when_none_are_given(average: CompiledSystem) -> None:
     x, y = parse_axes(average, None, None)
-    assert (x.label, x.low, x.high) == ("contact.stiffness", 0, 5000)
-    assert (y.label, y.low, y.high) == ("coordination.stiffness", 0, 1500)
+    assert (x.free.label, x.low, x.high) == ("contact.stiffness", 0, 5000)
+    assert (y.free.label, y.low, y.high) == ("coordination.stiffness", 0, 1500)
 
 
 def test_a_scene_without_studies_asks_for_axes() -> None:
@@ -273,7 +273,7 @@ def test_a_stiffness_that_holds_another_force_has_a_region_from_nothing_on() -> 
     assert len(found.curves) == 1
     random = np.random.default_rng(5)
     for x, y in random.uniform([1, 1], [5000, 1500], (12, 2)).tolist():
-        overrides = [Override(axis.name, None, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
+        overrides = [Override(axis.free, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
         assert found.contains(x, y) == analyze(apply(system, overrides)).stable
 
 

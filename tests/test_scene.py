@@ -249,6 +249,11 @@ def test_all_mistakes_of_a_file_come_together_in_its_order() -> None:
             "3:20: E203 seed wants a whole number, 0 or more, got -1.",
         ),
         (
+            "clocks:",
+            "experiment: {seed: true}\nclocks:",
+            "3:20: E203 seed wants a whole number, 0 or more, got true.",
+        ),
+        (
             "studies:",
             "studis:",
             "16:1: E202 a topology has no key studis; the nearest is studies. Write: studies",

@@ -84,7 +84,7 @@ def test_equal_groups_have_an_active_set_and_no_single_gradient() -> None:
     step = 1e-3
     radius = [
         analyze(
-            apply(system, [Override("contact.stiffness", "one", Fraction(1000.0 + side))])
+            apply(system, [Override(Free("contact.stiffness", "one"), Fraction(1000.0 + side))])
         ).spectral_radius
         for side in (-step, 0.0, step)
     ]

@@ -12,7 +12,7 @@ import pytest
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
-from apc.frame.names import find
+from apc.frame.names import Free, find
 from apc.frame.overrides import Override, apply, parse_override
 from apc.vary.sensitivity import sensitivities
 from tests.bench.sensitivity_truth import check_frequencies, check_sensitivities, run, scene
@@ -101,13 +101,13 @@ def changed_by_a_percent(system: CompiledSystem) -> str:
         rows = [row for row in found.rows if row.parameter == name]
         if not rows[0].value:
             continue
-        known, group = find(system, name)
+        free = find(system, name)
         unit = "" if rows[0].unit == "1" else f" {rows[0].unit}"
         sides = []
         for share in (Fraction(-1, 1000), Fraction(1, 1000)):
             text = f"{name}={rows[0].value * (1 + float(share))!r}{unit}"
             override = parse_override(system, text)
-            assert (override.name, override.group) == (known, group)
+            assert override.free == free
             sides.append(analyze(apply(system, [override])).spectral_radius)
         said = [row.relative for row in rows]
         # The largest of those that share the radius decides on either side.
@@ -184,7 +184,7 @@ couplers:
     assert analysis.unfelt == ("p.s",)
     assert "Nothing ties" not in str(analysis)
     # Without the spring the device translates, and the integrator adds up where to: no drift.
-    loose = analyze(apply(system, [Override("p.kp", None, Fraction(0))]))
+    loose = analyze(apply(system, [Override(Free("p.kp"), Fraction(0))]))
     assert (loose.verdict, loose.stable, loose.translations) == ("stable up to a common translation", True, 1)
-    felt = analyze(apply(system, [Override("p.ki", None, Fraction(1))]))
+    felt = analyze(apply(system, [Override(Free("p.ki"), Fraction(1))]))
     assert (felt.rigid_modes, felt.unfelt) == (0, ())

@@ -9,8 +9,9 @@ import pytest
 
 from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import CompiledSystem
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
-from apc.present.region import stable_outlines
+from apc.present.region_picture import stable_outlines
 from apc.regions.axes import parse_axes
 from apc.regions.region import Region, region
 from apc.vary.critical import critical
@@ -33,7 +34,7 @@ def computing(scene: CompiledSystem) -> Region:
 
 
 def limit(scene: CompiledSystem, delay: str, value: Fraction, stiffness: str) -> float:
-    found = critical(apply(scene, [Override(delay, None, value)]), stiffness).value
+    found = critical(apply(scene, [Override(Free(delay), value)]), stiffness).value
     assert found is not None
     return found
 
@@ -64,7 +65,7 @@ def test_points_beside_the_curves_are_on_the_side_that_an_analysis_says(
             for x, y in points.tolist():
                 values = [Fraction(x), Fraction(y)]
                 names = ("contact.delay", "contact.stiffness")
-                moved = [Override(name, None, value) for name, value in zip(names, values, strict=True)]
+                moved = [Override(Free(name), value) for name, value in zip(names, values, strict=True)]
                 assert analyze(apply(scene, moved), prepared=prepared).stable is (sign > 0)
                 assert computing.contains(x, y) is (sign > 0)
 
@@ -97,7 +98,7 @@ def test_over_a_link_the_boundary_is_a_staircase_at_the_critical_values(scene: C
     x, y = outline.T
     assert abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2 == pytest.approx(area, rel=1e-12)
     low, high = curve.frequency_hz
-    leading = analyze(apply(scene, [Override("coordination.stiffness", None, Fraction(1100))])).modes[0]
+    leading = analyze(apply(scene, [Override(Free("coordination.stiffness"), Fraction(1100))])).modes[0]
     assert low <= leading.frequency_hz + 1
     assert high >= leading.frequency_hz - 1
     assert curve.mode == "difference"
@@ -111,8 +112,8 @@ def test_a_staircase_that_another_mode_takes_over_is_a_curve_a_mode(scene: Compi
         low, high = curve.frequency_hz
         for delay, stiffness in curve.knots[::4]:
             beside = [
-                Override("lan.delay", None, Fraction(float(delay))),
-                Override("coordination.stiffness", None, Fraction(float(stiffness))),
+                Override(Free("lan.delay"), Fraction(float(delay))),
+                Override(Free("coordination.stiffness"), Fraction(float(stiffness))),
             ]
             listed = analyze(apply(scene, beside)).modes
             near = min(listed, key=lambda mode: abs(mode.magnitude - 1) + (mode.shape != curve.mode))
@@ -121,7 +122,7 @@ def test_a_staircase_that_another_mode_takes_over_is_a_curve_a_mode(scene: Compi
 
 
 def test_over_two_times_the_boundary_is_known_to_a_cell(scene: CompiledSystem) -> None:
-    system = apply(scene, [Override("coordination.stiffness", None, Fraction(900))])
+    system = apply(scene, [Override(Free("coordination.stiffness"), Fraction(900))])
     axes = parse_axes(system, "contact.delay=0.5 ms:3 ms", "coordination.delay=0 ms:2 ms")
     found = region(system, axes, cells=3)
     assert found.stepped

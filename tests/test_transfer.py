@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from apc.large.transfer import StateSpace, build_transfer, differentiate, respond
+from apc.frame.lift import BoundedMap, FrameMap
+from apc.large.transfer import build_transfer, differentiate, respond
 
 
-def _sites(seed: int, *, error: float = 0.0, chain: int = 2) -> StateSpace:
+def _sites(seed: int, *, error: float = 0.0, chain: int = 2) -> BoundedMap:
     """Return sites with two slow pairs and a chain that runs empty, in units far apart."""
     random = np.random.default_rng(seed)
     k, n = 7, 4 + chain
@@ -27,12 +26,13 @@ def _sites(seed: int, *, error: float = 0.0, chain: int = 2) -> StateSpace:
     m = m / units[:, None] * units
     b, s = random.standard_normal((k, n, 2)) / units[:, None], random.standard_normal((k, 2, n)) * units
     d = random.standard_normal((k, 2, 2))
-    return StateSpace(m, b, s, d, error * np.abs(m), error * np.abs(b), error * np.abs(s), error * np.abs(d))
+    maps = FrameMap(m, b, s, d)
+    return BoundedMap(*maps.blocks, maps.mapped(lambda block: error * np.abs(block)))
 
 
-def _answer(space: StateSpace, counts: np.ndarray, point: complex) -> np.ndarray:
-    n = space.m.shape[-1]
-    one = space.d + space.s @ np.linalg.solve(point * np.eye(n) - space.m, space.b.astype(complex))
+def _answer(maps: FrameMap, counts: np.ndarray, point: complex) -> np.ndarray:
+    n = maps.p.shape[-1]
+    one = maps.d + maps.s @ np.linalg.solve(point * np.eye(n) - maps.p, maps.q.astype(complex))
     return np.tensordot(counts, one, 1)
 
 
@@ -43,9 +43,9 @@ COUNTS = np.array([1.0, 2.0, 1.0, 5.0, 1.0, 1.0, 3.0])
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("reach", [0.0, 1e-4, 1e-3])
 def test_the_answer_is_within_its_bound_anywhere_in_the_disc(seed: int, reach: float) -> None:
-    space = _sites(seed)
+    maps = _sites(seed)
     random = np.random.default_rng(seed)
-    transfer = build_transfer(space, COUNTS)
+    transfer = build_transfer(maps, COUNTS)
     found = respond([transfer], POINTS, np.full(len(POINTS), reach))
     value, doubt = found.value, found.doubt
     for point, centre, slope, bound in zip(POINTS, value, found.slope, doubt, strict=True):
@@ -53,21 +53,18 @@ def test_the_answer_is_within_its_bound_anywhere_in_the_disc(seed: int, reach: f
             inside = point + reach * np.sqrt(random.random()) * np.exp(2j * np.pi * random.random())
             # The truth itself is computed in floats, far better than the bound but for reach 0.
             straight = centre + (inside - point) * slope
-            assert np.all(np.abs(_answer(space, COUNTS, inside) - straight) <= bound + 1e-12 * np.abs(centre))
+            assert np.all(np.abs(_answer(maps, COUNTS, inside) - straight) <= bound + 1e-12 * np.abs(centre))
     assert np.all(doubt <= 1e-7 * np.abs(value).max()) or reach
 
 
 def test_the_bound_covers_what_the_matrices_may_be_off_by() -> None:
-    space = _sites(3, error=1e-9)
+    maps = _sites(3, error=1e-9)
     random = np.random.default_rng(1)
-    found = respond([build_transfer(space, COUNTS)], POINTS, np.zeros(len(POINTS)))
+    found = respond([build_transfer(maps, COUNTS)], POINTS, np.zeros(len(POINTS)))
     for _ in range(20):
-        off: dict[str, Any] = {
-            name: getattr(space, name)
-            + random.choice([-1, 1], getattr(space, name).shape) * getattr(space, f"{name}_error")
-            for name in ("m", "b", "s", "d")
-        }
-        moved = StateSpace(**off, m_error=0, b_error=0, s_error=0, d_error=0)
+        moved = maps.mapped(
+            lambda block, error: block + random.choice([-1, 1], block.shape) * error, maps.error
+        )
         for point, centre, bound in zip(POINTS, found.value, found.doubt, strict=True):
             assert np.all(np.abs(_answer(moved, COUNTS, point) - centre) <= bound)
 

@@ -18,100 +18,89 @@ from typing import TypeVar
 from apc.compiler.errors import Place
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spanned:
+    """A node of a tree, abstract: `start` and `end` are offsets into the parsed text, in no comparison."""
+
+    start: int = field(default=0, compare=False, repr=False)
+    end: int = field(default=0, compare=False, repr=False)
+
+
 @dataclass(frozen=True, slots=True)
-class Number:
+class Number(Spanned):
     """A number without a unit, exact."""
 
     value: Fraction
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Name:
+class Name(Spanned):
     """`object.x` is `("object", "x")`; an index stays with its segment, `("finger[2]", "x")`."""
 
     parts: tuple[str, ...]
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Negate:
+class Negate(Spanned):
     """−operand."""
 
     operand: Expr
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Binary:
+class Binary(Spanned):
     """`operator` is one of + - * / ^; the right side of ^ is a `Number`, maybe negative or a fraction."""
 
     operator: str
     left: Expr
     right: Expr
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Compare:
+class Compare(Spanned):
     """A condition; `operator` is one of < <= > >= == !=."""
 
     operator: str
     left: Expr
     right: Expr
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Logic:
+class Logic(Spanned):
     """A condition of two conditions; `operator` is `and` or `or`."""
 
     operator: str
     left: Expr
     right: Expr
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Not:
+class Not(Spanned):
     """The opposite of a condition."""
 
     operand: Expr
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class Call(Spanned):
     """A function of `FUNCTIONS` and its arguments."""
 
     function: str
     arguments: tuple[Expr, ...]
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Conditional:
+class Conditional(Spanned):
     """`if condition then then else otherwise`; an `elseif` is a `Conditional` in `otherwise`."""
 
     condition: Expr
     then: Expr
     otherwise: Expr
-    start: int = field(default=0, compare=False, repr=False)
-    end: int = field(default=0, compare=False, repr=False)
 
 
 V = TypeVar("V")
 
 Expr = Number | Name | Negate | Binary | Compare | Logic | Not | Call | Conditional
-"""One node of a tree; `start` and `end` are offsets into the parsed text and count in no comparison."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -227,18 +227,20 @@ class _Parser:
             right = self.exponent()
             if self.kind == "^":
                 self.fail("E326", "a power of a power needs parentheses", hint="(x^2)^3")
-            return self.built(Binary("^", left, right, left.start, self.last_end), left)
+            return self.built(Binary("^", left, right, start=left.start, end=self.last_end), left)
         if binds in (Level.OR, Level.AND):
             self.want_condition(left)
             right = self.condition(binds + 1)
-            return self.built(Logic(operator, left, right, left.start, right.end), left, right)
+            return self.built(Logic(operator, left, right, start=left.start, end=right.end), left, right)
         self.want_number(left)
         right = self.number(binds + 1)
         if binds == Level.COMPARE:
             if self.kind in COMPARISONS:
                 self.fail("E322", "a comparison has two sides", hint="a < b and b < c")
-            return self.built(Compare(operator, left, right, left.start, self.last_end), left, right)
-        return self.built(Binary(operator, left, right, left.start, self.last_end), left, right)
+            return self.built(
+                Compare(operator, left, right, start=left.start, end=self.last_end), left, right
+            )
+        return self.built(Binary(operator, left, right, start=left.start, end=self.last_end), left, right)
 
     def prefix(self, level: int) -> Expr:
         """Parse what an operand starts with."""
@@ -257,11 +259,11 @@ class _Parser:
             case "-":
                 self.step()
                 operand = self.number(Level.SIGN)
-                return self.built(Negate(operand, token.start, self.last_end), operand)
+                return self.built(Negate(operand, start=token.start, end=self.last_end), operand)
             case "not" if level <= Level.NOT:
                 self.step()
                 operand = self.condition(Level.NOT)
-                return self.built(Not(operand, token.start, self.last_end), operand)
+                return self.built(Not(operand, start=token.start, end=self.last_end), operand)
             case "if" if level == 0:
                 return self.conditional()
             case "not" | "if":
@@ -294,7 +296,7 @@ class _Parser:
         else:
             self.expect("else", "an if … then")
             otherwise = self.number(0)
-        expr = Conditional(condition, then, otherwise, start, self.last_end)
+        expr = Conditional(condition, then, otherwise, start=start, end=self.last_end)
         return self.built(expr, condition, then, otherwise)
 
     def literal(self) -> Expr:
@@ -305,7 +307,7 @@ class _Parser:
             what = f"{cut(said)} is not a number, and units stand on parameters only"
             hint = f"{token.text}*{self.token.text}, or a parameter's name" if self.kind == "name" else ""
             self.fail("E323", what, hint=hint, at=token.start)
-        return Number(value, token.start, token.end)
+        return Number(value, start=token.start, end=token.end)
 
     def exact(self, token: Token) -> Fraction:
         """Return a literal's exact value, inside bounds."""
@@ -341,7 +343,7 @@ class _Parser:
         if abs(value) > MAX_POWER or value.denominator > MAX_POWER:
             limit = f"-{MAX_POWER} to {MAX_POWER}, or a fraction of such numbers"
             self.fail("E326", "an exponent", limit, cut(str(value)), at=start)
-        return Number(value, start, self.last_end)
+        return Number(value, start=start, end=self.last_end)
 
     def exponent_part(self, start: int) -> Fraction:
         if self.kind != "number":
@@ -355,7 +357,7 @@ class _Parser:
     def name_or_call(self) -> Expr:
         token = self.step()
         if self.kind != "(":
-            return Name(tuple(token.text.split(".")), token.start, token.end)
+            return Name(tuple(token.text.split(".")), start=token.start, end=token.end)
         function = token.text
         if function not in FUNCTIONS:
             close = nearest(function, FUNCTIONS)
@@ -372,7 +374,7 @@ class _Parser:
                 self.fail("E322", f"an argument of {function} is missing behind the comma")
         end = self.expect(")", f"{function}(").end
         self.check_count(function, len(arguments), token.start)
-        return self.built(Call(function, tuple(arguments), token.start, end), *arguments)
+        return self.built(Call(function, tuple(arguments), start=token.start, end=end), *arguments)
 
     def check_count(self, function: str, count: int, at: int) -> None:
         least, most = FUNCTIONS[function]

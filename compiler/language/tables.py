@@ -1,6 +1,6 @@
 """Tables in CSV files: columns with their units in the headings.
 
-Takes: a path. Gives: `read_table`, a `Table` in SI; `open_table`, for files not all of numbers.
+Takes: a path. Gives: `read_table`, a `Table` in SI; `open_table`, for files not all of numbers; `NamedFiles`.
 Guarantees: every cell is a finite number, or a mistake names its file, line and column; of a file that is no
 table no text is told, as it may be somebody's; a number takes eight bytes.
 Does not: know what a column means.
@@ -13,11 +13,11 @@ import hashlib
 import io
 import re
 from array import array
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,36 @@ class Reader(Protocol):
     def __iter__(self) -> Iterator[list[str]]: ...
 
     def __next__(self) -> list[str]: ...
+
+
+class Digested(Protocol):
+    """What was read of a file; `digest` is the SHA-256 of its bytes."""
+
+    @property
+    def digest(self) -> str:
+        """The digest."""
+
+
+F = TypeVar("F", bound=Digested)
+
+
+@dataclass(frozen=True, slots=True)
+class NamedFiles:
+    """The files a topology names, of a `folder`: the digests of those read, by name, and all `mistakes`."""
+
+    folder: Path
+    mistakes: Mistakes
+    digests: dict[str, str] = field(default_factory=dict)
+
+    def read(self, name: str, reader: Callable[[Path], F]) -> F | None:
+        """Return what a reader finds in a file; None, and its mistakes are taken, if that is at fault."""
+        try:
+            found = reader(self.folder / name)
+        except ApcError as error:
+            self.mistakes.take(error)
+            return None
+        self.digests[name] = found.digest
+        return found
 
 
 @dataclass(frozen=True, slots=True)

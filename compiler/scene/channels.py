@@ -15,15 +15,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import ApcError, Mistakes
+from apc.compiler.errors import Mistakes
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Binary, Name, Number
 from apc.compiler.language.recordings import read_trace
+from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import Value
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar
@@ -74,9 +74,7 @@ def read_channel(
     jitter: Value | None,
     words: Mapping[str, str],
     read_number: Callable[[Node, str], Value | None],
-    folder: Path,
-    mistakes: Mistakes,
-    texts: dict[str, str],
+    files: NamedFiles,
 ) -> SceneChannel | None:
     """Read what makes a link unreliable; None when its entry says nothing of the kind.
 
@@ -92,13 +90,10 @@ def read_channel(
         Its words: distribution, reorder, on_loss.
     read_number
         Reads a number without a unit, or an expression for one.
-    folder
-        Where files named in the topology are.
-    mistakes
-        Where faults go.
-    texts
-        The digests of files read, added to.
+    files
+        Reads a trace, and takes what is at fault.
     """
+    mistakes = files.mistakes
     given = {key for key in ("loss", "jitter", "trace") if nodes.get(key) is not None}
     _check_words(link, body, given, mistakes)
     if not given:
@@ -114,7 +109,7 @@ def read_channel(
         words.get("distribution", "uniform"),
         words.get("reorder", "newest"),
         words.get("on_loss", "hold"),
-        None if trace is None else _trace(trace, folder, mistakes, texts),
+        None if trace is None else _trace(trace, files),
     )
 
 
@@ -175,14 +170,7 @@ def _probability(
     return None
 
 
-def _trace(node: Node, folder: Path, mistakes: Mistakes, texts: dict[str, str]) -> NDArray[np.float64] | None:
-    text = read_text(node, "trace", mistakes, hint=_EXAMPLES["trace"])
-    if text is None:
-        return None
-    try:
-        trace = read_trace(folder / text, node.place)
-    except ApcError as error:
-        mistakes.take(error)
-        return None
-    texts[text] = trace.digest
-    return trace.delays
+def _trace(node: Node, files: NamedFiles) -> NDArray[np.float64] | None:
+    text = read_text(node, "trace", files.mistakes, hint=_EXAMPLES["trace"])
+    trace = None if text is None else files.read(text, lambda path: read_trace(path, node.place))
+    return None if trace is None else trace.delays

@@ -11,16 +11,24 @@ import math
 import re
 from collections.abc import Mapping as MappingType
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from apc.compiler.compiled import Graph
-from apc.compiler.errors import ApcError, Mistakes
-from apc.compiler.language.tables import Table, read_table
+from apc.compiler.errors import Mistakes
+from apc.compiler.language.tables import NamedFiles, Table, read_table
 from apc.compiler.language.values import Value
 from apc.compiler.source.nodes import Node, Scalar, Sequence
-from apc.compiler.source.reading import add_unknown, brief, check_keys, entries, form, read_mapping, read_text
+from apc.compiler.source.reading import (
+    add_unknown,
+    brief,
+    check_keys,
+    entries,
+    form,
+    read_mapping,
+    read_text,
+    whole_number,
+)
 
 # On a graph that isn't complete each peer has a place of its own in several arrays: gigabytes for more.
 MOST_PLACED = 1_000_000
@@ -40,9 +48,7 @@ class SceneDelay:
     delay: Value
 
 
-def read_graph(
-    node: Node | None, counts: MappingType[str, int], folder: Path, mistakes: Mistakes, texts: dict[str, str]
-) -> Graph:
+def read_graph(node: Node | None, counts: MappingType[str, int], files: NamedFiles) -> Graph:
     """Read `complete`, `ring`, `star`, `{edges: …}` or `{arcs: …}`.
 
     Parameters
@@ -51,13 +57,10 @@ def read_graph(
         The node; None means complete.
     counts
         The number of peers by group, in order.
-    folder
-        Where files named in the topology are.
-    mistakes
-        Where faults go.
-    texts
-        The digests of files read, added to.
+    files
+        Reads tables of arcs, and takes what is at fault.
     """
+    mistakes = files.mistakes
     if node is None:
         return COMPLETE
     peers = sum(counts.values())
@@ -83,7 +86,7 @@ def read_graph(
         )
         return COMPLETE
     key, value = body.entries[0]
-    reader = _ArcReader(counts, folder, mistakes, texts)
+    reader = _ArcReader(counts, files)
     pairs = reader.read(value, key.text)
     if key.text == "edges":
         pairs += [(receiver, sender, weight) for sender, receiver, weight in pairs]
@@ -92,13 +95,10 @@ def read_graph(
 
 
 class _ArcReader:
-    def __init__(
-        self, counts: MappingType[str, int], folder: Path, mistakes: Mistakes, texts: dict[str, str]
-    ) -> None:
+    def __init__(self, counts: MappingType[str, int], files: NamedFiles) -> None:
         self.counts = counts
-        self.folder = folder
-        self.mistakes = mistakes
-        self.texts = texts
+        self.files = files
+        self.mistakes = files.mistakes
         self.peers = sum(counts.values())
         self.starts: dict[str, int] = {}
         total = 0
@@ -162,12 +162,9 @@ class _ArcReader:
     def _peer(self, node: Node) -> int | None:
         """Return a peer's number, from 0: written 1 to N, or as left[2]."""
         if isinstance(node, Scalar):
-            if (
-                isinstance(node.value, int)
-                and not isinstance(node.value, bool)
-                and 1 <= node.value <= self.peers
-            ):
-                return node.value - 1
+            number = whole_number(node)
+            if number is not None and 1 <= number <= self.peers:
+                return number - 1
             found = _PEER.match(node.text)
             if (
                 found
@@ -181,12 +178,9 @@ class _ArcReader:
         return None
 
     def _from_file(self, node: Scalar, what: str) -> list[tuple[int, int, float]]:
-        try:
-            table = read_table(self.folder / node.text, node.place)
-        except ApcError as error:
-            self.mistakes.take(error)
+        table = self.files.read(node.text, lambda path: read_table(path, node.place))
+        if table is None:
             return []
-        self.texts[node.text] = table.digest
         names = [column.name for column in table.columns]
         if names not in (["from", "to"], ["from", "to", "weight"]):
             got = brief(", ".join(names))

@@ -15,7 +15,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +24,12 @@ from apc.compiler.components.component import Number, Option, Reference, Settabl
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import names
-from apc.compiler.language.tables import Column, Table, read_table
+from apc.compiler.language.tables import Column, NamedFiles, Table, read_table
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import PEERS, Value
 from apc.compiler.scene.instances import Part
 from apc.compiler.source.nodes import Mapping as MappingNode
-from apc.compiler.source.nodes import Node, Scalar, Sequence
+from apc.compiler.source.nodes import Node, Sequence
 from apc.compiler.source.reading import (
     add_unknown,
     brief,
@@ -40,6 +39,7 @@ from apc.compiler.source.reading import (
     read_mapping,
     read_name,
     read_text,
+    whole_number,
 )
 
 # By whole name, one number a peer, in SI.
@@ -65,9 +65,7 @@ class Settings:
     columns: Columns
 
 
-def read_counts(
-    node: Node | None, folder: Path, mistakes: Mistakes, texts: dict[str, str]
-) -> dict[str, GroupBody]:
+def read_counts(node: Node | None, files: NamedFiles) -> dict[str, GroupBody]:
     """Read how many peers each group has.
 
     A group says `count`, or has a `table` with a row a peer, or lists in `set` with a value a peer.
@@ -76,13 +74,10 @@ def read_counts(
     ----------
     node
         The section `peers`.
-    folder
-        Where its tables are found.
-    mistakes
-        Takes what is at fault.
-    texts
-        Takes the digest of each table read, by its name.
+    files
+        Reads its tables, and takes what is at fault.
     """
+    mistakes = files.mistakes
     found: dict[str, GroupBody] = {}
     hint = "peers: {user: {count: 3}}"
     section = read_mapping(node, "peers", mistakes, hint=hint)
@@ -99,24 +94,18 @@ def read_counts(
         if name is None or body is None:
             continue
         body = check_keys(body, ("count", "set", "table"), f"group {name}", mistakes)
-        table = _read_table(body.get("table"), folder, mistakes, texts)
+        table = _read_table(body.get("table"), files)
         count = _read_count(body, name, table, mistakes)
         if count is not None:
             found[name] = GroupBody(name, count, body, table)
     return found
 
 
-def _read_table(node: Node | None, folder: Path, mistakes: Mistakes, texts: dict[str, str]) -> Table | None:
-    text = read_text(node, "table", mistakes, hint="table: users.csv")
+def _read_table(node: Node | None, files: NamedFiles) -> Table | None:
+    text = read_text(node, "table", files.mistakes, hint="table: users.csv")
     if node is None or text is None:
         return None
-    try:
-        table = read_table(folder / text, node.place)
-    except ApcError as error:
-        mistakes.take(error)
-        return None
-    texts[text] = table.digest
-    return table
+    return files.read(text, lambda path: read_table(path, node.place))
 
 
 def _read_count(body: MappingNode, name: str, table: Table | None, mistakes: Mistakes) -> int | None:
@@ -135,8 +124,8 @@ def _read_count(body: MappingNode, name: str, table: Table | None, mistakes: Mis
         if body.get("table") is None:
             mistakes.add("E201", body.place, f"group {name} has no count", hint="count: 3")
         return None
-    count = node.value if isinstance(node, Scalar) and node.plain else None
-    if isinstance(count, int) and not isinstance(count, bool) and 1 <= count <= LARGEST_COUNT:
+    count = whole_number(node)
+    if count is not None and 1 <= count <= LARGEST_COUNT:
         if table is not None and table.rows != count:
             what = f"group {name} has a count of {count} and a table of {table.rows} rows"
             mistakes.add("E208", node.place, what, hint=f"count: {table.rows}")

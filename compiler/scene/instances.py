@@ -13,12 +13,13 @@ from collections.abc import Collection
 from collections.abc import Mapping as MappingType
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path
+from functools import partial
 
 from apc.compiler.components.component import Component, Inner, Reference, Settable
 from apc.compiler.components.parts import GROUND, MOST_PARTS, Scope, read_entry
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.language.recordings import TimeTable, read_time_table
+from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import (
     PEERS,
     Binding,
@@ -81,7 +82,7 @@ class PartEntry:
 class PartReader:
     """Reads the entries of parts, one after the other; counts the parts there are so far.
 
-    `counts` are the groups and how many peers each has; `texts` takes the digests of the files read.
+    `counts` are the groups and how many peers each has.
     """
 
     def __init__(
@@ -90,15 +91,13 @@ class PartReader:
         scope: Scope,
         numbers: NamedNumbers,
         counts: MappingType[str, int],
-        folder: Path,
-        texts: dict[str, str],
+        files: NamedFiles,
     ) -> None:
         self.entries = entries
         self.scope = scope
         self.numbers = numbers
         self.counts = counts
-        self.folder = folder
-        self.texts = texts
+        self.files = files
         self.mistakes = numbers.mistakes
         self.number_of_parts = 0
 
@@ -186,14 +185,9 @@ class PartReader:
                 self.mistakes.add("E201", entry.place, f"{name} has no {parameter.name}", hint=hint)
             elif text is not None:
                 assert parameter.unit is not None
-                try:
-                    table = read_time_table(self.folder / text, parameter.name, parameter.unit, node.place)
-                except ApcError as error:
-                    self.mistakes.take(error)
-                    continue
-                self.texts[text] = table.digest
-                found.append(table)
-        return tuple(found)
+                own = partial(read_time_table, name=parameter.name, unit=parameter.unit, named_at=node.place)
+                found.append(self.files.read(text, own))
+        return tuple(table for table in found if table is not None)
 
     def _shared(self, name: str, component: Component, node: Node | None) -> bool:
         if node is None:

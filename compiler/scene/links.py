@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping as MappingType
 from dataclasses import dataclass
-from pathlib import Path
 
 from apc.compiler.compiled import Graph
 from apc.compiler.components.component import Reference
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND
+from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import Value
 from apc.compiler.scene.channels import SceneChannel, read_channel
 from apc.compiler.scene.graphs import COMPLETE, SceneDelay, read_graph, read_pairs
@@ -41,9 +41,7 @@ def read_link(
     body: Mapping,
     counts: MappingType[str, int],
     numbers: NamedNumbers,
-    folder: Path,
-    mistakes: Mistakes,
-    texts: dict[str, str],
+    files: NamedFiles,
 ) -> SceneLink | None:
     """Read what a link's entry says beyond numbers and words.
 
@@ -55,12 +53,8 @@ def read_link(
         How many peers each group has.
     numbers
         Reads the delays.
-    folder
-        Where files named in the topology are.
-    mistakes
-        Takes what is at fault.
-    texts
-        Takes the digest of each file read, by its name.
+    files
+        Reads tables and traces, and takes what is at fault.
 
     Returns
     -------
@@ -71,11 +65,11 @@ def read_link(
     roles = {p.role: p.name for p in part.component.parameters if isinstance(p, Reference)}
     graph = COMPLETE
     if "graph" in roles:
-        graph = read_graph(body.get(roles["graph"]), counts, folder, mistakes, texts)
+        graph = read_graph(body.get(roles["graph"]), counts, files)
     delays = _read_delays(body.get(roles["delays"]), counts, numbers) if "delays" in roles else ()
     if "clock" not in roles or part.component.parameter("delay") is None:
         what = f"{part.name} is a {part.component.name}, which is no link: it has no clock and delay"
-        mistakes.add("E210", part.place, what, hint="type: Link")
+        files.mistakes.add("E210", part.place, what, hint="type: Link")
         return None
     channel = read_channel(
         part.name,
@@ -84,9 +78,7 @@ def read_link(
         values.get("jitter"),
         dict(part.options),
         lambda node, what: numbers.read(node, what, DIMENSIONLESS, "%"),
-        folder,
-        mistakes,
-        texts,
+        files,
     )
     if clock is None or "delay" not in values:
         return None  # reported where it is

@@ -1,6 +1,7 @@
 """The named numbers of a topology, and reading numbers that may be expressions over them.
 
-Takes: the section `parameters` and the number of peers. Gives: `NamedNumbers`, `read_named_numbers`.
+Takes: the section `parameters` and the number of peers.
+Gives: `NamedNumbers`, `read_named_numbers`; `read_new_name`.
 Guarantees: a number read has the dimension it must have; what depends on a name whose fault was reported adds
 no message of its own.
 Does not: know what a number is for, but for the bounds of a component's parameter.
@@ -8,7 +9,7 @@ Does not: know what a number is for, but for the bounds of a component's paramet
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Container, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -29,20 +30,30 @@ from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import brief, entries, read_mapping, read_name
 
 
+def read_new_name(key: Scalar, what: str, taken: Container[str], mistakes: Mistakes) -> str | None:
+    """Read a name that nothing in the topology has yet, and that is no word of the language."""
+    name = read_name(key, what, mistakes)
+    if name in RESERVED:
+        mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
+    elif name is not None and name in taken:
+        mistakes.add("E205", key.place, f"the name {name} is used twice in this topology")
+    else:
+        return name
+    return None
+
+
 def read_named_numbers(node: Node | None, peers: int, mistakes: Mistakes) -> NamedNumbers:
     """Read `parameters: {kt: 2000 N/m}`; `peers` is the number that the name `peers` stands for."""
     section = read_mapping(node, "parameters", mistakes, hint="parameters: {kt: 2000 N/m}")
     waiting: dict[str, Binding] = {}
     faulty: set[str] = set()
     for key, value in entries(section):
-        name = read_name(key, "a parameter", mistakes)
+        name = read_new_name(key, "a parameter", (), mistakes)
         binding = read_free(value, key.text, mistakes)
-        if name in RESERVED:
-            mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
-        elif name is not None and binding is not None:
+        if name is not None and binding is not None:
             waiting[name] = binding
-            continue
-        faulty.add(key.text)
+        else:
+            faulty.add(key.text)
     values, unresolved = resolve_in_order(waiting, peers, mistakes)
     return NamedNumbers(values, frozenset(faulty | unresolved), peers, mistakes)
 

@@ -21,9 +21,8 @@ from apc.compiler.components.component import Settable
 from apc.compiler.components.library import Library
 from apc.compiler.errors import Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
-from apc.compiler.language.values import (
-    Value,
-)
+from apc.compiler.language.tables import NamedFiles
+from apc.compiler.language.values import Value
 from apc.compiler.scene.groups import Columns, GroupBody, read_counts, read_settings, with_followers
 from apc.compiler.scene.instances import Part, PartReader, settable_names
 from apc.compiler.scene.links import SceneLink, read_link
@@ -147,8 +146,7 @@ def _folder_of(source: Source) -> Path:
 
 def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene | None:
     """Read every section, those first that others refer to."""
-    folder = _folder_of(source)
-    texts: dict[str, str] = {}
+    files = NamedFiles(_folder_of(source), mistakes)
     root = read_mapping(source.root, "a topology", mistakes, hint="topology: my-scene")
     if root is None:
         return None
@@ -157,15 +155,15 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     about = visible(read_text(root.get("about"), "about", mistakes) or "")
     peers = _required(root, "peers", "{user: {count: 3}}", mistakes)
     _required(root, "masses", "{device: {mass: 0.1 kg}}", mistakes)
-    bodies = read_counts(peers, folder, mistakes, texts)
+    bodies = read_counts(peers, files)
     counts = {name: group.count for name, group in bodies.items()}
     numbers = read_named_numbers(root.get("parameters"), sum(counts.values()), mistakes)
     clocks = read_clocks(root.get("clocks"), numbers, {*numbers.values, *counts}, mistakes)
     sections = PartSections(root, library, {*numbers.values, *counts, *clocks}, mistakes)
-    reader = PartReader(sections.entries, sections.scope(numbers, clocks), numbers, counts, folder, texts)
+    reader = PartReader(sections.entries, sections.scope(numbers, clocks), numbers, counts, files)
     parts = [part for name in sections.entries for part in reader.read(name)]
     links = [
-        read_link(part, sections.entries[part.name].body, counts, numbers, folder, mistakes, texts)
+        read_link(part, sections.entries[part.name].body, counts, numbers, files)
         for part in parts
         if part.section == "links" and "." not in part.name
     ]
@@ -180,7 +178,7 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
         tuple(link for link in links if link is not None),
         read_experiment(root.get("experiment"), numbers.read_time, mistakes),
         read_region(root.get("studies"), settable, sections.is_reported, numbers.read_for, mistakes),
-        tuple(sorted(texts.items())),
+        tuple(sorted(files.digests.items())),
         root.place,
     )
 

@@ -8,17 +8,16 @@ Does not: read what an entry says beyond its type and count (see `instances`).
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Container
+from collections.abc import Collection
 
-from apc.compiler.components.component import RESERVED
 from apc.compiler.components.definitions import read_type
 from apc.compiler.components.library import Library
 from apc.compiler.components.parts import LARGEST_ARRAY, Scope
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.scene.instances import PartEntry
-from apc.compiler.scene.named_numbers import NamedNumbers
-from apc.compiler.source.nodes import Mapping, Node, Scalar
-from apc.compiler.source.reading import entries, form, read_mapping, read_name
+from apc.compiler.scene.named_numbers import NamedNumbers, read_new_name
+from apc.compiler.source.nodes import Mapping, Node
+from apc.compiler.source.reading import entries, form, read_mapping, whole_number
 
 SECTIONS = ("masses", "couplers", "links", "hands")
 DEFAULT_TYPES = {"masses": "Mass", "links": "Link"}
@@ -38,10 +37,10 @@ class PartSections:
     `complete` is False when a whole section is missing or is none. All of that was reported.
     """
 
-    def __init__(self, root: Mapping, library: Library, taken: Container[str], mistakes: Mistakes) -> None:
+    def __init__(self, root: Mapping, library: Library, taken: Collection[str], mistakes: Mistakes) -> None:
         self.root = root
         self.library = library
-        self.taken = taken
+        self.taken = {*taken}
         self.mistakes = mistakes
         self.entries: dict[str, PartEntry] = {}
         self.faulty: set[str] = set()
@@ -57,23 +56,18 @@ class PartSections:
         mistakes = self.mistakes
         hint = f"{section}: {{{_EXAMPLES[section]}}}"
         for key, value in entries(read_mapping(node, section, mistakes, hint=hint)):
-            name = read_name(key, f"a part of {section}", mistakes)
+            name = read_new_name(key, f"a part of {section}", self.taken, mistakes)
             body = read_mapping(value, key.text, mistakes, hint=_EXAMPLES[section])
             if key.text not in self.entries:
                 self.faulty.add(key.text)  # until it has been read
             if name is None or body is None:
-                continue
-            if name in self.entries or name in self.taken:
-                mistakes.add("E205", key.place, f"the name {name} is used twice in this topology")
-                continue
-            if name in RESERVED:
-                mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
                 continue
             default, example = DEFAULT_TYPES.get(section), _TYPE_EXAMPLES.get(section, "Mass")
             component = read_type(key, body, default, self.library, mistakes, example=example)
             if component is not None:
                 count = self._count(name, section, body)
                 self.entries[name] = PartEntry(section, body, component, key.place, count)
+                self.taken.add(name)
                 self.faulty.discard(name)
 
     def _count(self, name: str, section: str, body: Mapping) -> int | None:
@@ -81,9 +75,8 @@ class PartSections:
         node = body.get("count")
         if node is None:
             return None
-        count = node.value if isinstance(node, Scalar) and node.plain else None
-        usable = isinstance(count, int) and not isinstance(count, bool) and section != "links"
-        if usable and isinstance(count, int) and 1 <= count <= LARGEST_ARRAY:
+        count = whole_number(node)
+        if section != "links" and count is not None and 1 <= count <= LARGEST_ARRAY:
             return count
         expected = (
             f"a whole number from 1 to {LARGEST_ARRAY}"

@@ -13,8 +13,8 @@ from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Number, Settable
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.values import Value
-from apc.compiler.source.nodes import Node, Scalar, Sequence
-from apc.compiler.source.reading import add_unknown, brief, check_keys, form, read_mapping
+from apc.compiler.source.nodes import Node, Sequence
+from apc.compiler.source.reading import add_unknown, brief, check_keys, form, read_mapping, whole_number
 
 # What can be set: by the name a person writes, the whole names it stands for.
 SettableNames = Mapping[str, list[tuple[str, Settable]]]
@@ -43,12 +43,10 @@ def read_experiment(
         got = str(duration)
         mistakes.add("E207", duration.place, "duration", expected="more than 0 s", got=got)
     seed = section.get("seed")
-    number = 0
-    if isinstance(seed, Scalar) and isinstance(seed.value, int) and 0 <= seed.value < 2**63:
-        number = int(seed.value)
-    elif seed is not None:
+    number = 0 if seed is None else whole_number(seed)
+    if seed is not None and (number is None or not 0 <= number < 2**63):
         mistakes.add("E203", seed.place, "seed", expected="a whole number, 0 or more", got=form(seed))
-    return Experiment(duration.number if duration is not None else None, number)
+    return Experiment(duration.number if duration is not None else None, number or 0)
 
 
 def read_region(

@@ -11,13 +11,12 @@ from collections.abc import Container
 from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.components.component import RESERVED
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.values import Value
-from apc.compiler.scene.named_numbers import NamedNumbers
+from apc.compiler.scene.named_numbers import NamedNumbers, read_new_name
 from apc.compiler.source.nodes import Mapping, Node
-from apc.compiler.source.reading import check_keys, entries, read_mapping, read_name
+from apc.compiler.source.reading import check_keys, entries, read_mapping
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +46,8 @@ def read_clocks(
     """
     found: dict[str, SceneClock] = {}
     for key, value in entries(read_mapping(node, "clocks", mistakes, hint="clocks: {haptic: 1 ms}")):
-        name = read_name(key, "a clock", mistakes)
+        name = read_new_name(key, "a clock", taken, mistakes)
         if name is None:
-            continue
-        if name in RESERVED:
-            mistakes.add("E205", key.place, f"{name} is a word of the language and can't be a name")
-            continue
-        if name in taken:
-            mistakes.add("E205", key.place, f"the name {name} is used twice in this topology")
             continue
         clock = _read_clock(name, value, numbers, mistakes)
         if clock is not None and _is_clock(clock, mistakes):

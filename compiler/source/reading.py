@@ -69,6 +69,12 @@ def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "
     return None
 
 
+def whole_number(node: Node) -> int | None:
+    """Return the whole number that a scalar is; None if it is none, as `true` or one in quotes."""
+    value = node.value if isinstance(node, Scalar) else None
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
 def read_name(node: Scalar, what: str, mistakes: Mistakes) -> str | None:
     """Return the text of a scalar that can serve as a name: a letter, then letters, digits, underscores."""
     if IDENTIFIER.match(node.text):

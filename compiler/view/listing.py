@@ -1,7 +1,7 @@
-"""What a scene is made of, as text for a person to read: what `apc show` tells, and the value of any stage.
+"""What a scene is made of, as text for a person to read: what `apc show` tells.
 
-Takes: a topology's path, or the value of a stage.
-Gives: `show_text` and `show_document` (for JSON), `show_dot`, `show_svg`; `describe`.
+Takes: a topology's path.
+Gives: `show_text` and `show_document` (for JSON), `show_dot`, `show_svg`.
 Guarantees: `show_text` has at most 80 columns wherever a name allows it; the same topology gives the same
 bytes.
 Does not: analyse, or compute anything new.
@@ -12,28 +12,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
-import casadi
-import sympy
-
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.equations.clocks import ClockedSystem, ReceiveCrossing
+from apc.compiler.equations.clocks import ClockedSystem
 from apc.compiler.equations.flatten import FlatKind, FlatSystem
-from apc.compiler.equations.solution import Assignment, ImplicitBlock
+from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
-from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.language.values import Value
 from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
 from apc.compiler.scene.scene import Scene
-from apc.compiler.source.nodes import Mapping, Node, Scalar
-from apc.compiler.source.source import Source
 from apc.compiler.view.diagram import Diagram, build_diagram, draw_dot, one_of, seconds
 from apc.compiler.view.picture import place
+from apc.compiler.view.stages import plain, step_lines
 from apc.compiler.view.svg import draw_svg
 from apc.compiler.words import counted, wrapped
 
@@ -347,151 +340,3 @@ def _times(number: int) -> str:
 
 def _time(number: float) -> str:
     return seconds(Fraction(number))
-
-
-@singledispatch
-def describe(value: object) -> str:
-    """Return the value of a stage as text."""
-    raise AssertionError(f"{type(value).__name__} is no stage's value")
-
-
-@describe.register
-def _(source: Source) -> str:
-    return "\n".join(_nodes(source.root, ""))
-
-
-def _nodes(node: Node, indent: str) -> Iterator[str]:
-    place = f"{node.place.line}:{node.place.column}"
-    if isinstance(node, Scalar):
-        yield f"{indent}{node.text!r}  ({type(node.value).__name__}, {place})"
-    elif isinstance(node, Mapping):
-        for key, value in node.entries:
-            yield f"{indent}{key.text}:  ({key.place.line}:{key.place.column})"
-            yield from _nodes(value, indent + "  ")
-    else:
-        for item in node.items:
-            yield f"{indent}-  ({place})"
-            yield from _nodes(item, indent + "  ")
-
-
-@describe.register
-def _(scene: Scene) -> str:
-    lines = [f"topology {scene.name}: {scene.about}"]
-    lines += [
-        f"clock {c.name}: every {_quantity(c.period)}, first at {_quantity(c.phase)}" for c in scene.clocks
-    ]
-    lines += [f"parameter {name} = {_quantity(value)}" for name, value in scene.parameters]
-    for group in scene.groups:
-        lines.append(f"group {group.name}: {group.count} peers")
-        lines += [f"  {name} = {_quantity(value)}" for name, value in group.values]
-        lines += [f"  {name} = {word}" for name, word in group.words]
-        lines += [f"  {name}: a value a peer" for name, _ in group.columns]
-    for part in scene.parts:
-        shared = ", shared" if part.shared else ""
-        lines.append(
-            f"{part.section} {part.name}: {part.component.name}{shared}, at {', '.join(part.groups)}"
-        )
-        lines += [f"  {name} = {_quantity(value)}" for name, value in (*part.values, *part.starts)]
-        lines += [f"  {name} = {word}" for name, word in (*part.options, *part.references)]
-        lines += [
-            f"  {own} joins {f'{other}.{its}' if its else other}" for own, other, its in part.connections
-        ]
-    for link in scene.links:
-        lines.append(f"link {link.name}: {link.graph.shape}, on {link.clock}, delay {_quantity(link.delay)}")
-        lines += [f"  from {d.sender} to {d.receiver}: {_quantity(d.delay)}" for d in link.delays]
-        if link.channel is not None:
-            lines += [f"  {told}" for told in link.channel.told]
-    return "\n".join(lines)
-
-
-def _quantity(value: Value) -> str:
-    return f"{format_expression(value.expression)} = {value}" if value.expression else str(value)
-
-
-@describe.register
-def _(flat: FlatSystem) -> str:
-    return "\n".join(line for kind in flat.kinds for line in _flat_kind(kind))
-
-
-def _flat_kind(kind: FlatKind) -> Iterator[str]:
-    yield f"kind {kind.name}: {len(kind.equations)} equations, {len(kind.variables)} unknowns"
-    yield from (f"  unknown {v.name} [{format_dimension(v.dimension)}]" for v in kind.variables)
-    yield from (f"  {e.text}    # {e.origin}" for e in kind.equations)
-    yield from (f"  send over {s.link}: {s.name} = {format_expression(s.expression)}" for s in kind.sends)
-
-
-@describe.register
-def _(clocked: ClockedSystem) -> str:
-    lines = []
-    for kind in clocked.kinds:
-        lines.append(f"kind {kind.flat.name}")
-        for partition in kind.partitions:
-            lines.append(f"  {partition.clock}: {', '.join(partition.variables)}")
-            lines += [f"    {equation.text}" for equation in partition.equations]
-        lines += [f"  sample on {s.clock}: {format_expression(s.expression)}" for s in kind.samples]
-        lines += [
-            f"  hold of {h.clock}: {h.variable}, after {format_expression(h.delay)} s" for h in kind.holds
-        ]
-        lines += [f"  previous on {p.clock}: {p.variable}" for p in kind.previous]
-        lines += [f"  receive on {r.clock} over {r.link}: {_heard(r)}" for r in kind.receives]
-        lines += [f"  send over {s.link}: {s.name} = {format_expression(s.expression)}" for s in kind.sends]
-    return "\n".join(lines)
-
-
-def _heard(receive: ReceiveCrossing) -> str:
-    what = receive.send if receive.edge is None else format_expression(receive.edge)
-    return f"{receive.operator} of {what}"
-
-
-@describe.register
-def _(system: SortedSystem) -> str:
-    lines = []
-    for kind in system.kinds:
-        lines.append(f"kind {kind.clocked.flat.name}: states {', '.join(kind.states)}")
-        lines += [f"  alias {name} = {plain(expression)}" for name, expression in kind.aliases]
-        for partition in kind.partitions:
-            lines.append(f"  {partition.clock}:")
-            lines += [line for step in partition.assignments for line in step_lines(step)]
-        lines += [f"  {name} := {plain(expression)}" for name, _, expression in kind.samples]
-        lines += [f"  send over {s.link}: {s.name} := {plain(s.expression)}" for s in kind.sends]
-    return "\n".join(lines)
-
-
-def step_lines(step: Assignment | ImplicitBlock) -> Iterator[str]:
-    """Yield an assignment, or a nonlinear loop: its chain, then what is computed on the way round."""
-    if not isinstance(step, ImplicitBlock):
-        yield f"    {step[0]} := {plain(step[1])}"
-        return
-    yield f"    loop {step.chain}"
-    yield from (f"      guess {name}" for name in step.tearing)
-    yield from (f"      {name} := {plain(expression)}" for name, expression in step.inner)
-    yield from (f"      until 0 = {plain(expression)}" for expression in step.residuals)
-
-
-def plain(expression: sympy.Expr) -> str:
-    """Return an expression as text, terms and factors in a fixed order."""
-    return str(sympy.sstr(expression, order="lex"))
-
-
-@describe.register
-def _(system: CompiledSystem) -> str:
-    lines = [f"{system.name}: {system.about}"]
-    lines += [f"timing {t.name} = {t.value} s" for t in system.timings]
-    lines += [f"parameter {p.name} = {p.value:.12g} {p.unit}" for p in system.parameters]
-    for kind in system.kinds:
-        lines.append(f"kind {kind.name}")
-        lines += _function_lines(kind.derivative, [f"der({state.name})" for state in kind.states])
-        for clock in kind.clocks:
-            lines += _function_lines(clock.tick, clock.outputs)
-        for send in kind.sends:
-            lines += _function_lines(send.send, send.channels)
-    lines += [f"dropped {name}: {reason}" for name, reason in system.dropped]
-    return "\n".join(lines)
-
-
-def _function_lines(function: Any, names: Iterable[str]) -> Iterator[str]:
-    yield f"  {function}"
-    if not function.is_a("SXFunction"):
-        return  # it solves a loop: a graph of matrices, whose entries have no text of their own
-    values = function(*function.sx_in())
-    yield from (f"    {name} = {casadi.SX(values[row])}" for row, name in enumerate(names))

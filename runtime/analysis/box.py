@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups, prepare
-from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -31,7 +30,7 @@ from apc.eigen.peer_group import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios
 from apc.frame.exact import evaluate_exact
 from apc.frame.linearize import site_of_row
-from apc.frame.names import Free, find
+from apc.frame.names import Free, Range, find
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
@@ -81,9 +80,9 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (equals and name and value):
         raise _malformed(text, place)
-    known, group = find(system, name, place)
-    refuse_channel_number(system, Free(known, group), place)
-    parameter = _parameter(system, known, group, place)
+    free = find(system, name, place)
+    refuse_channel_number(system, free, place)
+    parameter = _parameter(system, free, place)
     if value.startswith(("±", "+-")):
         share = _percentage(value.removeprefix("±").removeprefix("+-"), text, place)
         middle = Fraction(parameter.value)
@@ -98,7 +97,7 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
             raise _malformed(text, place)
         low, high = (quantity(one, place, what=name, unit=parameter.unit).value for one in (first, last))
     _check_limits(parameter, low, high, name, place)
-    return Range(known, group, parameter.unit, low, high)
+    return Range(free, parameter.unit, low, high)
 
 
 def _malformed(text: str, place: Place) -> ApcError:
@@ -120,8 +119,9 @@ def _percentage(text: str, whole: str, place: Place) -> Fraction:
     return share
 
 
-def _parameter(system: CompiledSystem, name: str, group: str | None, place: Place) -> Parameter:
+def _parameter(system: CompiledSystem, free: Free, place: Place) -> Parameter:
     """Return the parameter a box is about; refuse times and values that differ from peer to peer."""
+    name, group = free.name, free.group
     common = {parameter.name: parameter for parameter in system.parameters}
     if name not in common:
         what = f"{name} is a time: what happens in a frame changes with it by jumps, not by degrees"
@@ -161,9 +161,8 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
         E831 a parameter left open twice, E832 a scene that is no rational function of the parameters.
     """
     for place, one in enumerate(ranges):
-        same = [other for other in ranges[:place] if other.name == one.name]
-        if any(other.group == one.group or None in (one.group, other.group) for other in same):
-            raise ApcError(Mistake("E831", _PLACE, f"{one.label} is left open twice"))
+        if any(other.free.meets(one.free) for other in ranges[:place]):
+            raise ApcError(Mistake("E831", _PLACE, f"{one.free.label} is left open twice"))
     prepared = prepare(system)
     if not all(site.parameters_suffice for site in prepared.jacobians):
         what = f"{system.name} is not linear: where it is linearized may move with the parameters"
@@ -171,7 +170,7 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
     field = Ratios.of(len(ranges))
     opened = [_opened(system, group, ranges, field) for group in system.groups]
     for share in GENERIC:
-        point = [Override(one.name, one.group, one.low + share * (one.high - one.low)) for one in ranges]
+        point = [Override(one.free, one.low + share * (one.high - one.low)) for one in ranges]
         groups, exchange = lifted_groups(apply(system, point), prepared=prepared)
         members = [_members(group, exchange.starts) for group in groups]
         if all(len({_reach(opened[place]) for place in own}) == 1 for own in members):
@@ -210,9 +209,9 @@ def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field
     scope = scope_of(system, group.values, fixed=columns)
     varying = scope.follow(dict.fromkeys(columns, True), lambda *_: True, lambda _: False)
     given = {
-        one.name: field.parameter(place)
+        one.free.name: field.parameter(place)
         for place, one in enumerate(ranges)
-        if one.group in (None, group.name)
+        if one.free.group in (None, group.name)
     }
 
     def compute(name: str, formula: Formula, values: list[Any]) -> Any:

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.box import Box, open_box
-from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import (
     Balls,
@@ -47,6 +46,7 @@ from apc.eigen.ratios import Ratio
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, stays_rigid, what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
+from apc.frame.names import Range
 from apc.frame.site import LinearSite, entrywise
 from apc.result import Result
 from apc.threads import single_threaded

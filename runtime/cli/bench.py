@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import json_option, print_result, set_option, tell
+from apc.cli.options import file_argument, file_option, json_option, print_result, set_option, tell
 from apc.cli.progress import at_work
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -21,14 +21,9 @@ HARD = Path("tests/hard")  # of a copy of the repository
 
 
 @click.command("bench")
-@click.argument("file", required=False)
+@file_argument
 @set_option
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Draw error against time: .png, .svg or .pdf.",
-)
+@file_option("--plot", "Draw error against time: .png, .svg or .pdf.")
 @click.option(
     "--scale",
     "counts",

@@ -18,7 +18,7 @@ import click
 from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
 from apc.cli.critical import critical_command
-from apc.cli.options import beside, tell
+from apc.cli.options import beside, file_argument, file_option, tell
 from apc.cli.progress import at_work
 from apc.cli.region import region_command
 from apc.cli.simulate import simulate_command
@@ -118,7 +118,7 @@ def new(name: str) -> None:
 
 
 @apc.command()
-@click.argument("file", required=False)
+@file_argument
 def check(file: str | None) -> None:
     """Report every mistake in a topology; build nothing.
 
@@ -133,7 +133,7 @@ def check(file: str | None) -> None:
 
 
 @apc.command("compile")
-@click.argument("file", required=False)
+@file_argument
 @click.option(
     "--until",
     type=click.Choice(STAGES),
@@ -156,7 +156,7 @@ def compile_command(file: str | None, until: str, force: bool, timings: bool) ->
     path = Path(file) if file else find_input(compiled_too=False)
     if until != "compiled":
         from apc.compiler.pipeline import run_stages
-        from apc.compiler.view.listing import describe
+        from apc.compiler.view.stages import describe
 
         tell(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
         return
@@ -202,7 +202,7 @@ def _compile(path: Path, *, timings: bool) -> None:
 
 
 @apc.command()
-@click.argument("file", required=False)
+@file_argument
 @click.option(
     "--format",
     "format_",
@@ -210,7 +210,7 @@ def _compile(path: Path, *, timings: bool) -> None:
     help="text: graph, equations, schedule. json: the same as one document. dot: the graph for Graphviz. "
     "svg: the graph as a picture. Taken from --out if not given, else text.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal.")
+@file_option("--out", "Write to this file instead of the terminal.")
 def show(file: str | None, format_: str | None, out: Path | None) -> None:
     """Show what a scene is made of: its graph, equations and schedule.
 
@@ -231,7 +231,7 @@ def show(file: str | None, format_: str | None, out: Path | None) -> None:
 
 
 @apc.command()
-@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal.")
+@file_option("--out", "Write to this file instead of the terminal.")
 def schema(out: Path | None) -> None:
     """Print the JSON Schema of topologies, for editors.
 

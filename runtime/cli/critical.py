@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import json_option, print_result, set_option
+from apc.cli.options import file_argument, json_option, print_result, set_option
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
@@ -23,7 +23,7 @@ SCENES = (".yaml", ".yml", ".apc")
 
 @click.command("critical")
 @click.argument("path")
-@click.argument("file", required=False)
+@file_argument
 @set_option
 @click.option("--upper", metavar='"VALUE UNIT"', help="Look no further up than this.")
 @click.option("--lower", metavar='"VALUE UNIT"', help="Look no further down than this.")

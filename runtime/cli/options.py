@@ -1,14 +1,17 @@
-"""What commands have in common: the options `--set` and `--json`, and how a result is printed.
+"""What commands have in common: FILE, the options `--set` and `--json`, and how a result is printed.
 
-Takes: a result. Gives: `set_option`, `json_option`, `WholeNumber`; `print_result`, `tell`, `beside`.
+Takes: a result.
+Gives: `file_argument`, `file_option`, `set_option`, `json_option`, `WholeNumber`; `print_result`, `tell`,
+`beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
@@ -18,6 +21,9 @@ from apc.compiler.files import is_stdout
 from apc.present.forms import json_text
 from apc.result import Result
 
+Command = TypeVar("Command", bound=Callable[..., None])
+
+file_argument = click.argument("file", required=False)
 set_option = click.option(
     "--set",
     "settings",
@@ -26,6 +32,11 @@ set_option = click.option(
     help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+
+
+def file_option(name: str, told: str, *, required: bool = False) -> Callable[[Command], Command]:
+    """Return an option that names a file to write; `told` is its help."""
+    return click.option(name, type=click.Path(path_type=Path), metavar="FILE", help=told, required=required)
 
 
 class WholeNumber(click.IntRange):

@@ -12,14 +12,23 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import WholeNumber, beside, json_option, print_result, set_option, tell
+from apc.cli.options import (
+    WholeNumber,
+    beside,
+    file_argument,
+    file_option,
+    json_option,
+    print_result,
+    set_option,
+    tell,
+)
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
 
 
 @click.command("region")
-@click.argument("file", required=False)
+@file_argument
 @click.option("--x", metavar="PATH=LO:HI", help="Horizontal axis; the scene's studies: region: if not given.")
 @click.option("--y", metavar="PATH=LO:HI", help="Vertical axis.")
 @click.option(
@@ -53,12 +62,7 @@ from apc.threads import start_single_threaded
     show_default=True,
     help="Cells along each side of the rectangle to begin with.",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.",
-)
+@file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
 @json_option
 def region_command(
     file: str | None,

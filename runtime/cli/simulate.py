@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from apc.cli.options import WholeNumber, beside, json_option, print_result, set_option, tell
+from apc.cli.options import (
+    WholeNumber,
+    beside,
+    file_argument,
+    file_option,
+    json_option,
+    print_result,
+    set_option,
+    tell,
+)
 from apc.cli.progress import progress_bar
 from apc.compiler.errors import ApcError
 from apc.compiler.files import partial_name
@@ -30,7 +39,7 @@ if TYPE_CHECKING:
 
 
 @click.command("simulate")
-@click.argument("file", required=False)
+@file_argument
 @click.option(
     "--duration",
     metavar='"TIME"',
@@ -43,24 +52,9 @@ if TYPE_CHECKING:
     metavar="PATTERN",
     help="Record only what fits, such as cube.x, 'left[2].*' or '*.v'. May be repeated.",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write the rows to this file: .csv, .parquet, .mat or .npz.",
-)
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Draw them, a panel a quantity: .png, .svg or .pdf.",
-)
-@click.option(
-    "--still",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf.",
-)
+@file_option("--out", "Write the rows to this file: .csv, .parquet, .mat or .npz.")
+@file_option("--plot", "Draw them, a panel a quantity: .png, .svg or .pdf.")
+@file_option("--still", "Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf.")
 @json_option
 @click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
 @click.option(

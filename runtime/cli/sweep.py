@@ -14,7 +14,16 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import WholeNumber, beside, json_option, print_result, set_option, tell
+from apc.cli.options import (
+    WholeNumber,
+    beside,
+    file_argument,
+    file_option,
+    json_option,
+    print_result,
+    set_option,
+    tell,
+)
 from apc.cli.progress import Bar, progress_bar
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
@@ -22,7 +31,7 @@ from apc.option_value import option_value
 
 
 @click.command("sweep")
-@click.argument("file", required=False)
+@file_argument
 @click.option(
     "--over",
     multiple=True,
@@ -31,13 +40,7 @@ from apc.option_value import option_value
     help="Vary a parameter: PATH='LOW:HIGH', 'LOW:HIGH:COUNT', 'LOW:HIGH:COUNT:log' or 'V1,V2,V3', with "
     "units. May be repeated: every combination is computed, the last parameter turning fastest.",
 )
-@click.option(
-    "--out",
-    required=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write the rows to this file, .parquet or .csv.",
-)
+@file_option("--out", "Write the rows to this file, .parquet or .csv.", required=True)
 @click.option(
     "--of",
     default="analyze",

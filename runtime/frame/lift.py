@@ -1,7 +1,7 @@
 """One frame of one site as one linear map.
 
 Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
-Gives: `FrameMap`, `compose`; `LiftedSite`, `lift`, `bounded`; `follow`, the frame event by event.
+Gives: `FrameMap`, `compose`; `BoundedMap`, `LiftedSite`, `lift`, `bounded`; `follow`, event by event.
 Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
 exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
 Does not: know who the others are (see `modes`).
@@ -65,13 +65,19 @@ class FrameMap:
 
 
 @dataclass(frozen=True, slots=True)
-class LiftedSite(FrameMap):
-    """The one-frame map of a site, or of many of one kind; `error` bounds it entry by entry.
+class BoundedMap(FrameMap):
+    """A map and what it may be off by, entry by entry."""
+
+    error: FrameMap
+
+
+@dataclass(frozen=True, slots=True)
+class LiftedSite(BoundedMap):
+    """The one-frame map of a site, or of many of one kind.
 
     `estimated` says that the errors of some site are an estimate, as the bound says nothing.
     """
 
-    error: FrameMap
     z_names: tuple[str, ...]
     continuous: int  # the first so many entries of z are continuous states
     frame_s: float

@@ -1,7 +1,7 @@
 """What a person calls a parameter or a timing, and what stands behind the name.
 
 Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
-Gives: `Free`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`, `unit_of`.
+Gives: `Free`, `Range`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`, `unit_of`.
 Guarantees: a name that means nothing raises, with the nearest real one.
 Does not: read or change values.
 """
@@ -9,6 +9,7 @@ Does not: read or change values.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 from apc.compiler.compiled import PEERS, CompiledSystem, Parameter, Timing, counts_peers
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
@@ -22,7 +23,7 @@ OVERRIDE = Place("override")
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """A parameter or timing whose value is left open: of one group, or of all (`group` None)."""
+    """A parameter or timing that a value is wanted of: of one group, or of all (`group` None)."""
 
     name: str
     group: str | None = None
@@ -32,9 +33,23 @@ class Free:
         """The name as a person writes it, its group before it."""
         return self.name if self.group is None else f"{self.group}.{self.name}"
 
+    def meets(self, other: Free) -> bool:
+        """Say whether both are one number of some group: without a group it is that of all."""
+        return self.name == other.name and (self.group == other.group or None in (self.group, other.group))
 
-def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[str, str | None]:
-    """Return the parameter or timing a person's name means, and the group it names, if any.
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """What a box leaves open, or an axis of a region runs over: from `low` to `high`, exact, in SI."""
+
+    free: Free
+    unit: str
+    low: Fraction
+    high: Fraction
+
+
+def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> Free:
+    """Return the parameter or timing a person's name means, of the group it names, if any.
 
     Raises
     ------
@@ -64,7 +79,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> tuple[st
     if name not in known:
         near = nearest(name, sorted(known))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
-    return name, group
+    return Free(name, group)
 
 
 def is_named(name: str) -> bool:

@@ -21,7 +21,7 @@ from apc.compiler.compiled import CompiledSystem, Group, Parameter, Timing
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.formula import exact_value
 from apc.compiler.words import with_unit
-from apc.frame.names import OVERRIDE, find, unit_of
+from apc.frame.names import OVERRIDE, Free, find, unit_of
 from apc.frame.parameters import Scope, columns_of, scope_of
 
 N = TypeVar("N", Parameter, Timing)
@@ -29,10 +29,9 @@ N = TypeVar("N", Parameter, Timing)
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """A new SI value for a parameter or timing: of one group, or of all (`group` None)."""
+    """A new SI value for a parameter or timing."""
 
-    name: str
-    group: str | None
+    free: Free
     value: Fraction
 
 
@@ -53,12 +52,12 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
     if not (equals and name and value):
         form = "contact.stiffness=800 N/m"
         raise ApcError(Mistake("E621", place, "an override", "NAME=VALUE", text[:80], form))
-    known, group = find(system, name, place)
-    unit = unit_of(system, known)
+    free = find(system, name, place)
+    unit = unit_of(system, free.name)
     found = quantity(
         value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
     )
-    return Override(known, group, found.value)
+    return Override(free, found.value)
 
 
 def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSystem:
@@ -72,13 +71,13 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     """
     if not overrides:
         return system
-    everywhere = {one.name: one.value for one in overrides if one.group is None}
+    everywhere = {one.free.name: one.value for one in overrides if one.free.group is None}
     timings = {timing.name for timing in system.timings}
     parameters = {parameter.name: parameter for parameter in system.parameters}
     common = _changed(scope_of(system), everywhere)
     groups = []
     for group in system.groups:
-        own = {one.name: one.value for one in overrides if one.group == group.name}
+        own = {one.free.name: one.value for one in overrides if one.free.group == group.name}
         # Set for everybody means for this group as well: its own old value goes. A time of its own stays.
         shared = {name: value for name, value in everywhere.items() if f"{group.name}.{name}" not in timings}
         values = {value.name: value for value in group.values if value.name not in shared}

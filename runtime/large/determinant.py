@@ -24,10 +24,11 @@ from apc.eigen.closing import Coupling
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange, check_mean
+from apc.frame.lift import BoundedMap, FrameMap
 from apc.frame.schedule import Heard, Sent, Way
 from apc.large.characteristic import Characteristic
-from apc.large.populations import Population, hear_themselves
-from apc.large.transfer import StateSpace, build_transfer
+from apc.large.populations import Population, hear_themselves, rows_of
+from apc.large.transfer import build_transfer
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -125,8 +126,8 @@ def of_populations(listed: Sequence[Population], exchange: Exchange) -> tuple[Ch
     for g, population in enumerate(listed):
         k = len(population.parameters)
         own, weight = (np.tile(row, (k, 1)) for row in (places.own[g], places.others[g]))
-        space = hear_themselves(population.lifted, population.schedule, own, weight)
-        placed = _placed(space, places.sent[g], places.heard[g], len(sent_place), len(heard_place))
+        maps = hear_themselves(population.lifted, population.schedule, own, weight)
+        placed = _placed(maps, places.sent[g], places.heard[g], len(sent_place), len(heard_place))
         transfers.append(build_transfer(placed, population.counts))
     lags = sorted({heard.lag for _, heard in heard_place})
     weights = np.zeros((len(lags), len(heard_place), len(sent_place)))
@@ -154,12 +155,10 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
     n_s, n_r = int(sent_starts[-1]), int(heard_starts[-1])
     transfers = []
     for g, group in enumerate(sites):
-        one = group.lifted
-        blocks = (*one.blocks, *one.error.blocks)
         rows = np.arange(sent_starts[g], sent_starts[g + 1])
         lines = np.arange(heard_starts[g], heard_starts[g + 1])
-        space = _placed(StateSpace(*(block[None] for block in blocks)), rows, lines, n_s, n_r)
-        transfers.append(build_transfer(space, np.ones(1)))
+        placed = _placed(rows_of(group.lifted, 1), rows, lines, n_s, n_r)
+        transfers.append(build_transfer(placed, np.ones(1)))
     lags = sorted({heard.lag for group in sites for heard in group.schedule.heard})
     weights, errors = np.zeros((len(lags), n_r, n_s)), np.zeros((len(lags), n_r, n_s))
     for g, group in enumerate(sites):
@@ -176,7 +175,7 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
     return Characteristic(tuple(transfers), tuple(lags), weights, errors)
 
 
-def _placed(space: StateSpace, rows: Integers, lines: Integers, n_s: int, n_r: int) -> StateSpace:
+def _placed(maps: BoundedMap, rows: Integers, lines: Integers, n_s: int, n_r: int) -> BoundedMap:
     """Return sites among all that is sent and heard: `rows` of s and `lines` of r are theirs."""
 
     def wide(block: Floats) -> Floats:
@@ -189,13 +188,7 @@ def _placed(space: StateSpace, rows: Integers, lines: Integers, n_s: int, n_r: i
         found[:, rows] = block
         return found
 
-    return StateSpace(
-        m=space.m,
-        b=wide(space.b),
-        s=tall(space.s),
-        d=tall(wide(space.d)),
-        m_error=space.m_error,
-        b_error=wide(space.b_error),
-        s_error=tall(space.s_error),
-        d_error=tall(wide(space.d_error)),
-    )
+    def placed(one: FrameMap) -> FrameMap:
+        return FrameMap(one.p, wide(one.q), tall(one.s), tall(wide(one.d)))
+
+    return BoundedMap(*placed(maps).blocks, placed(maps.error))

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import Loop
+from apc.eigen.eigenpairs import eigenpairs
 from apc.eigen.rigid import find_rigid_modes
 from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.exchange import Exchange
+from apc.frame.lift import FrameMap
 from apc.large.characteristic import Characteristic, null_vectors, weights_at
 from apc.large.determinant import Places, heard_weights, of_loop, of_populations, senders_of
 from apc.large.populations import (
@@ -26,6 +28,7 @@ from apc.large.populations import (
     hear_roughly,
     lines_of,
     mode_of,
+    rows_of,
     site_one,
     some_rows,
     state_names,
@@ -176,8 +179,8 @@ def _common_starts(listed: Sequence[Population], exchange: Exchange) -> Complexe
     for population, (weight, senders) in zip(listed, weights, strict=True):
         few = np.unique(np.linspace(0, len(population.parameters) - 1, SAMPLES).astype(np.int64))
         own = np.tile(weight * senders, (len(few), 1))
-        alike, *_ = hear_roughly(some_rows(population.lifted, few), population.schedule, own, 0 * own)
-        values = np.linalg.eigvals(alike).astype(np.complex128).ravel()
+        alike = hear_roughly(some_rows(population.lifted, few), population.schedule, own, 0 * own)
+        values = np.linalg.eigvals(alike.p).astype(np.complex128).ravel()
         kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
         found.append(values[kept])
     return np.concatenate(found)
@@ -215,17 +218,15 @@ def _nearly_free(function: Characteristic, loop: Loop, value: complex) -> tuple[
     """
     random = np.random.default_rng(0)
     pushes = [random.uniform(0.5, 1.0, (1, len(group.lifted.p))) for group in loop.sites]
-    all_blocks = [
-        (one.p[None], one.q[None], one.s[None], one.d[None]) for one in (group.lifted for group in loop.sites)
-    ]
+    maps = [rows_of(group.lifted, 1) for group in loop.sites]
     alone = [
-        _move(blocks, value, np.zeros((1, blocks[1].shape[2])), np.zeros(blocks[2].shape[1]), push)
-        for blocks, push in zip(all_blocks, pushes, strict=True)
+        _move(one, value, np.zeros((1, one.q.shape[2])), np.zeros(one.s.shape[1]), push)
+        for one, push in zip(maps, pushes, strict=True)
     ]
     answer = differentiate(function.transfers, np.array([value]))[0][0]
     hearing = weights_at(function, np.array([value]))[0]
     sent_alone = np.concatenate(
-        [(blocks[2] @ one.z[..., None])[0, :, 0] for blocks, one in zip(all_blocks, alone, strict=True)]
+        [(one.s @ moved.z[..., None])[0, :, 0] for one, moved in zip(maps, alone, strict=True)]
     )
     sent = np.linalg.solve(np.eye(len(answer)) - answer @ hearing, sent_alone)
     felt_alone = np.concatenate([one.felt[0] for one in alone])
@@ -233,11 +234,11 @@ def _nearly_free(function: Characteristic, loop: Loop, value: complex) -> tuple[
     heard, weight = hearing @ sent, felt @ hearing
     motions = []
     s_start = r_start = 0
-    for blocks, push in zip(all_blocks, pushes, strict=True):
-        rows = slice(s_start, s_start + blocks[2].shape[1])
-        lines = slice(r_start, r_start + blocks[1].shape[2])
+    for one, push in zip(maps, pushes, strict=True):
+        rows = slice(s_start, s_start + one.s.shape[1])
+        lines = slice(r_start, r_start + one.q.shape[2])
         s_start, r_start = rows.stop, lines.stop
-        motions.append(_move(blocks, value, heard[None, lines], weight[rows], push))
+        motions.append(_move(one, value, heard[None, lines], weight[rows], push))
     return motions, sent
 
 
@@ -287,14 +288,13 @@ def _own_mode(population: Population, places: Places, zero: Zero, site: tuple[in
     g, row = site
     some = some_rows(population.lifted, slice(row, row + 1))
     own, others = places.own[g], places.others[g]
-    m, _, s, _ = hear_roughly(some, population.schedule, own[None], others[None])
-    values, vectors = np.linalg.eig(m[0])
-    z = vectors[:, int(np.argmin(np.abs(values - zero.value)))]
-    found, covectors = np.linalg.eig(m[0].T)
-    w = covectors[:, int(np.argmin(np.abs(found - zero.value)))]
+    alone = hear_roughly(some, population.schedule, own[None], others[None])
+    pairs = eigenpairs(alone.p[0])
+    nearest = int(np.argmin(np.abs(pairs.values - zero.value)))
+    z, w = pairs.right[:, nearest], pairs.left[nearest]
     now, before, _ = lines_of(population.schedule)
     n_z = some.p.shape[-1]
-    received = own * (now @ (s[0] @ z) + before @ z[n_z:])
+    received = own * (now @ (alone.s[0] @ z) + before @ z[n_z:])
     shares: dict[str, float] = {}
     for name, share in zip(state_names(population), np.abs(w * z).tolist(), strict=True):
         shares[name] = shares.get(name, 0.0) + share
@@ -316,7 +316,7 @@ class _Motion:
 
 
 def _move(
-    blocks: tuple[Floats, Floats, Floats, Floats],
+    maps: FrameMap,
     value: complex,
     heard: Complexes | Floats,
     weight: Complexes | Floats,
@@ -324,15 +324,15 @@ def _move(
 ) -> _Motion:
     """Return how sites move at ζ, hearing r (k, n_r) from outside, with what they send weighed by χ (n_s,).
 
-    (ζ − M) z = B r + v and w (ζ − M) = χ S + v, pushed by v (k, n); w B + χ D weighs r.
+    (ζ − P) z = Q r + v and w (ζ − P) = χ S + v, pushed by v (k, n); w Q + χ D weighs r.
     """
-    m, b, s, d = blocks
-    shifted = value * np.eye(m.shape[-1]) - m
-    driven = (b @ heard[..., None])[..., 0] + push
+    p, q, s, d = maps.blocks
+    shifted = value * np.eye(p.shape[-1]) - p
+    driven = (q @ heard[..., None])[..., 0] + push
     z: Complexes = np.linalg.solve(shifted, driven[..., None])[..., 0].astype(np.complex128)
     covector = (weight @ s + push)[..., None]
     w: Complexes = np.linalg.solve(shifted.swapaxes(1, 2), covector)[..., 0].astype(np.complex128)
-    return _Motion(z, w, heard.astype(np.complex128), (w[:, None, :] @ b)[:, 0] + weight @ d)
+    return _Motion(z, w, heard.astype(np.complex128), (w[:, None, :] @ q)[:, 0] + weight @ d)
 
 
 def _move_population(
@@ -344,9 +344,9 @@ def _move_population(
     for start in range(0, len(population.parameters), CHUNK):
         some = some_rows(population.lifted, slice(start, start + CHUNK))
         k = len(some.p)
-        blocks = hear_roughly(some, population.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
-        moved = _move(blocks, value, np.tile(heard, (k, 1)), weight)
-        sent = (blocks[2] @ moved.z[..., None] + blocks[3] @ moved.r[..., None])[..., 0]
+        alone = hear_roughly(some, population.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
+        moved = _move(alone, value, np.tile(heard, (k, 1)), weight)
+        sent = (alone.s @ moved.z[..., None] + alone.d @ moved.r[..., None])[..., 0]
         packets = moved.z[:, some.p.shape[-1] :]
         received = others * heard + own * (sent @ now.T + packets @ before.T)
         parts.append(replace(moved, r=received))

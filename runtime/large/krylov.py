@@ -156,7 +156,7 @@ def _shifts(system: SparseSystem, listed: Sequence[Population]) -> list[complex]
         most = heard[starts[peers][:, None] + np.arange(len(population.schedule.heard))].max(axis=0)
         for share in SHARES:
             own = np.tile(share * most, (len(few), 1))
-            found.append(np.linalg.eigvals(hear_roughly(some, population.schedule, own, 0 * own)[0]).ravel())
+            found.append(np.linalg.eigvals(hear_roughly(some, population.schedule, own, 0 * own).p).ravel())
     values = np.concatenate(found).astype(np.complex128)
     values = values[(values.imag >= 0)]
     values = values[np.argsort(-np.abs(values), kind="stable")]

@@ -23,13 +23,12 @@ from apc.eigen.spectrum import Mode, oscillation
 from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import LiftedSite
+from apc.frame.lift import BoundedMap, FrameMap, LiftedSite
 from apc.frame.linearize import linearize_rows, site_of_row
 from apc.frame.parameters import Numbers
 from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite
-from apc.large.transfer import StateSpace
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -116,7 +115,7 @@ def site_one(population: Population, row: int) -> LinearSite:
     )
 
 
-def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> StateSpace:
+def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> BoundedMap:
     """Let every site hear its own packets, weighed, and leave the rest of what it hears open.
 
     Parameters
@@ -140,26 +139,28 @@ def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others:
     for start in range(0, len(own), CHUNK):
         chunk = slice(start, start + CHUNK)
         parts.append(_hear_themselves(some_rows(lifted, chunk), schedule, own[chunk], others[chunk]))
-    joined = zip(*parts, strict=True)
-    return StateSpace(*(np.concatenate(part) for part in joined))
+
+    def joined(maps: Sequence[FrameMap]) -> FrameMap:
+        return maps[0].mapped(lambda *blocks: np.concatenate(blocks), *maps[1:])
+
+    maps, errors = zip(*parts, strict=True)
+    return BoundedMap(*joined(maps).blocks, error=joined(errors))
 
 
-def hear_roughly(
-    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return M, B, S and D as `hear_themselves` has them, without their errors."""
+def hear_roughly(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> FrameMap:
+    """Return the map that `hear_themselves` gives, without its errors."""
     layout, feedback = _open_loop(lifted, schedule, own, others)
     return _cut(close([lifted], [feedback], layout))
 
 
 def _hear_themselves(
     lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
-) -> tuple[Floats, ...]:
+) -> tuple[FrameMap, FrameMap]:
     """Close a chunk of sites, with the errors."""
     layout, feedback = _open_loop(lifted, schedule, own, others)
     heard = Feedback(rounded(feedback.now), rounded(feedback.before))
-    closed = close([lifted.bounded], [heard], layout, numbers=RADII)
-    return (*map(value_of, _cut(closed)), *map(radius_of, _cut(closed)))
+    closed = _cut(close([lifted.bounded], [heard], layout, numbers=RADII))
+    return closed.mapped(value_of), closed.mapped(radius_of)
 
 
 def _open_loop(
@@ -173,10 +174,12 @@ def _open_loop(
     return lay_out([lifted.z_names], [schedule]), Feedback(own[:, :, None] * now, heard)
 
 
-def _cut(closed: Closed) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return M, B, S and D of closed loops over their states and what comes from outside."""
+def _cut(closed: Closed) -> FrameMap:
+    """Return the map of closed loops over their states and what comes from outside."""
     n = closed.matrix.shape[-2]
-    return closed.matrix[..., :n], closed.matrix[..., n:], closed.sent[..., :n], closed.sent[..., n:]
+    return FrameMap(
+        closed.matrix[..., :n], closed.matrix[..., n:], closed.sent[..., :n], closed.sent[..., n:]
+    )
 
 
 def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:

@@ -200,8 +200,8 @@ class _Family:
     def _matrices(self, values: Floats) -> tuple[Floats, Floats]:
         """Return M(μ) (k, n, n), relative coordinates, and bounds on their errors."""
         own = values[:, None] * self.weights
-        space = hear_themselves(rows_of(self.group.lifted, len(values)), self.group.schedule, own, 0 * own)
-        return relative_bounded(space.m, space.m_error, self.relative)
+        maps = hear_themselves(rows_of(self.group.lifted, len(values)), self.group.schedule, own, 0 * own)
+        return relative_bounded(maps.p, maps.error.p, self.relative)
 
     def radii(self, values: Floats) -> Floats:
         """Return estimates of the spectral radii at some graph eigenvalues."""

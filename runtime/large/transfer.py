@@ -1,15 +1,15 @@
 """What many sites together answer: their poles and residues, and their sum at a frequency, with bounds.
 
-Takes: the matrices of x⁺ = M x + B r, s = S x + D r of many sites, what these may be off by, and how often
-each site counts; points.
-Gives: `StateSpace`, `Transfer`, `build_transfer`; `Response`, `respond`, `differentiate`.
+Takes: the maps x⁺ = P x + Q r, s = S x + D r of many sites, what these may be off by, and how often each
+site counts; points.
+Gives: `Transfer`, `build_transfer`; `Response`, `respond`, `differentiate`.
 Guarantees: the errors hold all that rounding does, and those of the matrices. A response holds in a disc
 about each point, not only at it.
 Does not: answer nearer to zero than twice `Transfer.inner`.
 
-    T(ζ) = Σ_i n_i (D_i + S_i (ζ − M_i)⁻¹ B_i)
+    T(ζ) = Σ_i n_i (D_i + S_i (ζ − P_i)⁻¹ Q_i)
 
-Each M_i is split, X⁻¹ M X = diag(p_1, …, p_K, T₂): the eigenvalues beyond `inner` one by one, and all that
+Each P_i is split, X⁻¹ P X = diag(p_1, …, p_K, T₂): the eigenvalues beyond `inner` one by one, and all that
 is smaller, queues running empty and the like, as one block that may be defective. The block's part is a
 short power series of 1/ζ, added up over all sites before any ζ is known.
 """
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance
 from apc.frame.discretize import UNIT
+from apc.frame.lift import BoundedMap, FrameMap
 from apc.large.diagonal import block_diagonal, block_norms, block_norms_along, block_resolvent
 
 Floats = NDArray[np.float64]
@@ -39,20 +40,6 @@ SERIES, CUT = 60, 2.0**-7
 
 # Sites worked on together: they stay in the cache of a processor.
 CHUNK = 1024
-
-
-@dataclass(frozen=True, slots=True)
-class StateSpace:
-    """k sites x⁺ = M x + B r, s = S x + D r; `*_error` bounds the error, entry by entry."""
-
-    m: Floats  # (k, n, n)
-    b: Floats  # (k, n, n_r)
-    s: Floats  # (k, n_s, n)
-    d: Floats  # (k, n_s, n_r)
-    m_error: Floats
-    b_error: Floats
-    s_error: Floats
-    d_error: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,48 +62,48 @@ class Transfer:
     block: Floats  # (k,): a bound on ‖(ζ − T₂)⁻¹‖ from twice `inner` on
     loop: Floats  # (k, K + 1): u w, see `build_transfer`; the block last
     left: Floats  # (k, K + 1, n_s): |S X| u
-    right: Floats  # (k, K + 1, n_r): w |Y B|
-    together: Floats  # (k, n_s · n_r): what an error of M does where every |ζ − p_k| = 1
+    right: Floats  # (k, K + 1, n_r): w |Y Q|
+    together: Floats  # (k, n_s · n_r): what an error of P does where every |ζ − p_k| = 1
     loops: Floats  # (k,): Σ u w
     series: Floats  # (up to 1 + SERIES, n_s, n_r): D, then ζ⁻¹, ζ⁻², …
     series_sizes: Floats
     series_errors: Floats
 
 
-def build_transfer(space: StateSpace, counts: Floats) -> Transfer:
+def build_transfer(maps: BoundedMap, counts: Floats) -> Transfer:
     """Split every site into its poles and a block of what dies out at once.
 
     Parameters
     ----------
-    space
-        The k sites.
+    maps
+        Those of the k sites (k, …).
     counts
         How often each is there (k,).
 
     Notes
     -----
-    With computed X and Y ≈ X⁻¹, M + E = X (Λ + Δ) X⁻¹ holds for some |Δ| ≤ |X⁻¹| (|M X − X Λ| + |E| |X|). A
+    With computed X and Y ≈ X⁻¹, P + E = X (Λ + Δ) X⁻¹ holds for some |Δ| ≤ |X⁻¹| (|P X − X Λ| + |E| |X|). A
     majorant of rank one, Δ_kl ≤ u_k w_l, makes the Neumann series of (ζ − Λ − Δ)⁻¹ a geometric one: what it
-    changes is at most (Σ_k |S X|_k u_k/|ζ − p_k|) (Σ_l w_l |Y B|_l/|ζ − p_l|) / (1 − Σ_k u_k w_k/|ζ − p_k|).
+    changes is at most (Σ_k |S X|_k u_k/|ζ − p_k|) (Σ_l w_l |Y Q|_l/|ζ − p_l|) / (1 − Σ_k u_k w_k/|ζ − p_k|).
     """
-    sites, n = space.m.shape[:2]
-    scale = balance(np.max(np.abs(space.m) + space.m_error, axis=0))
+    sites, n = maps.p.shape[:2]
+    scale = balance(np.max(np.abs(maps.p) + maps.error.p, axis=0))
     values, vectors = np.empty((sites, n), np.complex128), np.empty((sites, n, n), np.complex128)
     for place in _chunks(np.arange(sites)):
-        own, right = np.linalg.eig(space.m[place] / scale[:, None] * scale)
+        own, right = np.linalg.eig(maps.p[place] / scale[:, None] * scale)
         order = np.argsort(-np.abs(own), axis=1, kind="stable")
         values[place] = np.take_along_axis(own, order, axis=1)
         vectors[place] = np.take_along_axis(right, order[:, None, :], axis=2)
     inner = INNER * min(1.0, float(np.abs(values).max(initial=0.0))) or INNER
-    return _gathered(space, scale, counts, values, vectors, inner)
+    return _gathered(maps, scale, counts, values, vectors, inner)
 
 
 def _gathered(
-    space: StateSpace, scale: Floats, counts: Floats, values: Complexes, vectors: Complexes, inner: float
+    maps: BoundedMap, scale: Floats, counts: Floats, values: Complexes, vectors: Complexes, inner: float
 ) -> Transfer:
     """Split the sites, those of equally many poles together, and put the parts side by side."""
     sites, n = values.shape
-    n_s, n_r = space.d.shape[1:]
+    n_s, n_r = maps.d.shape[1:]
     large = (np.abs(values) > inner).sum(axis=1)
     most = int(large.max(initial=0))
     errors = np.full((sites, n), np.inf)
@@ -126,12 +113,12 @@ def _gathered(
     loop = np.zeros((sites, most + 1))
     left, right = np.zeros((sites, most + 1, n_s)), np.zeros((sites, most + 1, n_r))
     series = np.zeros((3, 1 + SERIES, n_s, n_r))
-    series[0, 0] += np.tensordot(counts, space.d, 1)
-    series[1, 0] += np.tensordot(counts, np.abs(space.d), 1)
-    series[2, 0] += np.tensordot(counts, space.d_error, 1)
+    series[0, 0] += np.tensordot(counts, maps.d, 1)
+    series[1, 0] += np.tensordot(counts, np.abs(maps.d), 1)
+    series[2, 0] += np.tensordot(counts, maps.error.d, 1)
     for count in np.unique(large).tolist():
         for place in _chunks(np.flatnonzero(large == count)):
-            own = _balanced(space, place, scale)
+            own = _balanced(maps, place, scale)
             part = _split(own, counts[place], values[place], vectors[place], count, inner)
             poles[:count, place] = values[place, :count].T
             residues[:count, place] = (counts[place, None, None] * part.residues).swapaxes(0, 1)
@@ -164,19 +151,15 @@ def _gathered(
     )
 
 
-def _balanced(space: StateSpace, place: NDArray[np.intp], scale: Floats) -> StateSpace:
+def _balanced(maps: BoundedMap, place: NDArray[np.intp], scale: Floats) -> BoundedMap:
     """Return some sites over states in other units, powers of two so that nothing is rounded."""
     inverse = (1.0 / scale)[:, None]
-    return StateSpace(
-        m=space.m[place] * inverse * scale,
-        b=space.b[place] * inverse,
-        s=space.s[place] * scale,
-        d=space.d[place],
-        m_error=space.m_error[place] * inverse * scale,
-        b_error=space.b_error[place] * inverse,
-        s_error=space.s_error[place] * scale,
-        d_error=space.d_error[place],
-    )
+
+    def balanced(one: FrameMap) -> FrameMap:
+        p, q = one.p[place] * inverse * scale, one.q[place] * inverse
+        return FrameMap(p, q, one.s[place] * scale, one.d[place])
+
+    return BoundedMap(*balanced(maps).blocks, balanced(maps.error))
 
 
 def _chunks(places: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
@@ -203,18 +186,18 @@ class _Parts:
 
 
 def _split(
-    space: StateSpace, counts: Floats, values: Complexes, vectors: Complexes, large: int, inner: float
+    maps: BoundedMap, counts: Floats, values: Complexes, vectors: Complexes, large: int, inner: float
 ) -> _Parts:
     """Split sites that all have `large` poles beyond `inner`."""
     sites, n = values.shape
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
-    found = block_diagonal(space.m, space.m_error, values, vectors, large)
+    found = block_diagonal(maps.p, maps.error.p, values, vectors, large)
     basis, dual, small, change, grown = found.basis, found.dual, found.small, found.change, found.grown
     weight, size = np.abs(dual), np.abs(basis)
 
-    a, b = space.s @ basis, dual @ space.b
-    a_doubt = (space.s_error + charge * np.abs(space.s)) @ size
-    b_doubt = weight @ (space.b_error * grown + charge * np.abs(space.b))
+    a, b = maps.s @ basis, dual @ maps.q
+    a_doubt = (maps.error.s + charge * np.abs(maps.s)) @ size
+    b_doubt = weight @ (maps.error.q * grown + charge * np.abs(maps.q))
     b_doubt += (grown - 1) * np.abs(b).max(axis=1, keepdims=True)
     a_size, b_size = np.abs(a), np.abs(b)
     residues = a[:, :, :large].swapaxes(1, 2)[..., None] * b[:, :large, None, :]
@@ -277,7 +260,7 @@ def _block_series(
     block: Floats,
     radius: float,
 ) -> Floats:
-    """Return the terms S X₂ T₂^j Y₂ B of ζ^(−j−1) of all sites, their sizes, and what they may be off by.
+    """Return the terms S X₂ T₂^j Y₂ Q of ζ^(−j−1) of all sites, their sizes, and what they may be off by.
 
     What is left of the series when it is cut, at |ζ| = radius, is charged to the constant term.
 
@@ -286,7 +269,7 @@ def _block_series(
     counts
         How often each site is there (k,).
     ends
-        S X (k, n_s, n) and Y B (k, n, n_r), and what they may be off by.
+        S X (k, n_s, n) and Y Q (k, n, n_r), and what they may be off by.
     small
         T₂ (k, m, m), over the last m states.
     charge
@@ -386,7 +369,7 @@ def respond(transfers: Sequence[Transfer], points: Complexes, reach: Floats) -> 
 
 
 def _reaction(one: Transfer, chunk: slice, near: Floats) -> Floats:
-    """Return what the errors of a chunk's M do at most (z, n_s, n_r), see `build_transfer`.
+    """Return what the errors of a chunk's P do at most (z, n_s, n_r), see `build_transfer`.
 
     Sites whose poles are all far count all their poles as the nearest; only for the others it matters which.
     """

@@ -15,7 +15,7 @@ finds nothing. A count around the pole tells.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -30,6 +30,7 @@ from apc.large.characteristic import (
     count_around,
     refine,
 )
+from apc.large.transfer import Transfer
 
 Complexes = NDArray[np.complex128]
 Floats = NDArray[np.float64]
@@ -373,13 +374,18 @@ def _held_poles(function: Characteristic) -> list[Zero]:
         unheard = ~one.residues.any(axis=2)
         times = np.where(unheard, one.counts, one.counts - 1)
         times = np.where((np.abs(one.poles) > 0) & (one.poles.imag >= 0), times, 0)
-        places, sites = np.nonzero(times)
-        order = np.argsort(-np.abs(one.poles[places, sites]), kind="stable")[:MOST_HELD]
-        for place, site in zip(places[order].tolist(), sites[order].tolist(), strict=True):
+        for place, site in _largest_poles(one, times > 0):
             error = float(one.eigenvalue_errors[site, place])
             many = int(times[place, site])
             found.append(Zero(complex(one.poles[place, site]), error, many, (which, site)))
     return found
+
+
+def _largest_poles(one: Transfer, chosen: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Return where the largest few of some poles of a structure are, each its place and its site."""
+    places, sites = np.nonzero(chosen)
+    order = np.argsort(-np.abs(one.poles[places, sites]), kind="stable")[:MOST_HELD]
+    return zip(places[order].tolist(), sites[order].tolist(), strict=True)
 
 
 def _cancelled_poles(
@@ -393,9 +399,8 @@ def _cancelled_poles(
     taken = [*zeros.tolist(), *(one.value for one in known)]
     for which, one in enumerate(function.transfers):
         outside = (np.abs(one.poles) >= beyond * (1 - SAME)) & (one.poles.imag >= 0)
-        places, sites = np.nonzero(outside & (np.abs(one.poles) > 0) & (np.abs(one.poles - 1) > rigid_radius))
-        order = np.argsort(-np.abs(one.poles[places, sites]), kind="stable")[:MOST_HELD]
-        for place, site in zip(places[order].tolist(), sites[order].tolist(), strict=True):
+        outside &= (np.abs(one.poles) > 0) & (np.abs(one.poles - 1) > rigid_radius)
+        for place, site in _largest_poles(one, outside):
             pole = complex(one.poles[place, site])
             if any(abs(pole - other) <= SAME * abs(pole) for other in taken):
                 continue

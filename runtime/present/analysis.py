@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from apc.analysis.conventions import Conventions, Outcome
     from apc.analysis.needs import Needs, SiteNeeds
     from apc.analysis.paper import NamedMatrix, PaperRoute
-    from apc.analysis.ranges import Range
     from apc.answer import Answer
     from apc.compiler.compiled import CompiledSystem
     from apc.eigen.spectrum import Mode
+    from apc.frame.names import Range
 
 MOST_ROWS = 16
 DECIMALS = 6  # of a magnitude
@@ -296,7 +296,7 @@ def box_proof_text(found: BoxProof) -> str:
     """Return what was proved of a box."""
     lines = [f"  {_range(one)}" for one in found.ranges]
     where = [
-        f"  {one.label} = {with_unit(f'{value:.12g}', one.unit)}"
+        f"  {one.free.label} = {with_unit(f'{value:.12g}', one.unit)}"
         for one, value in zip(found.ranges, found.point, strict=False)  # a proved box has no point
     ]
     if found.stable:
@@ -313,12 +313,12 @@ def box_proof_text(found: BoxProof) -> str:
 
 def _range(found: Range) -> str:
     low, high = (with_unit(f"{float(one):.9g}", found.unit) for one in (found.low, found.high))
-    return f"{found.label} from {low} to {high}"
+    return f"{found.free.label} from {low} to {high}"
 
 
 def range_document(found: Range) -> dict[str, Any]:
     """Return a parameter and its range as plain data."""
-    return {"parameter": found.label, "unit": found.unit, "range": document((found.low, found.high))}
+    return {"parameter": found.free.label, "unit": found.unit, "range": document((found.low, found.high))}
 
 
 def box_proof_document(found: BoxProof) -> dict[str, Any]:

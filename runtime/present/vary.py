@@ -152,7 +152,9 @@ def sweep_text(found: Sweep) -> str:
         lines += note(text)
     for axis in found.grid.axes:
         ends = f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}"
-        lines.append(f"  {axis.label}: {with_unit(ends, axis.unit)}, {counted(len(axis.values), 'value')}")
+        lines.append(
+            f"  {axis.free.label}: {with_unit(ends, axis.unit)}, {counted(len(axis.values), 'value')}"
+        )
     lines += [f"  {count:>10,} × {verdict}" for verdict, count in found.verdicts]
     messages = Counter(cell for cell in found.columns[-1].tolist() if cell)
     if messages:

@@ -11,11 +11,10 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 
-from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
-from apc.frame.names import unit_of
+from apc.frame.names import Free, Range, unit_of
 from apc.sweeps.grid import parse_axis
 
 PLACE = Place("region")
@@ -66,26 +65,29 @@ def parse_axes(
         except ApcError as error:
             mistakes = [replace(one, place=Place(f"--{letter}")) for one in error.mistakes]
             raise ApcError(mistakes) from None
-        _refuse_period(system, axis.name, axis.label)
+        _refuse_period(system, axis.free)
         low, high = axis.values[0], axis.values[-1]
         least = NARROWEST * max(abs(low), abs(high))
         if high - low < least:
             expected = with_unit(f"a width of at least {float(least):.2g}", axis.unit)
-            what, got = f"the range of {axis.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
+            what, got = f"the range of {axis.free.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
             raise ApcError(Mistake("E903", Place(f"--{letter}"), what, expected, got))
-        found.append(Range(axis.name, axis.group, axis.unit, axis.values[0], axis.values[-1]))
+        found.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
     first, second = found
-    if first.name == second.name and (first.group == second.group or None in (first.group, second.group)):
-        what = f"{first.label} is on both axes; a region has two parameters"
-        if first.group != second.group:
-            what = f"{first.label} and {second.label} are not apart: without a group it is that of all groups"
+    if first.free.meets(second.free):
+        one, other = first.free.label, second.free.label
+        what = f"{one} is on both axes; a region has two parameters"
+        if one != other:
+            what = f"{one} and {other} are not apart: without a group it is that of all groups"
         raise ApcError(Mistake("E902", PLACE, what))
     return first, replace(second, low=second.low / scale, high=second.high / scale)
 
 
-def _refuse_period(system: CompiledSystem, name: str, label: str) -> None:
+def _refuse_period(system: CompiledSystem, free: Free) -> None:
     """Raise E903 for what makes another frame at every value: one would see arithmetic, not physics."""
     for clock in system.clocks:
-        if name in (clock.period, clock.phase):
-            what = f"{label} can't be an axis: at each value all clocks stand as before after another time"
+        if free.name in (clock.period, clock.phase):
+            what = (
+                f"{free.label} can't be an axis: at each value all clocks stand as before after another time"
+            )
             raise ApcError(Mistake("E903", PLACE, what, hint='--vary "haptic.period=1 ms, 2 ms"'))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.frame.names import find, unit_of
+from apc.frame.names import Free, Range, find, unit_of, value_now
 from apc.frame.overrides import Override, apply
 from apc.regions.passivity import CONDITIONS, MEANINGS, UNITS, PublishedCondition
 
@@ -33,21 +33,11 @@ LINES = 65
 
 
 @dataclass(frozen=True, slots=True)
-class Role:
-    """What plays a symbol: a parameter of the scene (of one group, or of all), or a number in SI."""
-
-    symbol: str
-    parameter: str | None
-    group: str | None
-    value: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class Overlay:
-    """A published condition, and what plays each of its symbols, in the order of the symbols."""
+    """A published condition, and what plays each of its symbols, in their order: a parameter or SI number."""
 
     condition: PublishedCondition
-    roles: tuple[Role, ...]
+    roles: tuple[Free | float, ...]
 
     @property
     def label(self) -> str:
@@ -71,7 +61,7 @@ def parse_overlay(system: CompiledSystem, text: str) -> Overlay:
     if condition is None:
         what = f"{name[:80]} is no published condition known here ({', '.join(CONDITIONS)})"
         raise ApcError(Mistake("E886", _PLACE, what, hint=nearest(name, CONDITIONS) or _FORM))
-    found: dict[str, Role] = {}
+    found: dict[str, Free | float] = {}
     for part in rest.split(","):
         symbol, equals, player = (piece.strip() for piece in part.partition("="))
         if not (equals and symbol and player):
@@ -90,24 +80,23 @@ def parse_overlay(system: CompiledSystem, text: str) -> Overlay:
     return Overlay(condition, tuple(found[symbol] for symbol in condition.symbols))
 
 
-def _role(system: CompiledSystem, symbol: str, player: str) -> Role:
+def _role(system: CompiledSystem, symbol: str, player: str) -> Free | float:
     """Read what plays a symbol: a quantity begins with a digit, sign or point, a parameter never does."""
     from apc.compiler.language.units import parse_unit, quantity
 
     if player[0] in "+-.0123456789":
-        value = quantity(player, _PLACE, what=symbol, unit=UNITS[symbol]).value
-        return Role(symbol, None, None, float(value))
-    name, group = find(system, player, _PLACE)
-    unit = unit_of(system, name)
+        return float(quantity(player, _PLACE, what=symbol, unit=UNITS[symbol]).value)
+    free = find(system, player, _PLACE)
+    name, unit = free.name, unit_of(system, free.name)
     if parse_unit(unit, _PLACE).dimension != parse_unit(UNITS[symbol], _PLACE).dimension:
         what = f"{symbol}, the {MEANINGS[symbol]},"
         raise ApcError(Mistake("E204", _PLACE, what, UNITS[symbol], f"{name} in {unit}"))
-    if group is None:
+    if free.group is None:
         own = [one for one in system.groups if name in _own_names(one)]
         if own:
             what = f"{name} differs between peers, and {symbol} is one number"
             raise ApcError(Mistake("E886", _PLACE, what, hint=f"{symbol}={own[0].name}.{name}"))
-    return Role(symbol, name, group, None)
+    return free
 
 
 def _own_names(group: Group) -> set[str]:
@@ -117,26 +106,10 @@ def _own_names(group: Group) -> set[str]:
 
 def symbol_values(system: CompiledSystem, overlay: Overlay) -> tuple[float, ...]:
     """Return the value of each symbol with the scene's numbers, in the order of the condition's symbols."""
-    common = {one.name: one.value for one in system.parameters}
-    common |= {one.name: float(one.value) for one in system.timings}
-    values = []
-    for role in overlay.roles:
-        if role.parameter is None:
-            assert role.value is not None
-            values.append(role.value)
-            continue
-        group = next((one for one in system.groups if one.name == role.group), None)
-        own = {one.name: one.value for one in group.values} if group else {}
-        values.append(float(own.get(role.parameter, common[role.parameter])))
-    return tuple(values)
+    return tuple(role if isinstance(role, float) else value_now(system, role) for role in overlay.roles)
 
 
-def overlay_points(
-    system: CompiledSystem,
-    overlay: Overlay,
-    x: tuple[str, float, float],
-    y: tuple[str, float, float],
-) -> Floats:
+def overlay_points(system: CompiledSystem, overlay: Overlay, x: Range, y: Range) -> Floats:
     """Return the boundary of an overlay's condition in the plane of two parameters, as one polyline.
 
     Parameters
@@ -146,7 +119,7 @@ def overlay_points(
     overlay
         The condition and its roles.
     x, y
-        Name of the parameter on the axis, and the ends of its range in SI.
+        The parameters of the plane.
 
     Returns
     -------
@@ -157,7 +130,7 @@ def overlay_points(
     Raises
     ------
     ApcError
-        E622 an axis names no parameter, E624 or E625 an end of an axis is a value that can't be.
+        E624 or E625 an end of an axis is a value that can't be.
 
     Notes
     -----
@@ -167,11 +140,8 @@ def overlay_points(
     """
     from scipy.optimize import brentq
 
-    axes = [find(system, name, _PLACE) for name, _, _ in (x, y)]
-
     def margin(at_x: float, at_y: float) -> float:
-        places = zip(axes, (at_x, at_y), strict=True)
-        overrides = [Override(name, group, Fraction(value)) for (name, group), value in places]
+        overrides = [Override(x.free, Fraction(at_x)), Override(y.free, Fraction(at_y))]
         return float(overlay.condition.margin(*symbol_values(apply(system, overrides), overlay)))
 
     def crossing(along: Callable[[float], float], low: float, high: float) -> float | None:
@@ -183,11 +153,12 @@ def overlay_points(
         return float(brentq(along, low, high, xtol=abs(high - low) * 1e-15, rtol=1e-14))
 
     points = []
-    for at in np.linspace(y[1], y[2], LINES).tolist():
-        found = crossing(lambda value, at=at: margin(value, at), x[1], x[2])  # type: ignore[misc]
+    ends_x, ends_y = ((float(one.low), float(one.high)) for one in (x, y))
+    for at in np.linspace(*ends_y, LINES).tolist():
+        found = crossing(lambda value, at=at: margin(value, at), *ends_x)  # type: ignore[misc]
         points += [(found, at)] if found is not None else []
-    for at in np.linspace(x[1], x[2], LINES).tolist():
-        found = crossing(lambda value, at=at: margin(at, value), y[1], y[2])  # type: ignore[misc]
+    for at in np.linspace(*ends_x, LINES).tolist():
+        found = crossing(lambda value, at=at: margin(at, value), *ends_y)  # type: ignore[misc]
         points += [(at, found)] if found is not None else []
     return _in_order(points)
 

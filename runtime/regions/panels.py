@@ -15,18 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import build_exchange
 from apc.frame.jacobians import jacobians
 from apc.frame.linearize import linearize_rows, site_of_row
+from apc.frame.names import Range
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from apc.regions.axes import PLACE, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.region import CELLS, Floats, Region, region
 from apc.result import Result
+from apc.sweeps.grid import with_last_unit
 from apc.vary.search import Told
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
@@ -87,15 +88,11 @@ def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
         E907 it isn't of that form.
     """
     name, equals, values = (part.strip() for part in text.partition("="))
-    listed = [value.strip() for value in values.split(",")]
+    listed = with_last_unit(values.split(","))
     if not (equals and name and all(listed)):
         form = "--vary lan.delay=0,8 ms"
         raise ApcError(Mistake("E907", Place("--vary"), "--vary", "NAME=VALUE,VALUE,…", text[:80], form))
-    unit = listed[-1].lstrip("+-.0123456789eE").strip()
-    bare = "+-.0123456789eE"
-    return tuple(
-        (f"{name}={value} {unit}" if not value.strip(bare) else f"{name}={value}",) for value in listed
-    )
+    return tuple((f"{name}={value}",) for value in listed)
 
 
 # A scene with a panel's settings, its axes, and what its y is multiplied by.
@@ -152,11 +149,8 @@ def compare_regions(
     found = []
     for title, work, laid in jobs:
         regions = tuple(region(system, axes, cells=cells, told=told) for system, axes, _ in work)
-        ranges = [(axis.label, float(axis.low), float(axis.high)) for axis in work[0][1]]
-        lines = tuple(
-            (one.label, overlay_points(work[0][0], one, ranges[0], ranges[1]) * [1.0, work[0][2]])
-            for one in laid
-        )
+        first, axes, gain = work[0]
+        lines = tuple((one.label, overlay_points(first, one, *axes) * [1.0, gain]) for one in laid)
         found.append(Panel(title, regions, tuple(gain for _, _, gain in work), lines))
     return Panels(tuple(found), normalize)
 
@@ -164,10 +158,10 @@ def compare_regions(
 def _refuse_set(axes: Sequence[Range], system: CompiledSystem, settings: Sequence[str]) -> None:
     """Raise E902 when a panel sets what an axis varies."""
     for text in settings:
-        override = parse_override(system, text)
+        free = parse_override(system, text).free
         for axis in axes:
-            if axis.name == override.name and override.group in (None, axis.group):
-                what = f"{axis.label} is on an axis and set for the panel as well"
+            if axis.free.name == free.name and free.group in (None, axis.free.group):
+                what = f"{axis.free.label} is on an axis and set for the panel as well"
                 raise ApcError(Mistake("E902", PLACE, what))
 
 
@@ -184,7 +178,7 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
     """
     first = resolve(system)
     value = axis.low + (axis.high - axis.low) * (MOVE - 1)
-    second = resolve(apply(system, [Override(axis.name, axis.group, value)]))
+    second = resolve(apply(system, [Override(axis.free, value)]))
     exchange = build_exchange(system, first.timings)
     found: set[int] = set()
     for place, group in enumerate(system.groups):
@@ -207,6 +201,6 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
                     heard = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=system.peers)
                     found |= set(heard.tolist())
     if len(found) > 1:
-        what = f"{axis.label} weighs what is heard of {' and '.join(map(str, sorted(found)))} others"
+        what = f"{axis.free.label} weighs what is heard of {' and '.join(map(str, sorted(found)))} others"
         raise ApcError(Mistake("E906", PLACE, f"{what}, so that there is no one effective gain"))
     return max(found, default=1)

@@ -19,12 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
-from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.words import counted
 from apc.finite_equations import finite_equations
-from apc.frame.names import Free
+from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
@@ -176,7 +175,7 @@ class Region(Result):
         points = self.rectangle.points(values)
         if not np.all((points >= 0) & (points <= 1)):
             ranges = " and ".join(
-                f"{axis.label} in {float(axis.low):g} to {float(axis.high):g} {axis.unit}"
+                f"{axis.free.label} in {float(axis.low):g} to {float(axis.high):g} {axis.unit}"
                 for axis in (self.x, self.y)
             )
             raise ApcError(Mistake("E904", PLACE, "a point", ranges, "one outside"))
@@ -224,7 +223,7 @@ def region(
     times, or the scene is linearized at its start, each point is analysed by itself, and the boundary is a
     line from cell edge to cell edge, its error the size of a cell.
     """
-    free = tuple(Free(axis.name, axis.group) for axis in axes)
+    free = tuple(axis.free for axis in axes)
     for one in free:
         refuse_channel_number(system, one, PLACE)
     rectangle = rectangle_of(*axes)
@@ -315,8 +314,7 @@ def _samples(
         if len(wrong):
             value = rectangle.values(points[wrong[:1]])[0].tolist()
             overrides = [
-                Override(free.name, free.group, Fraction(number))
-                for free, number in zip(source.free, value, strict=True)
+                Override(free, Fraction(number)) for free, number in zip(source.free, value, strict=True)
             ]
             apply(source.system, overrides)  # says so itself if the value can't be
             source.closed_at(value)
@@ -396,7 +394,7 @@ def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
     decided = []
     for value in values.tolist():
         overrides = [
-            Override(axis.name, axis.group, Fraction(number))
+            Override(axis.free, Fraction(number))
             for axis, number in zip((found.x, found.y), value, strict=True)
         ]
         answer = analyze(apply(found.system, overrides), prepared=prepared)

@@ -12,16 +12,15 @@ with the delay: the boundary is a straight line at a critical value of the other
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
-from apc.analysis.ranges import Range
 from apc.compiler.compiled import CompiledSystem
-from apc.frame.names import Free, parameter_of
+from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace
 from apc.regions.cells import HALVINGS, survey
@@ -115,26 +114,12 @@ def trace_strips(
         E844 a time that no delay is linear in.
     """
     delay, other = axes[axis], axes[1 - axis]
-    free = (Free(delay.name, delay.group), Free(other.name, other.group))
-    longest = system_with_delay(
-        system, free[0], delay.high
-    )  # what is too much is so before any strip is looked at
-    evaluator_of_many(longest, [free[1]], PLACE, prepared=prepared)
     strips: list[_Strip] = []
-    tell = pace(system, free[0], delay.low, delay.high, place=PLACE, told=told)
-    for piece in delay_pieces(system, free[0], delay.low, prepared, place=PLACE, high=delay.high):
-        tell(min(piece.high, delay.high))
-        width = delay.high - delay.low
-        ends = [float((one - delay.low) / width) for one in (piece.low, min(piece.high, delay.high))]
-        if piece.constant:
-            found = _standing(piece, free[1], other, ends, prepared)
-        else:
-            source = PointEvaluator(system, free, prepared)
-            found = _moving(source, axes[axis], other, piece, ends, cells, tolerance)
-        if found is None:
+    for strip in _strips(system, delay, other, prepared, cells, tolerance, told):
+        if strip is None:
             return None
-        strips.append(found)
-    whole = PointEvaluator(system, free, prepared)
+        strips.append(strip)
+    whole = PointEvaluator(system, (delay.free, other.free), prepared)
     arcs = [list(one.arcs) for one in strips]
     rectangle = rectangle_of(delay, other)
     edges = []
@@ -158,11 +143,34 @@ def trace_strips(
     )
 
 
-def _standing(
-    piece: Piece, free: Free, other: Range, ends: Sequence[float], prepared: Prepared
-) -> _Strip | None:
+def _strips(
+    system: CompiledSystem,
+    delay: Range,
+    other: Range,
+    prepared: Prepared,
+    cells: int,
+    tolerance: float,
+    told: Callable[[str], None] | None,
+) -> Iterator[_Strip | None]:
+    """Yield the strips in order; None for one that can't be had in closed form."""
+    # What is too much is so before any strip is looked at.
+    longest = system_with_delay(system, delay.free, delay.high)
+    evaluator_of_many(longest, [other.free], PLACE, prepared=prepared)
+    source = PointEvaluator(system, (delay.free, other.free), prepared)
+    tell = pace(system, delay.free, delay.low, delay.high, place=PLACE, told=told)
+    for piece in delay_pieces(system, delay.free, delay.low, prepared, place=PLACE, high=delay.high):
+        high = min(piece.high, delay.high)
+        tell(high)
+        ends = [float((one - delay.low) / (delay.high - delay.low)) for one in (piece.low, high)]
+        if piece.constant:
+            yield _standing(piece, other, ends, prepared)
+        else:
+            yield _moving(source, delay, other, piece, ends, cells, tolerance)
+
+
+def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepared) -> _Strip | None:
     """Return a strip in which nothing depends on the delay: straight lines at the other's critical values."""
-    low, high = float(other.low), float(other.high)
+    low, high, free = float(other.low), float(other.high), other.free
     line = Line(
         evaluator_of_many(piece.inside, [free], PLACE, prepared=prepared),
         np.array([parameter_of(piece.inside, free).value]),

@@ -18,11 +18,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
 
-from apc.analysis.ranges import Range
 from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
+from apc.frame.names import Range
 from apc.regions.eigenpairs import Family
 from apc.vary.batch import Evaluator
 
@@ -112,7 +113,7 @@ class ChebyshevFamily:
     def matrices(self, points: Floats) -> tuple[Floats, ...]:
         """Return each system's matrices (k, n, n) at points (k, 2)."""
         degree = max(int(one.max(initial=0)) for one in self.terms)
-        x, y = _polynomials(points, degree)
+        x, y = chebvander(2 * points.T - 1, degree)
         return tuple(
             ((x[:, terms[:, 0]] * y[:, terms[:, 1]]) @ coefficients).reshape(-1, n, n)
             for terms, coefficients, n in zip(self.terms, self.coefficients, self.sizes, strict=True)
@@ -122,8 +123,9 @@ class ChebyshevFamily:
         """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
         terms = self.terms[system]
         degree = int(terms.max(initial=0))
-        values = _polynomials(points, degree)
-        slopes = _derivatives(points, values)
+        values = chebvander(2 * points.T - 1, degree)
+        derivative = chebder(np.eye(degree + 1), scl=2)  # of each polynomial, as a series
+        slopes = values[..., : len(derivative)] @ derivative
         (x, y), (slope_x, slope_y) = (
             (one[0][:, terms[:, 0]], one[1][:, terms[:, 1]]) for one in (values, slopes)
         )
@@ -131,31 +133,6 @@ class ChebyshevFamily:
         summed = np.concatenate([x * y, slope_x * y, x * slope_y]) @ self.coefficients[system]
         both = summed.reshape(3, len(points), n, n)
         return both[0], both[1:]
-
-
-def _polynomials(points: Floats, degree: int) -> Floats:
-    """Return T_i(2u − 1) of both coordinates (2, k, degree + 1): T_(i+1) = 2x T_i − T_(i−1)."""
-    x = 2 * points.T - 1
-    found = np.empty((degree + 1, *x.shape))
-    found[0] = 1
-    if degree:
-        found[1] = x
-        for i in range(2, degree + 1):
-            found[i] = 2 * x * found[i - 1] - found[i - 2]
-    return found.transpose(1, 2, 0)
-
-
-def _derivatives(points: Floats, values: Floats) -> Floats:
-    """Return dT_i/du: T_(i+1)′ = 2 T_i + 2x T_i′ − T_(i−1)′ over x, twice that over u."""
-    x = 2 * points.T - 1
-    values = values.transpose(2, 0, 1)
-    found = np.zeros_like(values)
-    degree = len(found) - 1
-    if degree:
-        found[1] = 2
-        for i in range(2, degree + 1):
-            found[i] = 4 * values[i - 1] + 2 * x * found[i - 1] - found[i - 2]
-    return found.transpose(1, 2, 0)
 
 
 def resolve_family(evaluator: Evaluator, rectangle: Rectangle, errors: Errors) -> Family:

@@ -1,7 +1,7 @@
 """Which parameters a sweep varies, and every combination of their values.
 
 Takes: a `CompiledSystem`, names of parameters, and texts such as `0 N/m:3000 N/m:11` or `0, 8 ms`.
-Gives: `GridAxis`, `Grid`, `parse_axis`, `build_grid`, `check_size`.
+Gives: `GridAxis`, `Grid`, `parse_axis`, `with_last_unit`, `build_grid`, `check_size`.
 Guarantees: values are exact rationals in SI; the order of points is that of the axes as given, the last one
 turning fastest; what can be known to be out of bounds is told before any point is computed.
 Does not: compute points.
@@ -17,7 +17,7 @@ from fractions import Fraction
 
 from apc.compiler.compiled import PEERS, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.names import find, unit_of
+from apc.frame.names import Free, find, unit_of
 from apc.frame.overrides import Override, apply
 
 PLACE = Place("sweep")
@@ -34,22 +34,16 @@ _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class GridAxis:
-    """One swept parameter: of one group, or of all (`group` None); `values` in SI, in the order swept."""
+    """One swept parameter; `values` in SI, in the order swept."""
 
-    name: str
-    group: str | None
+    free: Free
     unit: str
     values: tuple[Fraction, ...]
 
     @property
-    def label(self) -> str:
-        """The parameter's name, its group before it."""
-        return f"{self.group}.{self.name}" if self.group else self.name
-
-    @property
     def heading(self) -> str:
         """The heading of its column: name and SI unit, if it has one."""
-        return self.label if self.unit == "1" else f"{self.label} [{self.unit}]"
+        return self.free.label if self.unit == "1" else f"{self.free.label} [{self.unit}]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +68,14 @@ class Grid:
     def overrides(self, point: int) -> tuple[Override, ...]:
         """Return what a point sets."""
         pairs = zip(self.axes, self.values(point), strict=True)
-        return tuple(Override(axis.name, axis.group, value) for axis, value in pairs)
+        return tuple(Override(axis.free, value) for axis, value in pairs)
 
 
 def build_grid(axes: Sequence[GridAxis]) -> Grid:
     """Return the grid of some axes. Raises ApcError E883 when they make none, or one too large."""
     if not axes:
         raise ApcError(Mistake("E883", PLACE, "nothing is swept", hint=_FORM))
-    labels = [axis.label for axis in axes]
+    labels = [axis.free.label for axis in axes]
     for place, label in enumerate(labels):
         if label in labels[:place]:
             raise ApcError(Mistake("E883", PLACE, f"{label} is swept twice"))
@@ -130,18 +124,17 @@ def parse_axis(system: CompiledSystem, name: str, text: str) -> GridAxis:
         E881 a range or list at fault; E882 a number of peers; E622 no such parameter; E204 and others of a
         quantity; E624 or E625 a value out of the parameter's bounds.
     """
-    known, group = _find(system, name.strip())
-    unit = unit_of(system, known)
-    label = f"{group}.{known}" if group else known
-    values = _range(label, unit, text) if ":" in text else _list(label, unit, text)
-    axis = GridAxis(known, group, unit, values)
+    free = _find(system, name.strip())
+    unit = unit_of(system, free.name)
+    values = (_range if ":" in text else _list)(free.label, unit, text)
+    axis = GridAxis(free, unit, values)
     for value in (min(values), max(values)):
         _check_bounds(system, axis, value)
     return axis
 
 
-def _find(system: CompiledSystem, name: str) -> tuple[str, str | None]:
-    """Return the parameter and group a name means; a number of peers has its own message."""
+def _find(system: CompiledSystem, name: str) -> Free:
+    """Return the parameter a name means; a number of peers has its own message."""
     last = name.rpartition(".")[2]
     known = {parameter.name for parameter in system.parameters}
     if name == PEERS or (last in (PEERS, "count") and name not in known):
@@ -196,9 +189,13 @@ def _quantities(label: str, unit: str, texts: Sequence[str]) -> tuple[Fraction, 
     """Read quantities; one without a unit takes that of the last."""
     from apc.compiler.language.units import quantity
 
+    return tuple(quantity(text, PLACE, what=label, unit=unit).value for text in with_last_unit(texts))
+
+
+def with_last_unit(texts: Sequence[str]) -> list[str]:
+    """Return the texts of quantities, those of numbers alone with the unit of the last: `0,8 ms`."""
     last = _NUMBER.sub("", texts[-1], count=1).strip()
-    complete = [f"{text.strip()} {last}" if last and _NUMBER.fullmatch(text) else text for text in texts]
-    return tuple(quantity(text, PLACE, what=label, unit=unit).value for text in complete)
+    return [f"{text.strip()} {last}" if last and _NUMBER.fullmatch(text) else text.strip() for text in texts]
 
 
 def _check_bounds(system: CompiledSystem, axis: GridAxis, value: Fraction) -> None:
@@ -208,12 +205,12 @@ def _check_bounds(system: CompiledSystem, axis: GridAxis, value: Fraction) -> No
     on it by an expression) is the affair of each point, where they may fit.
     """
     try:
-        apply(system, [Override(axis.name, axis.group, value)])
+        apply(system, [Override(axis.free, value)])
     except ApcError as error:
         own = [
             mistake
             for mistake in error.mistakes
-            if mistake.what in (axis.label, axis.name)
+            if mistake.what in (axis.free.label, axis.free.name)
             and (mistake.code == "E624" or (mistake.code == "E625" and mistake.expected.startswith("a time")))
         ]
         if own:

@@ -107,8 +107,7 @@ def _critical(system: CompiledSystem, argument: str) -> Quantity:
     if not argument:
         form = "--of critical:coordination.stiffness"
         raise ApcError(Mistake("E884", PLACE, "critical", "a parameter", "nothing", form))
-    known, _ = find(system, argument, PLACE)
-    unit = unit_of(system, known)
+    unit = unit_of(system, find(system, argument, PLACE).name)
     shown = "" if unit == "1" else unit
     columns = (
         VERDICT,

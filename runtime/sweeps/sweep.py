@@ -24,7 +24,6 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
 from apc.frame.jacobians import jacobians
-from apc.frame.names import Free
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
@@ -141,9 +140,9 @@ def sweep(
     grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
     quantity = find_quantity(system, of)
     for axis in grid.axes:
-        refuse_channel_number(system, Free(axis.name, axis.group), PLACE)
-        if axis.label == of.partition(":")[2].strip():
-            what = f"{axis.label} is swept: there is nothing to look for at one value of it"
+        refuse_channel_number(system, axis.free, PLACE)
+        if axis.free.label == of.partition(":")[2].strip():
+            what = f"{axis.free.label} is swept: there is nothing to look for at one value of it"
             raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
     if out is not None:
         check_table_path(out, "out=")
@@ -176,7 +175,11 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
         "left_out": list(left_out(system, linear=all(jacobians(kind).affine for kind in system.kinds))),
         "points": work.grid.points,
         "over": [
-            {"parameter": axis.label, "unit": axis.unit, "values": [float(value) for value in axis.values]}
+            {
+                "parameter": axis.free.label,
+                "unit": axis.unit,
+                "values": [float(value) for value in axis.values],
+            }
             for axis in work.grid.axes
         ],
         "parameters": parameters,

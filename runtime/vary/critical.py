@@ -100,12 +100,11 @@ def critical(
         parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear, E896 a number
         of an unreliable link; and those of `units.quantity`.
     """
-    known, group = find(system, name.strip(), _PLACE)
-    free = Free(known, group)
+    free = find(system, name.strip(), _PLACE)
     refuse_channel_number(system, free, _PLACE)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         timed = reaches_time(system, free)
-        unit = unit_of(system, known)
+        unit = unit_of(system, free.name)
         present = float(delay_now(system, free)) if timed else parameter_of(system, free).value
         limits = [_limit(*one, free, unit) for one in (("--lower", lower), ("--upper", upper))]
         _check_limits(system, free, limits, timed=timed)
@@ -143,12 +142,13 @@ def critical(
         enters=found.enters,
         verdict="" if chosen else verdict,
         left_out=left_out(system, linear=linear),
-        groups=_by_group(system, known, group),
+        groups=_by_group(system, free),
     )
 
 
-def _by_group(system: CompiledSystem, name: str, only: str | None) -> tuple[tuple[str, float | None], ...]:
+def _by_group(system: CompiledSystem, free: Free) -> tuple[tuple[str, float | None], ...]:
     """Return what each group has of a parameter, or one if its peers differ, where not all have one value."""
+    name, only = free.name, free.group
     several = {group.name for group in system.groups if name in {one.name for one in group.columns}}
     if only is not None:
         return ((only, None),) if only in several else ()

@@ -62,7 +62,7 @@ class Piece:
 
 def system_with_delay(system: CompiledSystem, free: Free, value: Fraction) -> CompiledSystem:
     """Return the system with another value of what reaches its delays."""
-    return apply(system, [Override(free.name, free.group, value)])
+    return apply(system, [Override(free, value)])
 
 
 def delay_now(system: CompiledSystem, free: Free) -> Fraction:

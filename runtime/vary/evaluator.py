@@ -110,8 +110,7 @@ class PointEvaluator:
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them."""
         overrides = [
-            Override(one.name, one.group, Fraction(float(number)))
-            for one, number in zip(self.free, value, strict=True)
+            Override(one, Fraction(float(number))) for one, number in zip(self.free, value, strict=True)
         ]
         return split(*lifted_groups(apply(self.system, overrides), prepared=self.prepared)).systems
 
@@ -285,7 +284,7 @@ def generic(system: CompiledSystem, free: Sequence[Free]) -> CompiledSystem:
     for place, one in enumerate(free):
         value = Fraction(parameter_of(system, one).value)
         share = GENERIC * Fraction(place + 3, 3)
-        overrides.append(Override(one.name, one.group, value * (1 + share) if value else share))
+        overrides.append(Override(one, value * (1 + share) if value else share))
     unbounded = replace(
         system,
         parameters=tuple(_unbounded(parameter) for parameter in system.parameters),

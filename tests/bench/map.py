@@ -19,6 +19,7 @@ from apc.analysis.analysis import Prepared, analyze, prepare
 from apc.benchmark.timing import timed
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import precision
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
@@ -124,7 +125,7 @@ class Tally:
 
     def add(self, system: CompiledSystem, shared: Prepared, values: dict[str, float], known: Truth) -> None:
         """Analyse a point and compare."""
-        drawn = [Override(name, None, Fraction(value)) for name, value in values.items()]
+        drawn = [Override(Free(name), Fraction(value)) for name, value in values.items()]
         taken, found = timed(lambda: analyze(apply(system, drawn), prepared=shared))
         self.seconds += taken
         self.points += 1

@@ -28,6 +28,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
+from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.simulation.simulation import ROW
 from apc.threads import single_threaded
@@ -65,7 +66,7 @@ def numbers(generator: random.Random, shape: Shape, system: CompiledSystem) -> l
     for name, (low, high, zero) in shape.ranges.items():
         value = 0.0 if generator.random() < zero else 10 ** generator.uniform(low, high)
         if name in known:
-            found.append(Override(name, None, Fraction(value)))
+            found.append(Override(Free(name), Fraction(value)))
     return found
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from apc.analysis.analysis import prepare
 from apc.benchmark.timing import median_time, timed
-from apc.frame.names import Free
 from apc.frame.overrides import apply, parse_override
 from apc.regions.axes import parse_axes
 from apc.regions.boundary import relative_to
@@ -72,7 +71,7 @@ def paper(quick: bool, judge: Judge) -> None:
     axes = parse_axes(system, X, Y)
     exact, found = warm(lambda: region(system, axes), 5 if quick else 30)
     shared = prepare(system)
-    free = tuple(Free(axis.name, axis.group) for axis in axes)
+    free = tuple(axis.free for axis in axes)
     set_up, _ = warm(lambda: prepare(system), 10)
     set_up += warm(lambda: evaluator(system, free, prepared=shared), 10)[0]
     count = 30 if quick else COUNT

@@ -22,7 +22,7 @@ import numpy as np
 from apc.analysis.analysis import Analysis, analyze, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import precision
-from apc.frame.names import Free, find, parameter_of
+from apc.frame.names import find, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.vary.sensitivity import Sensitivities, sensitivities
 from tests.fifty_digits.events import Happening, Play, build_peers, refusal
@@ -218,11 +218,11 @@ def _scaled(matrix: Any) -> Any:
 
 def _slopes(system: CompiledSystem, here: Sequence[Any], name: str) -> list[Any]:
     """Return the derivatives of all frame matrices by a parameter, set as `--set` does."""
-    known, group = find(system, name)
-    value = parameter_of(system, Free(known, group)).value
+    free = find(system, name)
+    value = parameter_of(system, free).value
 
     def at(number: float) -> list[Any]:
-        moved = _matrices(apply(system, [Override(known, group, Fraction(number))]))
+        moved = _matrices(apply(system, [Override(free, Fraction(number))]))
         return [flint.acb_mat(matrix.mid()) for matrix in moved]
 
     if value:
