@@ -21,6 +21,7 @@ from apc.compiler.functions.functions import build_functions
 from apc.compiler.scene.scene import Scene, build_scene, library_folders
 from apc.compiler.source.nodes import Mapping, Scalar, Sequence
 from apc.compiler.source.source import Source, read_source
+from apc.compiler.timings import part
 
 Stage = Literal["source", "scene", "flat", "clocked", "sorted", "compiled"]
 STAGES: tuple[Stage, ...] = ("source", "scene", "flat", "clocked", "sorted", "compiled")
@@ -41,7 +42,9 @@ def run_stages(path: Path, *, until: Stage) -> StageValue:
 
 def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
     """Run the stages one by one, yielding each one's name and value as soon as it is done."""
-    yield from stages_of(read_source(path))
+    with part("source"):
+        source = read_source(path)
+    yield from stages_of(source)
 
 
 def stages_of(source: Source) -> Iterator[tuple[Stage, StageValue]]:
@@ -49,19 +52,25 @@ def stages_of(source: Source) -> Iterator[tuple[Stage, StageValue]]:
     assert source.path is not None
     path = source.path
     yield "source", source
-    library = Library(library_folders(source))
-    scene = build_scene(source, library)
+    with part("scene"):
+        library = Library(library_folders(source))
+        scene = build_scene(source, library)
     yield "scene", scene
-    flat = flatten(scene)
+    with part("flat"):
+        flat = flatten(scene)
     yield "flat", flat
-    clocked = partition(flat)
+    with part("clocked"):
+        clocked = partition(flat)
     yield "clocked", clocked
-    sorted_system = sort(clocked)
+    with part("sorted"):
+        sorted_system = sort(clocked)
     yield "sorted", sorted_system
-    texts = origin_texts(
-        (path.name, source.digest), scene.texts, _folders_named(source), library.texts, path.parent
-    )
-    yield "compiled", build_functions(sorted_system, Origin(path.name, texts))
+    with part("compiled"):
+        texts = origin_texts(
+            (path.name, source.digest), scene.texts, _folders_named(source), library.texts, path.parent
+        )
+        system = build_functions(sorted_system, Origin(path.name, texts))
+    yield "compiled", system
 
 
 def _folders_named(source: Source) -> Iterator[str]:

@@ -62,11 +62,13 @@ from apc.compiler.formula import EXACT
 from apc.compiler.language.unit_text import is_si
 from apc.compiler.plain import PlainFunction, plain, read_function
 from apc.compiler.seal import seal
+from apc.compiler.timings import part
 
 FOREIGN = "it is not what apc compile writes"
 _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[0-9]{1,4000})?\Z")
 
 
+@part("save")
 def save(system: CompiledSystem, path: Path, *, sealed: bool = False) -> None:
     """Write a compiled model, `sealed` if it was compiled now. Raises ApcError if it can't be written."""
     members: dict[str, bytes] = {}

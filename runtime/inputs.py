@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from apc.compiler.cache import DAMAGE, LARGEST, SUFFIX, Archive, changed, read_archive, record_of
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_file, check_target, is_special, read_file, same_file
+from apc.compiler.timings import part
 from apc.suffixes import written
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ def load_or_compile(path: Path) -> CompiledSystem:
     return system
 
 
+@part("read")
 def open_scene(
     file: str | None, settings: Sequence[str], outputs: Mapping[str, Path | None] | None = None
 ) -> CompiledSystem:

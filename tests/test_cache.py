@@ -17,7 +17,7 @@ import sympy
 
 from apc.__main__ import run
 from apc.api import load
-from apc.compiler import cache, files
+from apc.compiler import cache, files, timings
 from apc.compiler.cache import Record, changed, read_archive, record_of
 from apc.inputs import compiled_already
 from tests.topologies import replaced, told
@@ -151,11 +151,47 @@ def test_compiling_again_says_unchanged_and_force_compiles(capsys: pytest.Captur
 
 def test_timings_name_every_stage(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["compile", "--timings"]) == 0
-    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.endswith(" ms")]
-    stages = ["source", "scene", "flat", "clocked", "sorted", "compiled", "self-check", "save", "all"]
-    assert [row[0] for row in rows] == stages
-    numbers = [float(row[-2]) for row in rows]
+    rows = [line.rsplit(maxsplit=2) for line in capsys.readouterr().err.splitlines()]
+    stages = ["source", "scene", "flat", "clocked", "sorted", "compiled", "self-check", "save"]
+    assert [row[0].strip() for row in rows] == ["start", *stages, "imports, rest", "all"]
+    numbers = [float(row[1]) for row in rows]
     assert sum(numbers[:-1]) == pytest.approx(numbers[-1], abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["analyze", "--json"], ["read", "analysis", "sensitivities", "margins", "print"]),
+        (["critical", "contact.stiffness"], ["read", "critical", "print"]),
+        (["simulate", "--duration", "0.1 s"], ["read", "prepare", "play", "print"]),
+        (["check"], ["source", "scene", "flat", "clocked", "sorted", "compiled"]),
+    ],
+)
+def test_every_command_says_what_its_parts_take_on_stderr(
+    words: list[str], parts: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(words) == 0
+    plain = capsys.readouterr()
+    assert run([*words, "--timings"]) == 0
+    found = capsys.readouterr()
+    assert found.out == plain.out
+    told = [line.rsplit(maxsplit=2)[0].strip() for line in found.err.splitlines()]
+    assert [name for name in told if name in parts] == parts
+    assert told[0] == "start" and told[-2:] == ["imports, rest", "all"]
+
+
+def test_a_part_within_another_counts_for_itself_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 1.0, 3.0, 7.0, 12.0, 20.0, 30.0, 50.0])
+    monkeypatch.setattr(timings.time, "perf_counter", lambda: next(clock))
+    with timings.record() as taken:
+        with timings.part("outer"), timings.part("inner"):
+            pass
+        with timings.part("inner"):
+            pass
+    assert taken == {"outer": 7.0, "inner": 14.0, "imports, rest": 29.0}
+    assert not timings.recording()
+    with timings.part("outer"):
+        assert not timings.recording()
 
 
 @pytest.mark.parametrize("content", [b"", b"garbage", b"PK\x05\x06" + 18 * b"\0"])

@@ -18,6 +18,7 @@ import numpy as np
 from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.timings import part
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peer_group import PeerGroup, states_of, used_ways
 from apc.eigen.peers import group_of_row, peer_groups
@@ -129,6 +130,7 @@ def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | N
     return replace(prepared, jacobians=found) if len(found) == len(sites) else None
 
 
+@part("analysis")
 def analyze(
     system: CompiledSystem,
     *,

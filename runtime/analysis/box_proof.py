@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.box import Box, open_box
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.timings import part
 from apc.eigen.balls import (
     Balls,
     Dual,
@@ -100,6 +101,7 @@ class _Question:
     held: NDArray[np.intp]
 
 
+@part("box")
 def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
     """Prove a scene stable in a whole box, or find a point of it where it is unstable.
 

@@ -19,6 +19,7 @@ from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.compiler.timings import part
 from apc.eigen.spectrum import UNSTABLE
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import linearize
@@ -89,6 +90,7 @@ class ContactModes(Result):
         return f"{', '.join(self.parts)}: {words}"
 
 
+@part("contact modes")
 def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -> ContactModes:
     """Analyse a scene in each mode of its contacts, walls and limits.
 

@@ -26,6 +26,7 @@ import numpy as np
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError
+from apc.compiler.timings import part
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.scheduling import build_schedules
@@ -115,6 +116,7 @@ class Conventions(Result):
         return f"the verdict hangs on a convention: {verdict} if {other.words} (--conventions lists all)"
 
 
+@part("conventions")
 def conventions(
     system: CompiledSystem,
     *,

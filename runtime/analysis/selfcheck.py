@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import PRECISIONS, TOO_LARGE, UNIT, moved_together
 from apc.frame.exact import evaluate_exact
@@ -49,6 +50,7 @@ SMALL, TERMS = 2.0**-16, 24
 TINY = float(np.finfo(np.float64).tiny)
 
 
+@part("self-check")
 def check_frame(system: CompiledSystem) -> float:
     """Compare one frame of every kind, both ways, at random; return the largest relative difference.
 

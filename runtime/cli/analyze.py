@@ -10,7 +10,7 @@ from __future__ import annotations
 import click
 
 from apc.analysis.methods import AUTO, METHODS
-from apc.cli.options import file_argument, json_option, print_result, set_option
+from apc.cli.options import Command, file_argument, json_option, print_result, set_option
 from apc.cli.progress import at_work
 from apc.threads import start_single_threaded
 
@@ -18,7 +18,7 @@ from apc.threads import start_single_threaded
 SECONDS_A_PEER = 1e-4
 
 
-@click.command("analyze")
+@click.command("analyze", cls=Command)
 @file_argument
 @set_option
 @click.option(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import file_argument, file_option, json_option, print_result, set_option, tell
+from apc.cli.options import Command, file_argument, file_option, json_option, print_result, set_option, tell
 from apc.cli.progress import at_work
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -20,7 +20,7 @@ from apc.compiler.files import check_target
 HARD = Path("tests/hard")  # of a copy of the repository
 
 
-@click.command("bench")
+@click.command("bench", cls=Command)
 @file_argument
 @set_option
 @file_option("--plot", "Draw error against time: .png, .svg or .pdf.")

@@ -9,28 +9,24 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
 
 import click
 
 from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
 from apc.cli.critical import critical_command
-from apc.cli.options import beside, file_argument, file_option, tell
+from apc.cli.options import Group, beside, file_argument, file_option, tell
 from apc.cli.progress import at_work
 from apc.cli.region import region_command
 from apc.cli.simulate import simulate_command
 from apc.cli.sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import unwritable, write_text
+from apc.compiler.timings import recording
 from apc.compiler.words import counted
 from apc.suffixes import check_suffix
 from apc.threads import start_single_threaded
-
-if TYPE_CHECKING:
-    from apc.compiler.compiled import CompiledSystem
 
 STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}\Z")
@@ -47,7 +43,7 @@ def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> 
         context.exit()
 
 
-@click.group(context_settings=CONTEXT)
+@click.group(cls=Group, context_settings=CONTEXT)
 @click.option(
     "--version",
     is_flag=True,
@@ -142,13 +138,13 @@ def check(file: str | None) -> None:
     help=f"Stop after a stage, print what it made and write nothing. One of {', '.join(STAGES[:-1])}.",
 )
 @click.option("--force", is_flag=True, help="Compile even if nothing has changed since it was compiled.")
-@click.option("--timings", is_flag=True, help="Print how long each stage took; implies --force.")
-def compile_command(file: str | None, until: str, force: bool, timings: bool) -> None:
+def compile_command(file: str | None, until: str, force: bool) -> None:
     """Turn a topology into equations: NAME.yaml to NAME.apc beside it.
 
     Prints what the scene needed: states, delays and packets kept for a peer,
     and how large the systems are that decide its stability. Compiles nothing
-    if the topology, every file it names and apc itself are as they were.
+    if the topology, every file it names and apc itself are as they were, and
+    no --timings are asked for.
     """
     start_single_threaded()
     from apc.inputs import check_model_name, compiled_already, find_input
@@ -162,43 +158,26 @@ def compile_command(file: str | None, until: str, force: bool, timings: bool) ->
         return
     if path.suffix == ".apc":
         raise ApcError(Mistake("E614", Place(str(path)), "is compiled already", hint=f"apc analyze {path}"))
-    if not (force or timings) and compiled_already(path):
+    if not (force or recording()) and compiled_already(path):
         tell(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
         return
     check_model_name(path)
     with at_work("compiling"):
-        _compile(path, timings=timings)
+        _compile(path)
 
 
-def _compile(path: Path, *, timings: bool) -> None:
-    """Compile, check, save and report; with `timings`, how long each of it took."""
+def _compile(path: Path) -> None:
+    """Compile, check, save and report."""
     from apc.analysis.needs import needs
     from apc.analysis.selfcheck import check_frame
-    from apc.compiler.pipeline import each_stage
+    from apc.compiler.pipeline import compile_topology
     from apc.compiler.store import save
-    from apc.present.analysis import compile_text, timings_text
+    from apc.present.analysis import compile_text
 
-    taken: list[tuple[str, float]] = []
-    last = time.perf_counter()
-
-    def lap(name: str) -> None:
-        nonlocal last
-        now = time.perf_counter()
-        taken.append((name, now - last))
-        last = now
-
-    values = []
-    for stage, value in each_stage(path):
-        lap(stage)
-        values.append(value)
-    system = cast("CompiledSystem", values[-1])
+    system = compile_topology(path)
     difference = check_frame(system)
-    lap("self-check")
     save(system, target := path.with_suffix(".apc"), sealed=True)
-    lap("save")
     tell(compile_text(system, needs(system), target, difference))
-    if timings:
-        tell(timings_text(taken))
 
 
 @apc.command()

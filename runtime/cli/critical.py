@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import file_argument, json_option, print_result, set_option
+from apc.cli.options import Command, file_argument, json_option, print_result, set_option
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
@@ -21,7 +21,7 @@ from apc.threads import start_single_threaded
 SCENES = (".yaml", ".yml", ".apc")
 
 
-@click.command("critical")
+@click.command("critical", cls=Command)
 @click.argument("path")
 @file_argument
 @set_option

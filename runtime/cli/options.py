@@ -1,15 +1,16 @@
 """What commands have in common: FILE, the options `--set` and `--json`, and how a result is printed.
 
 Takes: a result.
-Gives: `file_argument`, `file_option`, `set_option`, `json_option`, `WholeNumber`; `print_result`, `tell`,
-`beside`.
+Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `json_option`, `WholeNumber`;
+`print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,10 +19,11 @@ import click
 from apc.compiler.digits import plain_int
 from apc.compiler.errors import visible
 from apc.compiler.files import is_stdout
+from apc.compiler.timings import part, record
 from apc.present.forms import json_text
 from apc.result import Result
 
-Command = TypeVar("Command", bound=Callable[..., None])
+Function = TypeVar("Function", bound=Callable[..., None])
 
 file_argument = click.argument("file", required=False)
 set_option = click.option(
@@ -34,9 +36,35 @@ set_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 
 
-def file_option(name: str, told: str, *, required: bool = False) -> Callable[[Command], Command]:
+def file_option(name: str, told: str, *, required: bool = False) -> Callable[[Function], Function]:
     """Return an option that names a file to write; `told` is its help."""
     return click.option(name, type=click.Path(path_type=Path), metavar="FILE", help=told, required=required)
+
+
+class Command(click.Command):
+    """A command that says with --timings how long each of its parts took."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        told = "Say on stderr how long each part took."
+        self.params.append(click.Option(["--timings"], is_flag=True, help=told))
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command, its parts measured if that is asked for."""
+        if not ctx.params.pop("timings"):
+            return super().invoke(ctx)
+        started = time.process_time()
+        with record() as taken:
+            try:
+                return super().invoke(ctx)
+            finally:
+                ctx.call_on_close(lambda: tell(timings_text({"start": started, **taken}), err=True))
+
+
+class Group(click.Group):
+    """Commands each of which is a `Command`."""
+
+    command_class = Command
 
 
 class WholeNumber(click.IntRange):
@@ -52,6 +80,7 @@ class WholeNumber(click.IntRange):
         return super().convert(value, param, ctx)
 
 
+@part("print")
 def print_result(found: Result, *, as_json: bool, err: bool = False) -> None:
     """Print a result, as one JSON document or in words."""
     tell(json_text(found.to_dict()) if as_json else str(found), err=err)
@@ -65,3 +94,10 @@ def beside(*outputs: Path | None) -> bool:
 def tell(text: str, *, err: bool = False) -> None:
     """Print a text, with characters that would act on the terminal written out."""
     click.echo(visible(text), err=err)
+
+
+def timings_text(taken: Mapping[str, float]) -> str:
+    """Return what --timings says: parts and their seconds."""
+    rows = [*taken.items(), ("all", sum(taken.values()))]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"  {name:<{width}}  {seconds * 1e3:8.1f} ms" for name, seconds in rows)

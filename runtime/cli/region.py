@@ -13,6 +13,7 @@ from pathlib import Path
 import click
 
 from apc.cli.options import (
+    Command,
     WholeNumber,
     beside,
     file_argument,
@@ -27,7 +28,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
 
 
-@click.command("region")
+@click.command("region", cls=Command)
 @file_argument
 @click.option("--x", metavar="PATH=LO:HI", help="Horizontal axis; the scene's studies: region: if not given.")
 @click.option("--y", metavar="PATH=LO:HI", help="Vertical axis.")

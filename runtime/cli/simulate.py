@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import click
 
 from apc.cli.options import (
+    Command,
     WholeNumber,
     beside,
     file_argument,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from apc.simulation.trajectory import Sink
 
 
-@click.command("simulate")
+@click.command("simulate", cls=Command)
 @file_argument
 @click.option(
     "--duration",

@@ -15,6 +15,7 @@ from pathlib import Path
 import click
 
 from apc.cli.options import (
+    Command,
     WholeNumber,
     beside,
     file_argument,
@@ -30,7 +31,7 @@ from apc.compiler.files import is_special
 from apc.option_value import option_value
 
 
-@click.command("sweep")
+@click.command("sweep", cls=Command)
 @file_argument
 @click.option(
     "--over",

@@ -115,14 +115,6 @@ def _pairwise(system: CompiledSystem) -> Iterator[str]:
         yield f"costs N²: {name} is evaluated once a pair of peers, as {why}"
 
 
-def timings_text(taken: Sequence[tuple[str, float]]) -> str:
-    """Return what `apc compile --timings` prints: stages and their seconds."""
-    total = sum(seconds for _, seconds in taken)
-    rows = [*taken, ("all", total)]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"  {name:<{width}}  {seconds * 1e3:8.1f} ms" for name, seconds in rows)
-
-
 def analysis_text(result: Analysis) -> str:
     """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
     lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"]

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.files import check_target, write_text
+from apc.compiler.timings import part
 from apc.compiler.words import known_digits, measured, with_unit
 from apc.distribution import program_version
 from apc.optional import need
@@ -186,6 +187,7 @@ def check_region_path(path: Path) -> str:
     return suffix
 
 
+@part("draw")
 def write_panels(path: Path, found: Panels) -> None:
     """Write regions to a file, its format chosen by the suffix. Raises ApcError E601 if it can't."""
     suffix = check_region_path(path)

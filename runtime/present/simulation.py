@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.timings import part
 from apc.compiler.words import counted, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text
@@ -217,6 +218,7 @@ def played_dataset(found: Trajectory) -> Any:
     return xarray.Dataset(variables, {"time": time}, {"provenance": provenance_json(found.provenance)})
 
 
+@part("draw")
 def save_picture(found: Trajectory, path: Path) -> None:
     """Draw a run into a file, its format chosen by the suffix.
 

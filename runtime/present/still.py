@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.timings import part
 from apc.frame.jacobians import guards_of, jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
@@ -166,6 +167,7 @@ def _rows(system: CompiledSystem) -> list[tuple[str, list[Body], list[Wall]]]:
     return found
 
 
+@part("draw")
 def save_still(system: CompiledSystem, path: Path) -> None:
     """Draw how a scene begins into a file, its format chosen by the suffix.
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.finite_equations import finite_equations
 from apc.frame.names import Range
@@ -185,6 +186,7 @@ class Region(Result):
         return bool(inside[0]) if wide.ndim == 0 else inside.reshape(wide.shape)
 
 
+@part("region")
 def region(
     system: CompiledSystem,
     axes: tuple[Range, Range],

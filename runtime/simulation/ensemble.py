@@ -21,6 +21,7 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.timings import part
 from apc.processes import (
     Patience,
     Workers,
@@ -104,6 +105,7 @@ def share_interval(count: int, total: int) -> tuple[float, float]:
     return max(centre - half, 0.0), min(centre + half, 1.0)
 
 
+@part("play")
 def play_many(
     system: CompiledSystem,
     settings: Settings,

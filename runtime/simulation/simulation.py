@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.jacobians import SiteJacobians, jacobians
@@ -106,6 +107,7 @@ class Simulation:
         return tuple(dict.fromkeys(listed))
 
 
+@part("prepare")
 def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str] = ()) -> Simulation:
     """Do what comes before the first instant.
 

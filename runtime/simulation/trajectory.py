@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.timings import part
 from apc.distribution import versions
 from apc.option_value import option_value
 from apc.result import Result
@@ -160,6 +161,7 @@ class Keeper:
         self.values.append(block.values)
 
 
+@part("play")
 def play(
     simulation: Simulation, sinks: Sequence[Sink], *, progress: Callable[[float], None] | None = None
 ) -> tuple[Summary, bool]:

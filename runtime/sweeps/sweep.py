@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
+from apc.compiler.timings import part
 from apc.frame.jacobians import jacobians
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
@@ -94,6 +95,7 @@ class Sweep(Result):
         return table
 
 
+@part("points")
 def sweep(
     system: CompiledSystem,
     over: Mapping[str, str | Sequence[str]],
@@ -271,10 +273,10 @@ def _other_versions(computed: Computed, cluster: str | None) -> Mistake:
 
 def _rows(work: Work, kept: _Kept) -> Iterator[Row]:
     """Yield every row: the values of the axes, then the results."""
-    for part in range(work.parts):
-        computed = kept.read(part)
-        assert computed is not None, f"part {part} was written and is gone"
-        for point, row in zip(work.points_of(part), computed, strict=True):
+    for number in range(work.parts):
+        computed = kept.read(number)
+        assert computed is not None, f"part {number} was written and is gone"
+        for point, row in zip(work.points_of(number), computed, strict=True):
             yield (*(float(value) for value in work.grid.values(point)), *row)
 
 

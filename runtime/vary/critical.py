@@ -18,6 +18,7 @@ import numpy as np
 from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, find, parameter_of, unit_of
@@ -70,6 +71,7 @@ class Critical(Result):
     groups: tuple[tuple[str, float | None], ...] = ()
 
 
+@part("critical")
 def critical(
     system: CompiledSystem,
     name: str,

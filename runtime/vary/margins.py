@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.timings import part
 from apc.eigen.spectrum import finite
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, named_times, parameter_of
@@ -85,6 +86,7 @@ class Margins(Result):
     note: str
 
 
+@part("margins")
 def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Margins:
     """Find how much each stiffness, damping and delay may grow, all else as it is.
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
@@ -87,6 +88,7 @@ class Sensitivities(Result):
     note: str
 
 
+@part("sensitivities")
 def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -> Sensitivities:
     """Differentiate the spectral radius with respect to every parameter, as each can be set.
 
