@@ -44,7 +44,7 @@ def part(name: str) -> Iterator[None]:
 
 @contextmanager
 def record() -> Iterator[dict[str, float]]:
-    """Measure the parts of the body; give their seconds, and what is in none of them, imports first of all."""
+    """Measure the parts of the body; give their seconds, and of what is in none of them."""
     global _taken
     found: dict[str, float] = {}
     _taken = found

@@ -162,7 +162,7 @@ def test_timings_name_every_stage(capsys: pytest.CaptureFixture[str]) -> None:
     ("words", "parts"),
     [
         (["analyze", "--json"], ["read", "analysis", "sensitivities", "margins", "print"]),
-        (["critical", "contact.stiffness"], ["read", "critical", "print"]),
+        (["critical", "tie.stiffness"], ["read", "critical", "print"]),
         (["simulate", "--duration", "0.1 s"], ["read", "prepare", "play", "print"]),
         (["check"], ["source", "scene", "flat", "clocked", "sorted", "compiled"]),
     ],
