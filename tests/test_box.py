@@ -109,7 +109,7 @@ def test_a_group_of_its_own_is_opened_alone_even_if_it_is_alike_in_the_middle() 
     )
     found = _proof(system, "left.contact.stiffness=±5%")
     assert found.stable is True
-    assert found.ranges[0].group == "left"
+    assert found.ranges[0].free.group == "left"
     unstable = _proof(system, "left.contact.stiffness=1000 N/m:2500 N/m")
     assert unstable.stable is False
 

@@ -2,7 +2,7 @@
 
 Takes: groups of equal peers, and what each weighs the packets of each other by.
 Gives: `Loop`, `Coupling`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`, `close_loop`; `Feedback`,
-`feedback_of`, `close`, `shift_packets`.
+`bounded_weight`, `feedback_of`, `close`, `shift_packets`.
 Guarantees: the state holds, site by site, z and then the packets on their way, in order of row and age. The
 matrix of `close_loop` comes with a bound on its rounding error, entry by entry; `close` takes one system or
 many (k, …), real or complex.
@@ -216,6 +216,12 @@ class Closed:
     sent: Matrix  # of all sites, one below the other
 
 
+def bounded_weight(weight: Fraction, doubt: float) -> tuple[float, float]:
+    """Return a weight as a float and what that may be off by: its doubt, and its rounding if it has any."""
+    known = float(weight)
+    return known, doubt + (UNIT * abs(known) if known != weight else 0.0)
+
+
 def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback]:
     """Return what each site hears, each weight with the radius of its doubt and of its rounding."""
     row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in loop.sites]
@@ -229,12 +235,11 @@ def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback
             for h, weight in enumerate(loop.coupling[one.way][g]):
                 if weight == 0 and doubt == 0:
                     continue
-                row, known = row_of[h][one.sent], float(weight)
-                found_as = known, doubt + (UNIT * abs(known) if known != weight else 0.0)
+                row = row_of[h][one.sent]
                 if one.lag == 0:
-                    now[:, line, starts[h] + row] = found_as
+                    now[:, line, starts[h] + row] = bounded_weight(weight, doubt)
                 else:
-                    before[:, line, layout.places[Packet(h, row, one.lag)]] = found_as
+                    before[:, line, layout.places[Packet(h, row, one.lag)]] = bounded_weight(weight, doubt)
         found.append(Feedback(now, before))
     return found
 

@@ -20,9 +20,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import Coupling
+from apc.eigen.closing import Coupling, bounded_weight
 from apc.eigen.peer_group import PeerGroup
-from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.lift import BoundedMap, FrameMap
 from apc.frame.schedule import Heard, Sent, Way
@@ -160,7 +159,7 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
         placed = _placed(rows_of(group.lifted, 1), rows, lines, n_s, n_r)
         transfers.append(build_transfer(placed, np.ones(1)))
     lags = sorted({heard.lag for group in sites for heard in group.schedule.heard})
-    weights, errors = np.zeros((len(lags), n_r, n_s)), np.zeros((len(lags), n_r, n_s))
+    weights = np.zeros((2, len(lags), n_r, n_s))
     for g, group in enumerate(sites):
         for line, heard in enumerate(group.schedule.heard):
             layer = lags.index(heard.lag)
@@ -168,11 +167,9 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
                 weight = coupling[heard.way][g][h]
                 if heard.sent in sender.schedule.sent:
                     row = sent_starts[h] + sender.schedule.sent.index(heard.sent)
-                    weights[layer, heard_starts[g] + line, row] = float(weight)
-                    errors[layer, heard_starts[g] + line, row] = float(abs(weight)) * UNIT + doubts.get(
-                        heard.way, 0.0
-                    )
-    return Characteristic(tuple(transfers), tuple(lags), weights, errors)
+                    known = bounded_weight(weight, doubts.get(heard.way, 0.0))
+                    weights[:, layer, heard_starts[g] + line, row] = known
+    return Characteristic(tuple(transfers), tuple(lags), *weights)
 
 
 def _placed(maps: BoundedMap, rows: Integers, lines: Integers, n_s: int, n_r: int) -> BoundedMap:

@@ -138,29 +138,17 @@ def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others:
     parts = []
     for start in range(0, len(own), CHUNK):
         chunk = slice(start, start + CHUNK)
-        parts.append(_hear_themselves(some_rows(lifted, chunk), schedule, own[chunk], others[chunk]))
-
-    def joined(maps: Sequence[FrameMap]) -> FrameMap:
-        return maps[0].mapped(lambda *blocks: np.concatenate(blocks), *maps[1:])
-
-    maps, errors = zip(*parts, strict=True)
-    return BoundedMap(*joined(maps).blocks, error=joined(errors))
+        layout, feedback = _open_loop(some_rows(lifted, chunk), schedule, own[chunk], others[chunk])
+        heard = Feedback(rounded(feedback.now), rounded(feedback.before))
+        parts.append(_cut(close([some_rows(lifted, chunk).bounded], [heard], layout, numbers=RADII)))
+    whole = parts[0].mapped(lambda *blocks: np.concatenate(blocks), *parts[1:])
+    return BoundedMap(*whole.mapped(value_of).blocks, error=whole.mapped(radius_of))
 
 
 def hear_roughly(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> FrameMap:
     """Return the map that `hear_themselves` gives, without its errors."""
     layout, feedback = _open_loop(lifted, schedule, own, others)
     return _cut(close([lifted], [feedback], layout))
-
-
-def _hear_themselves(
-    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
-) -> tuple[FrameMap, FrameMap]:
-    """Close a chunk of sites, with the errors."""
-    layout, feedback = _open_loop(lifted, schedule, own, others)
-    heard = Feedback(rounded(feedback.now), rounded(feedback.before))
-    closed = _cut(close([lifted.bounded], [heard], layout, numbers=RADII))
-    return closed.mapped(value_of), closed.mapped(radius_of)
 
 
 def _open_loop(
