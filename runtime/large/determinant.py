@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import Coupling
 from apc.eigen.peer_group import PeerGroup
-from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Heard, Sent, Way
+from apc.large.bordered import wires_of
 from apc.large.characteristic import Characteristic
 from apc.large.populations import Population, hear_themselves
 from apc.large.transfer import StateSpace, build_transfer
@@ -160,20 +160,8 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
         lines = np.arange(heard_starts[g], heard_starts[g + 1])
         space = _placed(StateSpace(*(block[None] for block in blocks)), rows, lines, n_s, n_r)
         transfers.append(build_transfer(space, np.ones(1)))
-    lags = sorted({heard.lag for group in sites for heard in group.schedule.heard})
-    weights, errors = np.zeros((len(lags), n_r, n_s)), np.zeros((len(lags), n_r, n_s))
-    for g, group in enumerate(sites):
-        for line, heard in enumerate(group.schedule.heard):
-            layer = lags.index(heard.lag)
-            for h, sender in enumerate(sites):
-                weight = coupling[heard.way][g][h]
-                if heard.sent in sender.schedule.sent:
-                    row = sent_starts[h] + sender.schedule.sent.index(heard.sent)
-                    weights[layer, heard_starts[g] + line, row] = float(weight)
-                    errors[layer, heard_starts[g] + line, row] = float(abs(weight)) * UNIT + doubts.get(
-                        heard.way, 0.0
-                    )
-    return Characteristic(tuple(transfers), tuple(lags), weights, errors)
+    wires = wires_of(sites, coupling, doubts)
+    return Characteristic(tuple(transfers), wires.lags, wires.weights, wires.errors)
 
 
 def _placed(space: StateSpace, rows: Integers, lines: Integers, n_s: int, n_r: int) -> StateSpace:
