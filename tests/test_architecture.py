@@ -62,8 +62,8 @@ HOUSE = (
     (
         "apc.large",
         """
-        diagonal transfer characteristic zeros populations determinant determinant_spectrum translation rings
-        sparse_system krylov
+        diagonal transfer characteristic bordered zeros populations determinant determinant_spectrum
+        translation rings sparse_system krylov
         """,
     ),
     (
@@ -76,7 +76,7 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch evaluator bends marginal crossings bracket delays search critical
+        wiring batch crossings plane bracket counting loops evaluator bends marginal delays search critical
         margins sensitivity
         """,
     ),

@@ -19,7 +19,7 @@ from apc.frame.overrides import Override, apply
 from apc.vary.critical import critical
 from apc.vary.crossings import scan, scan_lines
 from apc.vary.margins import margins
-from tests.bruteforce import Scene, frame_matrix
+from tests.bruteforce import Scene, frame_matrices, frame_matrix
 from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
@@ -323,6 +323,56 @@ def test_many_packets_on_their_way_give_the_crossings_that_few_give(monkeypatch:
     for one, other in zip(by_matrix.crossings, by_count.crossings, strict=True):
         assert (one.value, one.stable_side, one.kind) == (other.value, other.stable_side, other.kind)
         assert one.frequency_hz == pytest.approx(other.frequency_hz, rel=1e-6)
+
+
+@pytest.mark.parametrize("frames", [13, 40, 100])
+def test_a_long_delay_has_the_crossing_of_all_peers_by_hand(frames: int) -> None:
+    """The spectral radius of the full map, a packet a state, is 1 between the ends of the error."""
+    late = Fraction(8 * frames, 1000)
+    found = critical(with_values(compiled(AVERAGE), {"lan.delay": str(late)}), "coordination.stiffness")
+    assert found.whole and found.known and found.value is not None and found.error is not None
+    assert found.crossings[0].proof.startswith("proved")
+    assert found.error < 1e-12 * found.value
+
+    def largest(k_t: float) -> float:
+        sizes = np.abs(np.linalg.eigvals(frame_matrices(Scene(kt=k_t, comm=late), 1)[0]))
+        return float(np.sort(sizes)[-2])  # all can move together
+
+    aside = 1e-6 * found.value
+    assert largest(found.value - aside) < 1 < largest(found.value + aside)
+
+
+@pytest.mark.parametrize("frames", [100, 300])
+def test_a_long_delay_has_the_crossing_of_a_frequency_sweep_by_hand(frames: int) -> None:
+    """det(ζ − P − w ζ^(−d) Q S) goes once less around 0 for every eigenvalue beyond the circle."""
+    late = f"{Fraction(8 * frames, 1000)}"
+    found = critical(with_values(compiled(AVERAGE), {"lan.delay": late}), "coordination.stiffness")
+    assert found.value is not None
+    place = 2 * np.pi * found.crossings[0].frequency_hz * 0.008
+    near = place + 0.02 / frames * np.concatenate([-np.geomspace(1, 1e-9, 3000), np.geomspace(1e-9, 1, 3000)])
+    angles = np.unique(
+        np.concatenate([np.geomspace(1e-7, np.pi, 3000), np.linspace(1e-3, np.pi, 60_000), near])
+    )
+    points = np.exp(1j * angles)
+
+    def beyond(k_t: float) -> int:
+        # Of two peers who hear each other a frame late: one's motion, what it hears and what it sends.
+        full = frame_matrices(Scene(peers=2, kt=k_t), 1)[0]
+        size = len(full) // 2
+        first = size - 4  # of four packets x and v, the newest first, and older ones nobody hears
+        p, q, s = full[:first, :first], full[:first, size + first : 2 * size], full[first:size, :first]
+        total = 0
+        for weight in (1.0, -0.5):  # of three peers, all alike or apart
+            late = (weight * points**-frames)[:, None, None] * (q @ s)
+            f = np.linalg.det(points[:, None, None] * np.eye(first) - p - late)
+            f /= (1 - 1 / points) if weight == 1.0 else 1.0  # all can move together
+            turn = np.angle(f[1:] / f[:-1])
+            assert np.abs(turn).max() < 2.5
+            total += first - round(float(turn.sum()) / np.pi)
+        return total
+
+    aside = 1e-7 * found.value
+    assert [beyond(found.value - aside), beyond(found.value + aside)] == [0, 2]
 
 
 def test_what_does_not_enter_the_analysis_is_said_not_to() -> None:

@@ -2,7 +2,7 @@
 
 Takes: a `ClosedSystem`; its sites' matrices as exact rationals.
 Gives: `precision`, `unprovable`, `rational_ball`, `site_balls`, `frame_steps`, `closed_frame`, `frame_balls`,
-`reduced_balls`, `square`; `Dual`, `slope_of`, `step_duals`: balls with a slope.
+`reduced_balls`, `square`; `weight_balls`; `Dual`, `slope_of`, `step_duals`: balls with a slope.
 Guarantees: the true matrix, of the numbers the sites hold, lies in the balls, whatever the number of bits;
 more bits make them smaller. Where a parameter is a ball, value and slope hold those of every parameter in it.
 Does not: decide anything (see `certify`).
@@ -23,7 +23,7 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem, Packet, shift_packets
+from apc.eigen.closing import ClosedSystem, Loop, Packet, shift_packets
 from apc.eigen.graph_modes import Surd
 from apc.eigen.relative import Relative, relative
 from apc.frame.discretize import step_balls
@@ -49,7 +49,7 @@ def precision(bits: int) -> Iterator[None]:
         flint.ctx.prec = before
 
 
-def unprovable(system: ClosedSystem) -> str:
+def unprovable(system: ClosedSystem | Loop) -> str:
     """Return why a system's coefficients can't be had exactly, or "" when they can."""
     if not system.sites:
         return "its matrix was not composed from sites"
@@ -70,7 +70,7 @@ def rational_ball(value: Fraction | int) -> Any:
     return flint.arb(flint.fmpq(exact.numerator, exact.denominator))
 
 
-def site_balls(system: ClosedSystem) -> list[LinearSite]:
+def site_balls(system: ClosedSystem | Loop) -> list[LinearSite]:
     """Return the sites' matrices as balls at the present precision; equal sites are worked out once."""
     known: dict[int, LinearSite] = {}
     found = []
@@ -123,7 +123,7 @@ def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Seque
     unit = np.eye(n, dtype=np.int64).astype(object)
     place_of = system.layout.places
     rows_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
-    weights = _weights(system)
+    weights = weight_balls(system)
     sent: dict[tuple[int, int], Balls] = {}
 
     def hearing(g: int) -> Callable[[int], Balls | None]:
@@ -164,7 +164,7 @@ def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Seque
     return matrix
 
 
-def _weights(system: ClosedSystem) -> dict[Way, list[list[tuple[int, Any]]]]:
+def weight_balls(system: ClosedSystem | Loop) -> dict[Way, list[list[tuple[int, Any]]]]:
     """Return, way by way and site by site, whom it hears with what weight, the doubts included."""
     found: dict[Way, list[list[tuple[int, Any]]]] = {}
     for way, rows in system.coupling.items():

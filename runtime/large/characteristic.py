@@ -212,6 +212,21 @@ def characteristic_ball(function: Characteristic, points: Complexes, reach: Floa
         f.
     points, reach
         The discs (z,).
+    """
+    with np.errstate(all="ignore"):
+        found = _bounded(function, points, reach)
+    return determinant_ball(found.value, found.slope, found.doubt, reach)
+
+
+def determinant_ball(matrix: Complexes, slope: Complexes, doubt: Floats, reach: Floats) -> Ball:
+    """Return a determinant at the centres of discs, and how much it changes at most within them.
+
+    Parameters
+    ----------
+    matrix, slope, doubt
+        A and A₁ (z, n, n), and a bound V on what A + h A₁ differs by from the matrix anywhere in the disc.
+    reach
+        The discs' radii (z,).
 
     Notes
     -----
@@ -220,8 +235,6 @@ def characteristic_ball(function: Characteristic, points: Complexes, reach: Floa
     Σ |λ_i|² ≤ F² (Schur), so it differs from 1 by at most (1 + F/√n)^n − 1.
     """
     with np.errstate(all="ignore"):
-        found = _bounded(function, points, reach)
-        matrix, slope, doubt = found.value, found.slope, found.doubt
         n = matrix.shape[-1]
         fine = np.asarray(np.isfinite(doubt).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2)))
         matrix = np.where(fine[:, None, None], matrix, np.eye(n))

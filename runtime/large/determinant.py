@@ -20,11 +20,12 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import Coupling, bounded_weight
+from apc.eigen.closing import Coupling
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.lift import BoundedMap, FrameMap
 from apc.frame.schedule import Heard, Sent, Way
+from apc.large.bordered import wires_of
 from apc.large.characteristic import Characteristic
 from apc.large.populations import Population, hear_themselves, rows_of
 from apc.large.transfer import build_transfer
@@ -158,18 +159,8 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
         lines = np.arange(heard_starts[g], heard_starts[g + 1])
         placed = _placed(rows_of(group.lifted, 1), rows, lines, n_s, n_r)
         transfers.append(build_transfer(placed, np.ones(1)))
-    lags = sorted({heard.lag for group in sites for heard in group.schedule.heard})
-    weights = np.zeros((2, len(lags), n_r, n_s))
-    for g, group in enumerate(sites):
-        for line, heard in enumerate(group.schedule.heard):
-            layer = lags.index(heard.lag)
-            for h, sender in enumerate(sites):
-                weight = coupling[heard.way][g][h]
-                if heard.sent in sender.schedule.sent:
-                    row = sent_starts[h] + sender.schedule.sent.index(heard.sent)
-                    known = bounded_weight(weight, doubts.get(heard.way, 0.0))
-                    weights[:, layer, heard_starts[g] + line, row] = known
-    return Characteristic(tuple(transfers), tuple(lags), *weights)
+    wires = wires_of(sites, coupling, doubts)
+    return Characteristic(tuple(transfers), wires.lags, wires.weights, wires.errors)
 
 
 def _placed(maps: BoundedMap, rows: Integers, lines: Integers, n_s: int, n_r: int) -> BoundedMap:

@@ -1,7 +1,7 @@
 """The spectrum of a population by its characteristic function: bounds, verdict, the largest modes.
 
 Takes: loops with long delays, or populations of different peers on complete graphs.
-Gives: `solve_loops`, `solve_populations`.
+Gives: `solve_loops`, `solve_populations`; `frequency_of`, `without_packets`.
 Guarantees: as `zeros`: the radius is bounded from both sides, and nothing beyond it is missed; a verdict
 nearer to the boundary than its bound says so. Rigid modes are known from the equations.
 Does not: list more than the largest modes.
@@ -128,7 +128,7 @@ def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spect
 def _solve_loop(loop: Loop) -> _Solved:
     """Find the largest modes of a loop."""
     function = of_loop(loop.sites, loop.coupling, loop.doubts)
-    prompt = _without_packets(loop)
+    prompt = without_packets(loop)
     rigid, drifts = find_rigid_modes(prompt, with_drifts=False).directions.shape[1], 0
     starts = _delay_starts(function)
     zeros = find_zeros(function, starts, rigid=rigid, listed=LISTED, near=0)
@@ -143,7 +143,13 @@ def _solve_loop(loop: Loop) -> _Solved:
     return _Solved(zeros, rigid, drifts, modes)
 
 
-def _without_packets(loop: Loop) -> Loop:
+def frequency_of(loop: Loop, value: complex) -> float:
+    """Return the frequency in Hz of the motion of an eigenvalue of a loop, whole turns in a frame counted."""
+    function = of_loop(loop.sites, loop.coupling, loop.doubts)
+    return _loop_mode(function, loop, Zero(value, 0.0, 1)).frequency_hz
+
+
+def without_packets(loop: Loop) -> Loop:
     """Return the loop with no packet in its state: how many motions are rigid does not depend on delays."""
     sites = tuple(
         replace(group, schedule=replace(group.schedule, depths=(0,) * len(group.schedule.depths)))

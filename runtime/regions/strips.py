@@ -27,7 +27,6 @@ from apc.regions.cells import HALVINGS, survey
 from apc.regions.curves import between, refined
 from apc.regions.eigenpairs import largest, log_magnitudes
 from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
-from apc.vary.crossings import scan
 from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
 from apc.vary.evaluator import PointEvaluator, evaluator_of_many
 from apc.vary.marginal import marginal_motion, with_rigid
@@ -177,7 +176,7 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
         0,
     )
     scale = line.scale()
-    found = scan(line.course, line.samples(low, high, scale)[0], least=scale / SPAN)
+    found = line.scan(line.course, line.samples(low, high, scale)[0], scale / SPAN)
     if not len(found.points):
         return None
     arcs, heights = [], [0.0]
@@ -198,7 +197,7 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
                 crossing.error / (high - low) + np.spacing(1.0),
             )
         )
-    first = bool(found.radius[0] < 1)
+    first = bool(found.stable[0])
     steps = np.diff([*heights, 1.0])
     area = float(steps[0 if first else 1 :: 2].sum())
     off = sum(float(arc.errors[0]) for arc in arcs)

@@ -156,18 +156,21 @@ class BatchEvaluator:
         """Return one closed system at one point (m,), as an analysis has it: with error bounds."""
         assert not self.timed, "another time is another schedule"
         system = self.wirings[place].system
-        used = {site_key(group) for group in system.sites}
+        return close_loop(replace(system, sites=self.sites_moved(system.sites, value)))
+
+    def sites_moved(self, sites: Sequence[PeerGroup], value: Sequence[float]) -> tuple[PeerGroup, ...]:
+        """Return some of the sites at one point (m,), linearized and lifted anew."""
+        used = {site_key(group) for group in sites}
         moved = {
             site_key(group): _moved(group, vector)
             for group, vector in self._points(value)
             if site_key(group) in used
         }
-        sites = [
+        return tuple(
             replace(one, parameters=new.parameters, site=new.site, exact=new.exact, lifted=new.lifted)
-            for one in system.sites
+            for one in sites
             if (new := moved[site_key(one)])
-        ]
-        return close_loop(replace(system, sites=tuple(sites)))
+        )
 
     def exact_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems with the sites of one point (m,), for exact arithmetic.
@@ -249,6 +252,7 @@ def batch_evaluator(
     *,
     durations: Mapping[int, tuple[float, float]] | None = None,
     follows: bool = True,
+    matrices: bool = True,
 ) -> BatchEvaluator:
     """Prepare groups of peers for many values of some parameters.
 
@@ -264,8 +268,10 @@ def batch_evaluator(
         Where a time varies: the seconds of each step by its quanta, as constant and slope.
     follows
         Whether any coefficient may follow what varies.
+    matrices
+        Whether the systems' matrices are wanted, and not the maps of the sites alone.
     """
-    systems = split(groups, exchange).systems
+    systems = split(groups, exchange).systems if matrices else ()
     if durations is None:
         durations = {
             event.duration: (float(event.duration * group.schedule.quantum), 0.0)

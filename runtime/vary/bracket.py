@@ -1,7 +1,7 @@
 """A crossing of the unit circle held between two values near to each other.
 
 Takes: a crossing found in floats, and the closed systems at any value.
-Gives: `Bracket`, `bracket`, `bracket_in_floats`.
+Gives: `Bracket`, `bracket`, `bracket_in_floats`; `hold`.
 Guarantees: a bracket holds a crossing of the true systems: on one of its ends every eigenvalue of the systems
 that cross is inside the circle, on the other one outside; proved by ball arithmetic or, for more states than
 that is worth or where the equations can't be had exactly, by the error bounds of an analysis in floats.
@@ -43,7 +43,7 @@ ExactSystems = Callable[[float], Sequence[tuple[ClosedSystem, RigidModes]]]
 FloatSystems = Callable[[float], Sequence[ClosedSystem]]
 
 # Whether the crossing lies above a value, None if that isn't known.
-_Above = Callable[[float], bool | None]
+Above = Callable[[float], bool | None]
 
 # A bracket in floats reaches this many of the spectral radius's error bounds to either side at first.
 FLOAT_REACH = 2.0
@@ -86,7 +86,7 @@ def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Br
         most_bits = max(most_bits, bits)
         return None if inside is None else inside == root.rising
 
-    held = _held(root, above, HALF * FIRST * _size(root), low, high)
+    held = hold(root, above, low, high)
     return None if held is None else Bracket(*held, f"proved with {most_bits} bits")
 
 
@@ -113,8 +113,7 @@ def bracket_in_floats(root: Root, systems: FloatSystems, *, low: float, high: fl
     if not np.isfinite(error):
         return None
     reach = FLOAT_REACH * error / abs(root.slope) if root.slope else SCATTER * _size(root)
-    half = max(reach, HALF * FIRST * _size(root))
-    held = _held(root, above, half, low, high)
+    held = hold(root, above, low, high, reach)
     return None if held is None else Bracket(*held, "bounded in floats")
 
 
@@ -122,8 +121,21 @@ def _size(root: Root) -> float:
     return max(abs(root.value), 1e-300)
 
 
-def _held(root: Root, above: _Above, half: float, low: float, high: float) -> tuple[float, float] | None:
-    """Return a value and the error on it of a bracket that starts `half` to either side, if one is found."""
+def hold(root: Root, above: Above, low: float, high: float, half: float = 0.0) -> tuple[float, float] | None:
+    """Return a value and the error on it of a bracket, if one is found.
+
+    Parameters
+    ----------
+    root
+        The crossing.
+    above
+        Whether it lies above a value.
+    low, high
+        No bracket reaches beyond these.
+    half
+        How far to either side of the root it starts at least.
+    """
+    half = max(half, HALF * FIRST * _size(root))
     for _ in range(TRIES):
         left, right = max(root.value - half, low), min(root.value + half, high)
         if above(left) is True and above(right) is False:

@@ -1,7 +1,7 @@
 """Where the largest eigenvalue magnitude of a family of matrices crosses 1 as one number varies.
 
 Takes: a function that gives the matrices and their derivatives at many points of an interval, or of many.
-Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`.
+Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`; `extremes`.
 Guarantees: every cell between samples is either shown clear by the eigenvalues and their derivatives at both
 ends, or divided down to the cell size; every change found is bracketed.
 Does not: prove anything (see `critical`), or choose the interval.
@@ -80,13 +80,13 @@ class Root:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """What was found: `points` (k,) with the largest magnitude `radius` (k,), and the `roots` in order.
+    """What was found: `points` (k,), whether it is `stable` (k,) at each, and the `roots` in order.
 
     `whole` is False where an eigenvalue kept so near to the circle that not every cell could be cleared.
     """
 
     points: Floats
-    radius: Floats
+    stable: Truths
     roots: tuple[Root, ...]
     whole: bool
 
@@ -169,7 +169,7 @@ def scan_lines(
     """
     count = len(points)
     if not any(len(one) for one in points):
-        return tuple(Scan(np.empty(0), np.empty(0), (), whole=True) for _ in points)
+        return tuple(Scan(np.empty(0), np.empty(0, dtype=bool), (), whole=True) for _ in points)
     narrow = [_narrow(*pair) for pair in zip(points, least, strict=True)]
     lines = np.repeat(np.arange(count), [len(one) for one in points])
     samples = _sample(courses, lines, np.concatenate(points), ends=True)
@@ -192,15 +192,14 @@ def scan_lines(
         samples, new = samples.merged(more)
     else:
         whole[lines] = False
-    radius = samples.radius()
-    stable = radius < 1
+    stable = samples.radius() < 1
     changes = np.flatnonzero((stable[1:] != stable[:-1]) & (samples.lines[1:] == samples.lines[:-1]))
     changes = changes[changes <= _last_cells(samples, count)[samples.lines[changes]]] if first else changes
     roots, of_line = _roots(courses, samples, changes), samples.lines[changes]
     return tuple(
         Scan(
             samples.points[samples.lines == line],
-            radius[samples.lines == line],
+            stable[samples.lines == line],
             tuple(root for root, one in zip(roots, of_line, strict=True) if one == line),
             bool(whole[line]),
         )
@@ -309,7 +308,7 @@ def _open(samples: _Samples, cells: NDArray[np.intp]) -> Truths:
         if not start.shape[1]:
             continue
         # Every cell both ways at once: forward, and as it looks from its end.
-        least, most, single, upper = _extremes(
+        least, most, single, upper = extremes(
             np.concatenate([start, end]),
             np.concatenate([rise * width, -end_rise * width]),
             np.concatenate([end, start]),
@@ -328,7 +327,7 @@ def _open(samples: _Samples, cells: NDArray[np.intp]) -> Truths:
     return hiding
 
 
-def _extremes(
+def extremes(
     value: Complexes, rise: Complexes, end: Complexes, end_rise: Complexes
 ) -> tuple[Floats, Floats, Truths, Truths]:
     """Follow each eigenvalue across a cell to its partner at the end.

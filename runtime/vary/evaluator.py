@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.modes import split
+from apc.eigen.modes import arrange, split
 from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.discretize import UNIT
@@ -27,6 +28,9 @@ from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
 from apc.vary.batch import BatchEvaluator, batch_evaluator
+
+if TYPE_CHECKING:
+    from apc.vary.loops import LoopEvaluator
 
 Floats = NDArray[np.float64]
 
@@ -53,6 +57,9 @@ DRIFT = 1e-6
 # States of one system beyond which no range of values is looked at: a hundred matrices and more are held at a
 # time, each with the vectors of its eigenvalues. Of 250 states a range takes ten seconds and half a GB.
 MOST_STATES = 300
+
+# From so many packets of a loop on their way on, leaving them out of the state is quicker.
+MANY_PACKETS = 24
 
 # The blocks of a point that has no matrix.
 NOTHING = [(np.full((1, 1), np.nan), np.full((1, 1), np.nan))]
@@ -237,6 +244,28 @@ def evaluator(
         return PointEvaluator(system, tuple(free), prepared)
     groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
     return batch_evaluator(system, free, groups, exchange)
+
+
+def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> LoopEvaluator | None:
+    """Return the loops of a system without their packets, None where few of these are on their way.
+
+    Parameters
+    ----------
+    system, free, prepared
+        As for `evaluator`, which raises the same.
+    """
+    used = [prepared.jacobians[group.kind] for group in system.groups]
+    if max(sum(schedule.depths) for schedule in prepared.schedules) * system.peers <= MANY_PACKETS:
+        return None
+    if not all(site.parameters_suffice for site in used):
+        return None
+    groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
+    loops = arrange(groups, exchange).loops
+    if max(len(loop.packets) for loop in loops) <= MANY_PACKETS:
+        return None
+    from apc.vary.loops import loop_evaluator  # most scenes have none, and need not load it
+
+    return loop_evaluator(system, free, groups, loops, exchange)
 
 
 def evaluator_of_many(

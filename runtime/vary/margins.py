@@ -29,7 +29,7 @@ from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator
 from apc.vary.crossings import scan_lines
 from apc.vary.delays import delay_now
-from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size
+from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size, long_loops
 from apc.vary.search import (
     Crossing,
     Line,
@@ -134,6 +134,8 @@ def _parameter_margins(
     system: CompiledSystem, free: Sequence[Free], prepared: Prepared
 ) -> list[Margin] | str:
     """Return the margins of the parameters that matter, or why there are none."""
+    if long_loops(system, free, prepared):
+        return _loop_margins(system, free, prepared)
     family = evaluator(system, free, prepared=prepared)
     base = np.array([parameter_of(system, one).value for one in free])
     here = family.matrices(base[None])
@@ -149,11 +151,44 @@ def _parameter_margins(
     if not _radius(here) < 1:
         return "none: the scene is not stable as it is"
     found: list[Margin | None] = [None] * len(free)
-    for family in {id(line.family): line.family for line in lines}.values():
-        own = [place for place, line in enumerate(lines) if line.family is family]
+    for which in dict.fromkeys(id(line.family) for line in lines):
+        own = [place for place, line in enumerate(lines) if id(line.family) == which]
         for place, one in zip(own, _along(system, [(free[i], lines[i]) for i in own]), strict=True):
             found[place] = one
     return [one for one in found if one]
+
+
+def _loop_margins(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> list[Margin] | str:
+    """Return the margins of the parameters that matter of loops with long delays, or why there are none.
+
+    What is 0 varies by itself, see `_apart`.
+    """
+    base = np.array([parameter_of(system, one).value for one in free])
+    some = [one for one, value in zip(free, base, strict=True) if value]
+    together = long_loops(system, some, prepared)
+    found: list[Margin] = []
+    for one, start in zip(free, base.tolist(), strict=True):
+        family = together if start else long_loops(system, [one], prepared)
+        assert family is not None, "a delay is as long whatever a stiffness is"
+        own, column = (base[base != 0], some.index(one)) if start else (np.zeros(1), 0)
+        line = Line(family, own, column)
+        here = line.course(own[[column]])
+        if all(not slope.any() for _, slope in here):
+            continue
+        scale = abs(start) or reach(here)
+        limit = parameter_of(system, one).maximum
+        top = min(GROWTH * scale, np.inf if limit is None else limit)
+        if not top > start:
+            continue
+        points, _ = line.samples(start, float(top), scale)
+        scanned = family.scan(points, scale / GROWTH, own, column, first=True)
+        if not scanned.stable[:1].all():
+            return "none: the scene is not stable as it is"
+        roots = [root for root in scanned.roots if root.rising]
+        crossing = proved_crossing(roots[0], line, scanned) if roots else None
+        unit, reached = parameter_of(system, one).unit, float(scanned.points[-1])
+        found.append(_margin(one.label, unit, start, crossing, reached))
+    return found
 
 
 def _along(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Margin | None]:

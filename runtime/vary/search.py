@@ -15,6 +15,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +33,13 @@ from apc.frame.names import Free, parameter_of
 from apc.vary.batch import BatchEvaluator
 from apc.vary.bends import bends
 from apc.vary.bracket import Bracket, bracket, bracket_in_floats
-from apc.vary.crossings import Courses, Root, Scan, scan
+from apc.vary.crossings import Course, Courses, Root, Scan, scan
 from apc.vary.delays import Piece, borders, delay_now, delay_pieces, pace, system_with_delay
-from apc.vary.evaluator import PointEvaluator, evaluator_of_many
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many, long_loops
 from apc.vary.marginal import marginal_motion, with_rigid
+
+if TYPE_CHECKING:  # only scenes with long delays load it
+    from apc.vary.loops import LoopEvaluator
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -107,7 +111,7 @@ class Search:
 class Line:
     """The points at which one of an evaluator's free parameters varies and the others stay at `base` (m,)."""
 
-    family: BatchEvaluator | PointEvaluator
+    family: BatchEvaluator | PointEvaluator | LoopEvaluator
     base: Floats
     column: int
 
@@ -118,10 +122,20 @@ class Line:
         return found
 
     def course(self, values: Floats) -> Sequence[tuple[Floats, Floats]]:
-        """Return each system's matrices and their derivatives at values (k,)."""
+        """Return each system's matrices and their derivatives at values (k,), of loops without delays."""
         along = np.zeros((len(values), len(self.base)))
         along[:, self.column] = 1.0
         return self.family.slopes(self.points(values), along)
+
+    def scan(self, course: Course, points: Floats, least: float) -> Scan:
+        """Find the crossings between the first and the last of some points, see `crossings.scan`.
+
+        `course` gives the matrices; of loops with long delays it is only asked whether these change.
+        """
+        if isinstance(self.family, BatchEvaluator | PointEvaluator):
+            return scan(course, points, least=least)
+        course(points)
+        return self.family.scan(points, least, self.base, self.column)
 
     def samples(self, bottom: float, top: float, scale: float) -> tuple[Floats, bool]:
         """Return values from bottom to top to begin a scan with, and whether the equations between are known.
@@ -133,7 +147,10 @@ class Line:
     def with_bends(self, points: Floats, least: float) -> tuple[Floats, bool]:
         """Return points with those that the equations' coefficients ask for, and whether these are known."""
         family = self.family
-        found = bends(family, self.base, self.column) if isinstance(family, BatchEvaluator) else None
+        if isinstance(family, PointEvaluator):
+            return points, False
+        maps = family if isinstance(family, BatchEvaluator) else family.family
+        found = bends(maps, self.base, self.column)
         return (points, False) if found is None else found.between(points, least)
 
     def scale(self) -> float:
@@ -188,7 +205,9 @@ def search(
         Is told how far the search is.
     """
     parameter = parameter_of(system, free)
-    family = evaluator_of_many(system, [free], _PLACE, prepared=prepared)
+    family = long_loops(system, [free], prepared) or evaluator_of_many(
+        system, [free], _PLACE, prepared=prepared
+    )
     line = Line(family, np.array([parameter.value]), 0)
     scale = line.scale()
     bottom = low
@@ -215,7 +234,7 @@ def search(
         return pairs
 
     points, known = line.samples(bottom, top, scale)
-    found = scan(course, points, least=scale / SPAN)
+    found = line.scan(course, points, scale / SPAN)
     edges = []
     for number, root in enumerate(found.roots):
         if told:
@@ -248,12 +267,12 @@ def _search(
     edges: Sequence[Crossing], found: Scan, asked: tuple[float, float], *, known: bool, enters: bool
 ) -> Search:
     """Put the crossings together with the stretches between them."""
-    points, radius = found.points, found.radius
+    points = found.points
     if not len(points):
         return Search((), (), asked, whole=False, known=known, looked=0, enters=enters)
     ends = [-np.inf, *(one.value for one in edges), np.inf]
     stable = tuple(
-        bool(radius[(points > low) & (points < high)][0] < 1) for low, high in itertools.pairwise(ends)
+        bool(found.stable[(points > low) & (points < high)][0]) for low, high in itertools.pairwise(ends)
     )
     scanned = (float(points[0]), float(points[-1]))
     return Search(tuple(edges), stable, scanned, found.whole, known, len(points), enters)
@@ -270,6 +289,8 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
         listed: list[float] = line.points(np.array([value]))[0].tolist()
         return listed
 
+    if not isinstance(family, BatchEvaluator | PointEvaluator):
+        return _told(root, *family.proved(root, point, low=low, high=high))
     if not isinstance(family, BatchEvaluator):
 
         def all_of_them(value: float) -> tuple[ClosedSystem, ...]:
@@ -314,6 +335,11 @@ def _alike(one: Sequence[ClosedSystem], other: Sequence[ClosedSystem]) -> bool:
 def _described(
     root: Root, held: Bracket | None, systems: Sequence[tuple[ClosedSystem, RigidModes]]
 ) -> Crossing:
+    """Return the crossing of a root, and how fast it swings."""
+    return _told(root, held, marginal_motion(systems, root.eigenvalue).frequency_hz)
+
+
+def _told(root: Root, held: Bracket | None, frequency_hz: float) -> Crossing:
     """Return the crossing of a root; if no bracket holds it, with the error that floats are trusted with."""
     if held is None:
         error = FLOAT_ROUNDINGS / abs(root.slope) if root.slope else root.high - root.low
@@ -322,7 +348,7 @@ def _described(
         value=held.value,
         error=held.error,
         stable_side="below" if root.rising else "above",
-        frequency_hz=marginal_motion(systems, root.eigenvalue).frequency_hz,
+        frequency_hz=frequency_hz,
         kind="crossing",
         proof=held.proof,
     )
@@ -372,7 +398,7 @@ def search_delay(
         whole, known, looked = whole and found.whole, known and enclosed, looked + len(found.points)
         if not len(found.points):
             continue
-        first = bool(found.radius[0] < 1)
+        first = bool(found.stable[0])
         if stable and stable[-1] != first:
             edges.append(_jump(system, free, before, piece, prepared, stable_below=stable[-1]))
         if not stable or stable[-1] != first:
@@ -417,8 +443,8 @@ def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> tu
     if family is None:
         found = analyze(piece.inside, prepared=prepared)
         if found.stable is None or found.verdict == DRIFTS:
-            return Scan(np.empty(0), np.empty(0), (), whole=found.verdict == DRIFTS), True
-        return Scan(np.array([low]), np.array([found.spectral_radius]), (), whole=True), True
+            return Scan(np.empty(0), np.empty(0, dtype=bool), (), whole=found.verdict == DRIFTS), True
+        return Scan(np.array([low]), np.array([found.spectral_radius < 1]), (), whole=True), True
 
     def course(points: Floats) -> Sequence[tuple[Floats, Floats]]:
         if not piece.constant:
