@@ -223,7 +223,7 @@ def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
     at = relative_coordinates(free.basis)
     if not len(at.rest):
         none = np.zeros((0, 0), dtype=np.complex128)
-        return _Solved(free, at, Eigenpairs(none[0], none, none), np.zeros(0), 0.0, 0.0, True, 0)
+        return _Solved(free, at, Eigenpairs(none.ravel(), none, none), np.zeros(0), 0.0, 0.0, True, 0)
     reduced, reduced_error = relative_bounded(system.matrix, system.error, at)
     pairs, found = enclose_eigenvalues(reduced, reduced_error, whole=len(at.held) > 0)
     inside = False if found.low > 1 else True if found.high < 1 else None  # NaN decides nothing

@@ -166,7 +166,7 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
                 continue
             known = None
             for method in methods:
-                values = ", ".join(f"{one.name}={float(one.value)!r}" for one in drawn)
+                values = ", ".join(f"{one.free.label}={float(one.value)!r}" for one in drawn)
                 try:
                     taken, found = timed(partial(analyze, system, method=method))
                 except ApcError as error:
