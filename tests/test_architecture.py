@@ -76,8 +76,8 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch crossings plane bracket counting loops evaluator bends marginal delays search critical
-        margins sensitivity
+        wiring batch crossings plane bracket counting loops evaluator bends marginal delays lags search
+        critical margins sensitivity
         """,
     ),
     ("apc", "answer"),

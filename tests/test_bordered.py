@@ -48,8 +48,8 @@ def _check_logarithm(loop: Loop) -> None:
 
     def at(place: np.ndarray, step: float = 0.0) -> Logarithm:
         moved = maps.mapped(lambda one, slope: one + step * slope, slopes)
-        loops, change = bordered(moved, wires), bordered(slopes, wires, unit=0.0)
-        return logarithm(loops, change, wires.lags, np.zeros(3, dtype=np.intp), place, rigid=1)
+        loops, change = bordered(moved, wires.weights), bordered(slopes, wires.weights, unit=0.0)
+        return logarithm(loops, change, np.array(wires.lags), np.zeros(3, dtype=np.intp), place, rigid=1)
 
     found, matrix = at(points), close_loop(loop).matrix
     for value, point in zip(found.value, points, strict=True):

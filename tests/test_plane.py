@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from apc.large.bordered import Logarithm
-from apc.vary.plane import cross
+from apc.vary.plane import cross, over_all
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -47,6 +47,10 @@ class Pull:
         turning = 1j * (points - self.delay * late)
         moving = points**-self.delay / f
         return Logarithm(self.times * np.log(f), self.times * turning / f, self.times * moving)
+
+    def over(self, values: Floats, points: Complexes) -> Logarithm:
+        """Return the same at all values and points."""
+        return over_all(self, values, points)
 
     def alone(self, values: Floats) -> Complexes:
         """Return the pole."""

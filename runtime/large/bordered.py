@@ -18,7 +18,7 @@ number.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,7 +86,13 @@ class Wires:
         return np.einsum("zl,lrs->zrs", np.abs(points[:, None]) ** -lags, np.abs(self.weights)), doubt
 
 
-def wires_of(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]) -> Wires:
+def wires_of(
+    sites: Sequence[PeerGroup],
+    coupling: Coupling,
+    doubts: Mapping[Way, float],
+    *,
+    only: Callable[[Way], bool] = lambda way: True,
+) -> Wires:
     """Return how the sites of a loop hear each other.
 
     Parameters
@@ -97,13 +103,17 @@ def wires_of(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way
         What each hears of each, W (K, K) by way.
     doubts
         By how much each entry of a way's W may be off, where it isn't exact.
+    only
+        Which ways count.
     """
     sent_starts = np.cumsum([0, *(len(group.schedule.sent) for group in sites)])
     heard_starts = np.cumsum([0, *(len(group.schedule.heard) for group in sites)])
-    lags = sorted({heard.lag for group in sites for heard in group.schedule.heard})
+    lags = sorted({heard.lag for group in sites for heard in group.schedule.heard if only(heard.way)})
     weights = np.zeros((2, len(lags), int(heard_starts[-1]), int(sent_starts[-1])))
     for g, group in enumerate(sites):
         for line, heard in enumerate(group.schedule.heard):
+            if not only(heard.way):
+                continue
             layer = lags.index(heard.lag)
             for h, sender in enumerate(sites):
                 weight = coupling[heard.way][g][h]
@@ -143,15 +153,15 @@ class Bordered:
     states: int
 
 
-def bordered(maps: FrameMap, wires: Wires, unit: float = 1.0) -> Bordered:
+def bordered(maps: FrameMap, weights: Floats, unit: float = 1.0) -> Bordered:
     """Return the matrices of many loops, or with `unit` 0 the derivatives of them.
 
     Parameters
     ----------
     maps
         The maps (k, …) of all sites as of one, or their derivatives.
-    wires
-        How the sites hear each other.
+    weights
+        W_l (l, n_r, n_s).
     unit
         What stands for 1.
     """
@@ -160,7 +170,7 @@ def bordered(maps: FrameMap, wires: Wires, unit: float = 1.0) -> Bordered:
     fixed[:, :n_z, :n_z], fixed[:, n_z:, :n_z] = -maps.p, -maps.s
     fixed[:, n_z:, n_z:] = unit * np.eye(n_s)
     back = np.concatenate([maps.q, maps.d], axis=-2)
-    return Bordered(fixed, -(back @ wires.weights[:, None]), n_z)
+    return Bordered(fixed, -(back @ weights[:, None]), n_z)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,16 +183,16 @@ class Logarithm:
 
 
 def logarithm(
-    loops: Bordered, slopes: Bordered, lags: Sequence[int], rows: Integers, points: Complexes, rigid: int
+    loops: Bordered, slopes: Bordered | None, lags: Integers, rows: Integers, points: Complexes, rigid: int
 ) -> Logarithm:
     """Return the logarithm of F at points, its `rigid` zeros at 1 divided out.
 
     Parameters
     ----------
     loops, slopes
-        The matrices of many loops, and their derivatives over what varies.
+        The matrices of many loops, and their derivatives over what varies, None for nothing.
     lags
-        The l.
+        The l of all points, or of each (z, l).
     rows, points
         Of which loop (z,), and ζ there.
     rigid
@@ -199,7 +209,8 @@ def logarithm(
     for start in range(0, len(rows), chunk):
         some = slice(start, start + chunk)
         row, at = rows[some], points[some]
-        powers = [at**-lag for lag in lags]
+        exponents = np.broadcast_to(lags, (len(rows), lags.shape[-1]))[some].T
+        powers = [at**-lag for lag in exponents]
         matrix = loops.fixed[row].astype(np.complex128)
         matrix[:, place, place] += at[:, None]
         for power, heard in zip(powers, loops.heard, strict=True):
@@ -209,11 +220,13 @@ def logarithm(
         matrix[~good] = np.eye(n)
         inverse = np.linalg.inv(matrix).swapaxes(1, 2)
         turn = at * inverse[:, place, place].sum(axis=1)
-        move = _product(inverse, slopes.fixed[row])
-        for lag, power, heard, slope in zip(lags, powers, loops.heard, slopes.heard, strict=True):
-            if lag:
-                turn -= lag * power * _product(inverse[:, :, n_z:], heard[row])
-            move += power * _product(inverse[:, :, n_z:], slope[row])
+        for lag, power, heard in zip(exponents, powers, loops.heard, strict=True):
+            turn -= lag * power * _product(inverse[:, :, n_z:], heard[row])
+        move = np.zeros(len(at), np.complex128)
+        if slopes is not None:
+            move += _product(inverse, slopes.fixed[row])
+            for power, slope in zip(powers, slopes.heard, strict=True):
+                move += power * _product(inverse[:, :, n_z:], slope[row])
         with np.errstate(all="ignore"):
             value[some] = np.where(good, size + 1j * np.angle(sign) - rigid * np.log(1 - 1 / at), np.nan)
             turning[some] = 1j * (turn - rigid / (at - 1))

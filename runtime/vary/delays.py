@@ -1,7 +1,8 @@
 """A system's frame matrices as a delay varies: piece by piece, as far as the order of events stays the same.
 
 Takes: a `CompiledSystem` and a parameter or timing that reaches its delays.
-Gives: `Piece`, `delay_pieces`, `pace`, `borders`, `system_with_delay`, `delay_now`.
+Gives: `Piece`, `delay_pieces`, `most_packets`, `pace`, `borders`, `timing_slopes`; `system_with_delay`,
+`delay_now`.
 Guarantees: pieces join on without a gap; events coincide at the values between them and nowhere else.
 Does not: vary periods or phases: another period is another frame.
 
@@ -39,6 +40,9 @@ MOST_PIECES = 10_000
 # Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal
 # there by accident. No time of a scene is a multiple of one part in this prime number.
 INSIDE = (Fraction(28_571, 104_729), Fraction(56_393, 104_729))
+
+# How far apart two values of a parameter are at which timings tell how fast they follow it.
+STEP = Fraction(1, 1009)
 
 # A schedule as it is up to the length of its steps.
 _Form = tuple[object, ...]
@@ -114,6 +118,14 @@ def delay_pieces(
         low = end
 
 
+def most_packets(system: CompiledSystem, free: Free, value: Fraction, prepared: Prepared) -> int:
+    """Return how many packets of one peer are on their way at most, at a value."""
+    timings = resolve(system_with_delay(system, free, value)).timings
+    patterns = [site.pattern for site in prepared.jacobians]
+    schedules = build_schedules(system, timings, patterns, order=prepared.order)
+    return max(sum(one.depths) for one in schedules)
+
+
 def pace(
     system: CompiledSystem,
     free: Free,
@@ -177,13 +189,12 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
     if free.name in fixed:
         raise _rhythm(free, place)
     now = delay_now(system, free)
-    step = Fraction(1, 1009)
-    at = [resolve(system_with_delay(system, free, now + share * step)).timings for share in (0, 1, 2)]
-    slopes = {name: (at[1][name] - at[0][name]) / step for name in at[0]}
+    at = [resolve(system_with_delay(system, free, now + share * STEP)).timings for share in (0, 1, 2)]
+    slopes = timing_slopes(system, free)
     if any(slopes[name] for name in fixed):
         raise _rhythm(free, place)
     for name, slope in slopes.items():
-        if at[2][name] != at[0][name] + 2 * slope * step:
+        if at[2][name] != at[0][name] + 2 * slope * STEP:
             what = f"{name} is not linear in {free.name}: its critical value can't be searched"
             raise ApcError(Mistake("E844", place, what))
     clocks = {clock.name: clock for clock in system.clocks}
@@ -220,6 +231,13 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
         return min(nearest, default=value + (now or 1))
 
     return following
+
+
+def timing_slopes(system: CompiledSystem, free: Free) -> dict[str, Fraction]:
+    """Return how fast each timing follows a parameter or timing, by its name."""
+    now = delay_now(system, free)
+    here, there = (resolve(system_with_delay(system, free, value)).timings for value in (now, now + STEP))
+    return {name: (there[name] - here[name]) / STEP for name in here}
 
 
 def _rhythm(free: Free, place: Place) -> ApcError:

@@ -28,7 +28,7 @@ from apc.vary.batch import STEP, BatchEvaluator, batch_evaluator
 from apc.vary.bracket import Bracket
 from apc.vary.counting import bracket_of_loop
 from apc.vary.crossings import Root, Scan
-from apc.vary.plane import cross
+from apc.vary.plane import cross, over_all
 from apc.vary.wiring import site_key
 
 Floats = NDArray[np.float64]
@@ -109,7 +109,7 @@ class LoopEvaluator:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopSheet:
-    """One loop of an evaluator along a line through its values: a `plane.Sheet`."""
+    """One loop of an evaluator along a line through its values: a `plane.LineSheet`."""
 
     evaluator: LoopEvaluator
     place: int
@@ -134,8 +134,12 @@ class LoopSheet:
         level[:, self.column] = values
         maps, slopes = self.evaluator.maps(self.place, level, along)
         wires, rigid = self.evaluator.wires[self.place], self.evaluator.rigid[self.place]
-        loops, moved = bordered(maps, wires), bordered(slopes, wires, unit=0.0)
-        return logarithm(loops, moved, wires.lags, rows, points, rigid)
+        loops, moved = bordered(maps, wires.weights), bordered(slopes, wires.weights, unit=0.0)
+        return logarithm(loops, moved, np.array(wires.lags, dtype=np.intp), rows, points, rigid)
+
+    def over(self, values: Floats, points: Complexes) -> Logarithm:
+        """Return the logarithm of F (k, z) at all values (k,) and points (z,)."""
+        return over_all(self, values, points)
 
     def alone(self, values: Floats) -> Complexes:
         """Return the eigenvalues (k, n) of the sites hearing nothing at values (k,)."""

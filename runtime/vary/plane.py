@@ -1,7 +1,7 @@
 """Where eigenvalues of a loop cross the unit circle as one number varies, however long its delays are.
 
 Takes: the logarithm of a loop's characteristic function over the circle and over what varies.
-Gives: `Sheet`, `cross`.
+Gives: `Sheet`, `LineSheet`, `over_all`; `cross`, `count_beyond`.
 Guarantees: every cell of the plane, angle by value, is shown clear by what its corners say of each other, or
 shown to hold one crossing, or divided down to the cell size; crossings and counts agree wherever `whole`.
 Does not: prove a crossing (see `bracket`).
@@ -77,8 +77,23 @@ class Sheet(Protocol):
     def at(self, values: Floats, rows: Integers, points: Complexes) -> Logarithm:
         """Return its logarithm at points (z,), each at the value (k,) of its row (z,)."""
 
+    def over(self, values: Floats, points: Complexes) -> Logarithm:
+        """Return its logarithm (k, z) at all values (k,) and points (z,)."""
+
+
+class LineSheet(Sheet, Protocol):
+    """The same of what moves along a line: its `moving` is the derivative over the value."""
+
     def alone(self, values: Floats) -> Complexes:
         """Return the eigenvalues (k, n) of the sites hearing nothing at values (k,)."""
+
+
+def over_all(sheet: Sheet, values: Floats, points: Complexes) -> Logarithm:
+    """Return the logarithm (k, z) of a sheet at all values and points, one by one."""
+    rows = np.repeat(np.arange(len(values)), len(points))
+    found = sheet.at(values, rows, np.tile(points, len(values)))
+    shape = (len(values), len(points))
+    return Logarithm(*(one.reshape(shape) for one in (found.value, found.turning, found.moving)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +166,7 @@ def _principal(logarithm: Complexes) -> Complexes:
     return logarithm.real + 1j * (np.mod(logarithm.imag + np.pi, 2 * np.pi) - np.pi)
 
 
-def cross(sheets: Sequence[Sheet], points: Floats, least: float, *, first: bool = False) -> Scan:
+def cross(sheets: Sequence[LineSheet], points: Floats, least: float, *, first: bool = False) -> Scan:
     """Find every value at which the stability of several loops changes, between the first and last of some.
 
     Parameters
@@ -207,6 +222,11 @@ def cross(sheets: Sequence[Sheet], points: Floats, least: float, *, first: bool 
     return Scan(asked[sure], total[sure] == 0, tuple(roots), whole)
 
 
+def count_beyond(sheet: Sheet, values: Floats) -> Floats:
+    """Return how many eigenvalues are beyond the circle at values (k,), NaN where one is on it."""
+    return _counted(sheet, _grid(sheet, values, np.arange(len(values))))
+
+
 def _angles(longest: int) -> Floats:
     """Return angles to begin with, half the circle and a little beyond its ends."""
     apart = min(APART, TURNED / (longest + 1))
@@ -242,11 +262,7 @@ class _Grid:
 def _grid(sheet: Sheet, points: Floats, rows: Integers) -> _Grid:
     """Return F at some of the points and at the angles to begin with."""
     angles, values = _angles(sheet.longest), points[rows]
-    many = np.repeat(np.arange(len(values)), len(angles))
-    found = sheet.at(values, many, np.tile(_on_circle(angles), len(values)))
-    shape = (len(values), len(angles))
-    grid = Logarithm(*(one.reshape(shape) for one in (found.value, found.turning, found.moving)))
-    return _Grid(values, angles, grid, rows)
+    return _Grid(values, angles, sheet.over(values, _on_circle(angles)), rows)
 
 
 def _counted(sheet: Sheet, grid: _Grid) -> Floats:
@@ -290,7 +306,7 @@ def _counted(sheet: Sheet, grid: _Grid) -> Floats:
     return np.asarray(np.round(sheet.states - turned / np.pi))
 
 
-def _beyond_all_along(sheet: Sheet, points: Floats) -> Truths:
+def _beyond_all_along(sheet: LineSheet, points: Floats) -> Truths:
     """Say of each stretch between points whether one eigenvalue is seen to stay beyond the circle."""
     count = len(points)
     starts = 1j * np.geomspace(np.pi / (2 * sheet.longest + 2), np.pi, BEYOND)

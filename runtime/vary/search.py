@@ -34,11 +34,21 @@ from apc.vary.batch import BatchEvaluator
 from apc.vary.bends import bends
 from apc.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.vary.crossings import Course, Courses, Root, Scan, scan
-from apc.vary.delays import Piece, borders, delay_now, delay_pieces, pace, system_with_delay
-from apc.vary.evaluator import PointEvaluator, evaluator_of_many, long_loops
+from apc.vary.delays import (
+    INSIDE,
+    Piece,
+    borders,
+    delay_now,
+    delay_pieces,
+    most_packets,
+    pace,
+    system_with_delay,
+)
+from apc.vary.evaluator import MANY_PACKETS, PointEvaluator, evaluator_of_many, long_loops
 from apc.vary.marginal import marginal_motion, with_rigid
 
 if TYPE_CHECKING:  # only scenes with long delays load it
+    from apc.vary.lags import LateStretch
     from apc.vary.loops import LoopEvaluator
 
 Floats = NDArray[np.float64]
@@ -391,6 +401,12 @@ def search_delay(
     before: Piece | None = None
     at, whole, known, looked = low, True, True, 0
     tell = pace(system, free, low, end, place=_PLACE, told=told)
+    if most_packets(system, free, end, prepared) > MANY_PACKETS:
+        from apc.vary.lags import late_stretches  # most scenes have short delays, and need not load it
+
+        late = late_stretches(system, free, low, end, prepared, borders(system, free, place=_PLACE))
+        if late is not None:
+            return _late_search(system, free, late, end, prepared, from_stable=from_stable)
     for piece in delay_pieces(system, free, low, prepared, place=_PLACE, high=end):
         at = min(piece.high, end)
         tell(at)
@@ -413,6 +429,42 @@ def search_delay(
             break
     scanned = float(low), float(at)
     return Search(tuple(edges), tuple(stable), scanned, whole, known, looked, enters=True)
+
+
+def _late_search(
+    system: CompiledSystem,
+    free: Free,
+    late: Sequence[LateStretch],
+    end: Fraction,
+    prepared: Prepared,
+    *,
+    from_stable: bool,
+) -> Search:
+    """Put the stretches of a delay together, each change of side told by analyses of both."""
+    known = [one for one in late if one.stable is not None]
+    edges: list[Crossing] = []
+    stable = [True] if from_stable else [bool(one.stable) for one in known[:1]]
+    whole, before = True, None
+    for one in known:
+        if one.stable != stable[-1]:
+            pair = [None if some is None else _late_piece(system, free, some) for some in (before, one)]
+            assert pair[1] is not None
+            edges.append(_jump(system, free, pair[0], pair[1], prepared, stable_below=stable[-1]))
+            sides = [analyze(some.inside, prepared=prepared).stable for some in pair if some is not None]
+            whole &= sides[-1] == one.stable and sides[0] == (one if before is None else before).stable
+            stable.append(bool(one.stable))
+            if from_stable:
+                break
+        before = one
+    return Search(
+        tuple(edges), tuple(stable), (float(late[0].low), float(end)), whole, True, len(known), enters=True
+    )
+
+
+def _late_piece(system: CompiledSystem, free: Free, one: LateStretch) -> Piece:
+    """Return a stretch as a piece, nothing in which depends on the delay."""
+    inside = system_with_delay(system, free, one.low + INSIDE[0] * (one.high - one.low))
+    return Piece(one.low, one.high, None, constant=True, inside=inside)
 
 
 def delay_reach(

@@ -1,0 +1,60 @@
+"""Claims about `apc.vary.lags`: a link's delay over any range, by one lifting for each part of a frame."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from apc.analysis.analysis import lifted_groups, prepare
+from apc.compiler.errors import Place
+from apc.eigen.modes import split
+from apc.eigen.spectrum import solve_spectrum
+from apc.frame.names import Free
+from apc.threads import single_threaded
+from apc.vary.critical import critical
+from apc.vary.delays import borders, system_with_delay
+from apc.vary.lags import LateStretch, late_stretches
+from tests.topologies import AVERAGE, MESH, compiled, replaced
+
+PHASED = replaced(AVERAGE, ("network: 8 ms", "network: {period: 4 ms, phase: 1 ms}"))
+DIFFERENT = replaced(
+    MESH, ("{count: 3}", "{count: 2}\n  other: {count: 1, set: {coordination.stiffness: 150 N/m}}")
+)
+NAMED = replaced(AVERAGE, ("peers:", "parameters: {late: 8 ms}\npeers:"), ("delay: 8 ms}", "delay: late}"))
+
+
+def _stretches(text: str, name: str, high: Fraction) -> list[LateStretch] | None:
+    system, free = compiled(text), Free(name)
+    with single_threaded(), np.errstate(all="ignore"):
+        prepared = prepare(system)
+        following = borders(system, free, place=Place("test"))
+        return late_stretches(system, free, Fraction(0), high, prepared, following)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [(AVERAGE, "lan.delay"), (PHASED, "lan.delay"), (DIFFERENT, "lan.delay"), (NAMED, "late")],
+)
+def test_every_stretch_is_as_stable_as_its_matrix_says(text: str, name: str) -> None:
+    system = compiled(text)
+    found = _stretches(text, name, Fraction(160, 1000))
+    assert found is not None and len(found) >= 40
+    assert [one.high for one in found[:-1]] == [one.low for one in found[1:]]
+    assert {one.stable for one in found} == {True, False}
+    for one in found[::3]:
+        middle = system_with_delay(system, Free(name), (one.low + one.high) / 2)
+        assert one.stable == solve_spectrum(split(*lifted_groups(middle)).systems).stable
+
+
+def test_a_delay_that_forces_wait_for_is_left_to_others() -> None:
+    assert _stretches(AVERAGE, "coordination.delay", Fraction(3, 1000)) is None
+
+
+def test_a_search_of_two_seconds_ends_where_a_short_one_does() -> None:
+    system = compiled(AVERAGE)
+    long, short = (critical(system, "lan.delay", upper=upper) for upper in ("2 s", "140 ms"))
+    assert long.crossings == short.crossings and long.whole and long.looked == 2000
+    (edge,) = long.crossings
+    assert edge.kind == "jump" and edge.stable_side == "below"
