@@ -9,8 +9,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.frame.batch_lift import exponential_rows, lift_rows
-from apc.frame.discretize import UNIT, discretize
+from apc.frame.batch_lift import lift_rows
+from apc.frame.discretize import UNIT, discretize, exponential_rows
 from apc.frame.jacobians import jacobians
 from apc.frame.lift import FrameMap, compose, lift
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.batch_lift import exponential_rows
+from apc.frame.discretize import exponential_rows
 from apc.frame.lift import follow
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite
