@@ -230,7 +230,7 @@ class _Stepped:
 
 
 class _Part:
-    """States that move together: e^{AT} x + φ₁(AT) T c, by these two matrices or by the series of what they do.
+    """States that move together: e^{AT} x + φ₁(AT) T c, by both matrices or by the series of what they do.
 
     A matrix is made once a length and costs the cube of the states; the series is summed each time, and costs
     as much as A has entries, as often as A T is large.
@@ -276,7 +276,7 @@ class _Part:
         return [one + other for one, other in zip(_times(whole, x), _times(mean, constant), strict=True)]
 
     def _further(self, x: list[Any], constant: list[Any], seconds: Any) -> list[Any]:
-        """Sum x + T (A x + c) + T²/2 A (A x + c) + …, ‖A T‖ ≤ 1: the rest is less than the last term's norm."""
+        """Sum x + T (A x + c) + T²/2 A (A x + c) + …, ‖A T‖ ≤ 1: the rest is below twice the last term."""
         import flint
 
         term = [(one + other) * seconds for one, other in zip(_sums(self.rows, x), constant, strict=True)]
@@ -351,8 +351,8 @@ def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) ->
     sizes = [max((abs(one) for _, one in row), default=Fraction(0)) for row in filled]
     for probe in _probes(whole.shape[1]):
         many, inputs = int(probe.sum()), probe.tolist()
-        for row, size, before, after in zip(filled, sizes, still, values(probe), strict=True):
-            expected = sum((one * inputs[column] for column, one in row if inputs[column]), Fraction(0))
+        for terms, size, before, after in zip(filled, sizes, still, values(probe), strict=True):
+            expected = sum((one * inputs[column] for column, one in terms if inputs[column]), Fraction(0))
             assert abs(after - before - expected) <= COEFFICIENT_ROUNDINGS * Fraction(UNIT) * many * size, (
                 f"the slopes of {function.name()} are not what it multiplies its inputs by"
             )

@@ -151,8 +151,8 @@ def _powers(matrix: Matrix) -> tuple[Floats, Floats]:
         while len(stack) < base:
             last, last_size, last_off = stack[-1], float(size[-1]), float(off[-1])
             off = np.append(off, worse(off, size, last_off, last_size))
-            stack = np.concatenate([stack, stack @ last])
-            size = norms(stack)
+            further = stack @ last
+            stack, size = np.concatenate([stack, further]), np.append(size, norms(further))
         logs = [0.0, *np.log(size + off)]
         exponents = list(range(base + 1))
         power, power_off = stack[-1], float(off[-1])

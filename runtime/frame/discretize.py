@@ -1,7 +1,7 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
 Takes: the matrices of dx/dt = A x + B u, exact, or of many sites at once in floats.
-Gives: `Step`, `discretize`, `moved_together`; `exponential_rows`, in floats; `step_balls`.
+Gives: `Step`, `discretize`, `moved_together`; in floats, `exponential` and `exponential_rows`; `step_balls`.
 Guarantees: every entry of `discretize` is right to the last digit but one, proved by ball arithmetic, whether
 a mode dies out in a nanosecond or never; where many states move together and it is off by no more than
 composing it rounds, it is had in floats. Every step comes with a bound.
@@ -149,8 +149,8 @@ def _steps(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> l
             return found
         if len(a) > MOST_TOGETHER:
             what = (
-                f"{len(a)} states of one peer move together in continuous time, so fast that floats lose what "
-                f"a step makes of them, and {MOST_TOGETHER} such states are the most that are analysed"
+                f"{len(a)} states of one peer move together in continuous time, so fast that floats lose "
+                f"them in a step, and {MOST_TOGETHER} such states are the most that are analysed"
             )
             hint = "smaller arrays, as count: 100, or shorter periods"
             raise ApcError(Mistake("E812", Place("the scene"), what, hint=hint))
@@ -159,26 +159,45 @@ def _steps(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> l
 
 
 def _balanced_steps(a: Floats, b: Floats, durations: Sequence[Fraction]) -> list[Step] | None:
-    """Return the steps in floats; None where one may be off by much more than composing it rounds.
-
-    In units in which the rows of A are as large as its columns, powers of 2 of those given, its exponential
-    takes the fewest squarings, and the largest of it says how far any of it may be off.
-    """
-    import scipy.linalg
-
-    balanced, (units, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
-    whole = units[:, None] / np.concatenate([units, np.ones(b.shape[1])])
+    """Return the steps in floats; None where one may be off by much more than composing it rounds."""
     allowed = 2.0 if len(a) <= MOST_TOGETHER else DOUBTFUL
     found = []
     for duration in durations:
         with np.errstate(all="ignore"):
-            step = exponential_rows(balanced[None], b[None] / units[:, None], float(duration), rounded=3)
-            matrix, size = step.matrix[0], step.size[0]
+            step, units = exponential(a, b, float(duration), rounded=3)
+            matrix, size = step.matrix, step.size
             largest = np.abs(matrix).max()
             if not size.max() <= allowed * largest < np.inf:
                 return None
-            found.append(Step(whole * matrix, whole * size + UNDERFLOW, step.roundings))
+            found.append(Step(units * matrix, units * size + UNDERFLOW, step.roundings))
     return found
+
+
+def exponential(
+    a: Floats, b: Floats, seconds: float, *, rounded: int = 2 * COEFFICIENT_ROUNDINGS
+) -> tuple[Step, Floats]:
+    """Return [F G] of one site as `exponential_rows`, in units of its own, and what these are of it (n_x, n).
+
+    Parameters
+    ----------
+    a, b
+        A (n_x, n_x) and B (n_x, n_u).
+    seconds, rounded
+        As for `exponential_rows`.
+
+    Notes
+    -----
+    In units in which the rows of a large A are as large as its columns, powers of 2 of those given, its
+    exponential takes the fewest squarings, and the largest of it says how far any of it may be off.
+    """
+    units = np.ones(len(a))
+    if len(a) > FEW_TOGETHER:
+        import scipy.linalg
+
+        a, (units, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
+    step = exponential_rows(a[None], b[None] / units[:, None], seconds, rounded=rounded)
+    whole = units[:, None] / np.concatenate([units, np.ones(b.shape[1])])
+    return Step(step.matrix[0], step.size[0], step.roundings), whole
 
 
 def exponential_rows(
