@@ -6,7 +6,6 @@ own files; memory is the most it held. This program loads nothing large itself, 
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -84,6 +83,7 @@ def print_growth(
     numbers: Sequence[int],
     targets: tuple[float, float],
     judge: Judge,
+    folder: Path,
 ) -> None:
     """Measure `compile` and `analyze` of ever larger scenes; judge the largest, and print the exponents.
 
@@ -92,24 +92,22 @@ def print_growth(
     print(f"\n{title:>16}  {'compile':>17}  {'analyze':>17}   radius")
     rows = []
     for number in numbers:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            (folder / "scene.yaml").write_text(write(number, folder), encoding="utf-8")
-            compiling, analysing = (("-m", "apc", "compile", "--force"), ("-m", "apc", "analyze"))
-            measured = [
-                once((*words, file), folder)[1:]
-                for words, file in ((compiling, "scene.yaml"), (analysing, "scene.apc"))
-            ]
-            told = subprocess.run(
-                [sys.executable, *analysing, "--json", "scene.apc"],
-                cwd=folder, env=_environment(folder), capture_output=True, text=True, check=True,
-            )  # fmt: skip
-            found = json.loads(told.stdout)
+        scene = folder / title.replace(" ", "-") / str(number)
+        scene.mkdir(parents=True)
+        (scene / "scene.yaml").write_text(write(number, scene), encoding="utf-8")
+        model = str(scene / "scene.apc")
+        commands = (("compile", "--force", str(scene / "scene.yaml")), ("analyze", model))
+        measured = [once(("-m", "apc", *words), folder)[1:] for words in commands]
+        told = subprocess.run(
+            [sys.executable, "-m", "apc", "analyze", model],
+            cwd=folder, env=_environment(folder), capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
+        radius = next(line.split("radius")[1] for line in told.splitlines() if "spectral radius" in line)
         rows.append([seconds for seconds, _ in measured])
         print(
             f"{number:>16}  "
             + "  ".join(f"{seconds:6.2f} s {size / 2**20:4.0f} MiB" for seconds, size in measured)
-            + f"   {found['spectral_radius']:.9f} ± {found['spectral_radius_error']:.0e}"
+            + f" {radius}"
         )
     for place, (command, target) in enumerate(zip(("compile", "analyze"), targets, strict=True)):
         first, *_, before, last = (one[place] for one in rows)
@@ -147,8 +145,9 @@ def main() -> None:
             found = imports(words, folder)
             listed = ", ".join(f"{one} {size / 1e3:.0f} ms" for one, size in found.most_common(MOST_PACKAGES))
             print(f"\nimports of {title}: {sum(found.values()) / 1e3:.0f} ms in all\n  {listed}")
-    for title, write, numbers, targets in GROWTH:
-        print_growth(title, write, numbers[:-1] if given.quick else numbers, targets, judge)
+        for title, write, numbers, targets in GROWTH:
+            some = numbers[:-1] if given.quick else numbers
+            print_growth(title, write, some, targets, judge, folder)
     judge.end()
 
 
