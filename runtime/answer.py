@@ -20,7 +20,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.result import Result
 from apc.vary.margins import Margins, margins
-from apc.vary.sensitivity import Sensitivities, sensitivities
+from apc.vary.sensitivity import Sensitivities, sensitivities, varied
 
 if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
@@ -34,8 +34,8 @@ SAME_RADIUS = 1e-11
 FEW_PEERS = 100
 
 # What is varied is composed hundreds of times, tick by tick: with more ticks in a frame for over ten seconds.
-# A number's effect on the exponentials has as many entries as these, a few hundred megabytes for all numbers.
-MOST_TICKS, MOST_ENTRIES = 500, 2_000_000
+# Each number costs products of matrices of all states: with more of these together, for as long.
+MOST_TICKS, MOST_PRODUCTS = 500, 250_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,10 +173,9 @@ def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> s
     packets = max(len(schedule.heard) for schedule in prepared.schedules)
     if packets > MOST_TICKS:
         return f"not looked for: {packets:,} packets heard in a frame take too long"
-    for kind in system.kinds:
-        if len(kind.parameters) * len(kind.states) ** 2 > MOST_ENTRIES:
-            what = f"{len(kind.parameters):,} numbers of {len(kind.states):,} states take too long"
-            return f"not looked for: {what}"
+    free, states = len(varied(system)), max(len(kind.states) for kind in system.kinds)
+    if free * states**3 > MOST_PRODUCTS:
+        return f"not looked for: {free:,} numbers of {states:,} states take too long"
     return ""
 
 

@@ -9,8 +9,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from apc.frame.batch_lift import exponential_rows, lift_rows
-from apc.frame.discretize import UNIT, discretize
+from apc.frame.batch_lift import lift_rows
+from apc.frame.discretize import UNIT, discretize, exponential_rows
 from apc.frame.jacobians import jacobians
 from apc.frame.lift import FrameMap, compose, lift
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
@@ -93,8 +93,8 @@ def _true_frame(population: Population, vector: Any) -> FrameMap:
         ("0.0001", 0, {"comp": Fraction(0), "comm": Fraction(0)}),
         ("0.0001", 5, {"kt": 2000.0}),
         ("0.0001", 9, {"bc": 0.2}),
-        ("0.001", 4, {}),
-        ("0.001", 2, {"kc": 3000.0}),
+        ("0.0001", 4, {}),
+        ("0.0001", 2, {"kc": 3000.0}),
         # A hundred times the mass, and it is a bound.
         ("0.1", 4, {}),
         ("1", 2, {"kc": 3000.0}),
@@ -114,8 +114,8 @@ def test_bound_and_estimate_cover_the_error_against_eighty_digits(grams: str, se
 
 
 def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
-    """A copy of a milligram: radii grow without measure over a frame, the errors don't."""
-    system = apply(different(6), [Override(Free("cube.mass"), Fraction(1, 10**6))])
+    """A copy of a tenth of a milligram: radii grow without measure over a frame, the errors don't."""
+    system = apply(different(6), [Override(Free("cube.mass"), Fraction(1, 10**7))])
     [population], _ = crowded(system)
     assert population.lifted.estimated
     for row, vector in enumerate(population.parameters):
@@ -127,7 +127,7 @@ def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
             apart = np.abs(getattr(population.lifted, name)[row] - getattr(alone, name))
             estimate = getattr(population.lifted.error, name)[row]
             assert np.all(apart <= estimate)
-            assert estimate.max() < 1e-8 * max(1.0, np.abs(getattr(alone, name)).max())
+            assert estimate.max() < 1e-7 * max(1.0, np.abs(getattr(alone, name)).max())
 
 
 @pytest.mark.parametrize("text", STIFF.values(), ids=STIFF)

@@ -9,8 +9,9 @@ import mpmath
 import numpy as np
 import pytest
 
+import apc.frame.discretize as discretizing
 from apc.compiler.errors import ApcError
-from apc.frame.discretize import UNIT, discretize
+from apc.frame.discretize import FEW_TOGETHER, UNIT, Step, discretize
 
 DAMPINGS = (0.0, 1e-12, 1e-6, 5.0, 1e6)
 MASSES = (1e-6, 0.1, 1e3)
@@ -79,3 +80,67 @@ def test_growth_beyond_a_float_is_refused() -> None:
     a = np.array([[Fraction(10**7)]], dtype=object)
     with pytest.raises(ApcError, match="E806"):
         discretize(a, np.zeros((1, 0), dtype=object), [Fraction(1)])
+
+
+def chain(masses: int, *, stiffness: int = 1000, damping: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Masses of 10 g in a row between two walls, springs and dampers between them, the ends pushed."""
+    a, b = (np.full((2 * masses, n), Fraction(0), dtype=object) for n in (2 * masses, 2))
+    for i in range(masses):
+        a[2 * i, 2 * i + 1] = Fraction(1)
+        for j, share in ((i - 1, -1), (i, 2), (i + 1, -1)):
+            if 0 <= j < masses:
+                a[2 * i + 1, 2 * j : 2 * j + 2] = [Fraction(-100 * k * share) for k in (stiffness, damping)]
+    b[1, 0] = b[-1, 1] = Fraction(100)
+    return a, b
+
+
+def in_balls(
+    matrices: tuple[np.ndarray, np.ndarray], time: Fraction, monkeypatch: pytest.MonkeyPatch
+) -> Step:
+    with monkeypatch.context() as only:
+        only.setattr(discretizing, "_balanced_steps", lambda *_: None)
+        (step,) = discretize(*matrices, [time])
+    return step
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "damping", "milliseconds"), [(1000, 1, 1), (1000, 0, 1), (20, 3, 1), (1000, 4, 1)]
+)
+def test_a_chain_of_many_masses_is_had_in_floats_within_its_bound(
+    stiffness: int, damping: int, milliseconds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matrices = chain(FEW_TOGETHER, stiffness=stiffness, damping=damping)
+    time = Fraction(milliseconds, 1000)
+    truth = in_balls(matrices, time, monkeypatch)
+    (step,) = discretize(*matrices, [time])
+    assert step.roundings > 1 == truth.roundings
+    bound = UNIT * step.roundings * step.size
+    assert (np.abs(step.matrix - truth.matrix) <= bound + UNIT * truth.size).all()
+    # In units of length in which velocities are as large as ways, no entry is off by more than composing it
+    # rounds: 130 states and holds.
+    units = np.tile([1.0, np.sqrt(stiffness * 100.0)], FEW_TOGETHER)
+    pushed = np.full(2, 1 / 100.0)
+    scaled = bound / units[:, None] * np.concatenate([units, pushed])
+    assert scaled.max() <= 4 * 130 * UNIT
+
+
+@pytest.mark.parametrize("seconds", [Fraction(1, 10), Fraction(2)])
+def test_a_chain_that_swings_often_in_a_step_is_had_in_balls(
+    seconds: Fraction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matrices = chain(FEW_TOGETHER // 2 + 1, damping=0)
+    (step,) = discretize(*matrices, [seconds])
+    assert step.roundings == 1
+    assert np.array_equal(step.matrix, in_balls(matrices, seconds, monkeypatch).matrix)
+
+
+def test_what_is_too_far_to_be_reached_by_the_series_is_within_the_bound() -> None:
+    """Of a line of integrators, x_n after T is T^n/n! of the first: below what the series takes in."""
+    n = FEW_TOGETHER + 20
+    a = np.array([[Fraction(int(i == j + 1)) for j in range(n)] for i in range(n)], dtype=object)
+    (step,) = discretize(a, np.zeros((n, 0), dtype=object), [Fraction(3, 2)])
+    with mpmath.workdps(60):
+        for i in range(n):
+            true = mpmath.mpf("1.5") ** i / mpmath.factorial(i)
+            off = UNIT * step.roundings * float(step.size[i, 0])
+            assert abs(mpmath.mpf(float(step.matrix[i, 0])) - true) <= off

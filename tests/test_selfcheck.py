@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from apc.analysis import selfcheck
 from apc.analysis.selfcheck import check_frame, skipped
+from apc.compiler.components.library import Library
 from apc.frame.lift import LiftedSite, lift
+from tests.bench.growing import equations
 from tests.sites import MS, columned, edged, grouped, linked, paper
 from tests.topologies import compiled
 
@@ -89,6 +93,25 @@ def test_what_moves_fast_within_a_frame_agrees_and_a_wrong_lift_of_it_is_found(
     def spoiled(*arguments: Any, **options: Any) -> LiftedSite:
         lifted = lift(*arguments, **options)
         return replace(lifted, p=lifted.p * (1 + 1e-12))
+
+    monkeypatch.setattr(selfcheck, "lift", spoiled)
+    with pytest.raises(AssertionError, match="stepped and lifted, differ by"):
+        check_frame(system)
+
+
+def test_many_masses_in_a_row_agree_and_a_wrong_lift_of_them_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their steps are sums of a series, ball by ball, and of no matrix."""
+    text = equations(150, tmp_path)
+    monkeypatch.setattr(selfcheck, "_step", small := Mock(side_effect=selfcheck._step))
+    system = compiled(text, Library((tmp_path / "parts",)))
+    assert check_frame(system) < 1e-15
+    assert {call.args[0].nrows() for call in small.call_args_list} == {2}  # the cube's
+
+    def spoiled(*arguments: Any, **options: Any) -> LiftedSite:
+        lifted = lift(*arguments, **options)
+        return replace(lifted, p=lifted.p * (1 + 1e-11))
 
     monkeypatch.setattr(selfcheck, "lift", spoiled)
     with pytest.raises(AssertionError, match="stepped and lifted, differ by"):

@@ -29,7 +29,7 @@ from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios
 from apc.frame.exact import evaluate_exact
-from apc.frame.linearize import site_of_row
+from apc.frame.linearize import site_of_entries
 from apc.frame.names import Free, Range, find
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import exact_numbers, scope_of
@@ -271,6 +271,4 @@ def _open_site(group: PeerGroup, opened: Mapping[str, Ratio], system: CompiledSy
     except NotRational as reason:
         what = f"the equations of {group.name} {reason}"
         raise ApcError(Mistake("E832", Place(system.name), what)) from None
-    entries = np.empty(len(flat), dtype=object)
-    entries[:] = flat
-    return site_of_row(built, entries)
+    return site_of_entries(built, flat, Fraction(0))

@@ -35,8 +35,8 @@ from apc.eigen.relative import Relative, independent_places, relative_bounded
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
 from apc.finite_equations import finite_equations
-from apc.frame.discretize import UNIT
-from apc.frame.lift import COEFFICIENT_ROUNDINGS, FrameMap
+from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT
+from apc.frame.lift import FrameMap
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded

@@ -203,8 +203,9 @@ def _many(
     )
     if states <= FEW_STATES:
         return False
+    # Peers that are all alike are a few systems of one peer's size, however large that is.
     most = max(len(kind.states) for kind in system.kinds)
-    return more_differ(system, jacobians, numbers, exchange, FEW_STATES // most)
+    return more_differ(system, jacobians, numbers, exchange, max(1, FEW_STATES // most))
 
 
 def _prompt(schedules: Sequence[Schedule], numbers: Numbers, exchange: Exchange) -> bool:

@@ -21,10 +21,17 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
-from apc.frame.discretize import PRECISIONS, TOO_LARGE, UNIT, moved_together
+from apc.frame.discretize import (
+    COEFFICIENT_ROUNDINGS,
+    FEW_TOGETHER,
+    PRECISIONS,
+    TOO_LARGE,
+    UNIT,
+    moved_together,
+)
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
-from apc.frame.lift import COEFFICIENT_ROUNDINGS, FrameMap, lift
+from apc.frame.lift import FrameMap, lift
 from apc.frame.linearize import linearize, linearize_exact
 from apc.frame.parameters import Numbers, exact_numbers, resolve
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
@@ -40,12 +47,19 @@ SEED = 20_090_616
 # Sites of one kind that are checked: they differ in numbers only, which the functions take as they come.
 MOST_CHECKED = 3
 
-# Evaluations that compare a function with its slopes: each costs as much as the function is long.
-MOST_PROBES = 64
+# Columns that are compared with a function one by one, and evaluations of one with more: each costs as much
+# as the function is long.
+MOST_PROBES, FEWEST_PROBES = 64, 8
 
 # The exponential is a Taylor series of X = A T/2^k with norms below 2^−16 and so many terms, then squared k
 # times: what is left out of every mode is below 2^−(16·25)/25! of it, less than 2^−480.
 SMALL, TERMS = 2.0**-16, 24
+
+# A product of balls by itself, and one of many within a product of matrices, in nanoseconds.
+SINGLE, WITHIN = 200, 3
+
+# The entries of a matrix of balls that are not zero, row by row, each with its column.
+Rows = list[list[tuple[int, Any]]]
 
 TINY = float(np.finfo(np.float64).tiny)
 
@@ -136,7 +150,7 @@ def _precisely_stepped(
     try:
         for bits in PRECISIONS:
             flint.ctx.prec = bits
-            balls = _stepped(_Stepped(exact, parameters), schedule, z, r)
+            balls = _stepped(_Stepped(exact, schedule, parameters), schedule, z, r)
             radius = np.array([float(ball.rad()) for ball in balls])
             if (radius <= asked).all():
                 return np.array([float(ball.mid()) for ball in balls])
@@ -162,14 +176,14 @@ def _stepped(site: _Stepped, schedule: Schedule, z: Floats, r: Floats) -> list[A
             case Act(hold, one):
                 u[hold] = value.get(one, zero)
             case Send(partition, rows):
-                everything = _times(site.sends[partition], [*x, *u])
+                everything = _sums(site.sends[partition], [*x, *u])
                 for channel, row in rows:
                     sent[row] = everything[channel]
             case Tick(partition, index, rows_heard):
                 memories = site.kind.clocks[partition].memories
                 m = [value.get(Value(partition, o, index - 1), zero) for o in memories]
                 received = [sum((heard[row] for row in rows), zero) for rows in rows_heard]
-                outputs = _times(site.ticks[partition], [*x, *u, *m, *received])
+                outputs = _sums(site.ticks[partition], [*x, *u, *m, *received])
                 value |= {Value(partition, o, index): number for o, number in enumerate(outputs)}
     after = [
         value[Value(one.partition, one.output, one.index + schedule.ticks[one.partition])]
@@ -186,14 +200,14 @@ class _Stepped:
     that is stepped.
     """
 
-    def __init__(self, exact: LinearSite, parameters: Floats) -> None:
+    def __init__(self, exact: LinearSite, schedule: Schedule, parameters: Floats) -> None:
         self.kind = exact.kind
         p = exact_numbers(exact.kind, parameters)
         self.rates = _agreed(exact.kind.derivative, (exact.a, exact.b), p)
-        self.parts = [
-            (states.tolist(), _picked(self.rates, states.tolist())) for states in moved_together(exact.a)
+        lengths = [
+            event.duration * schedule.quantum for event in schedule.events if isinstance(event, Propagate)
         ]
-        self.steps: dict[Fraction, list[tuple[list[int], Any, Any]]] = {}
+        self.parts = [_Part(states.tolist(), self.rates, lengths) for states in moved_together(exact.a)]
         self.ticks = [
             _agreed(clock.tick, (one.x, one.u, one.m, one.r), p)
             for clock, one in zip(exact.kind.clocks, exact.ticks, strict=True)
@@ -204,21 +218,81 @@ class _Stepped:
         ]
 
     def propagated(self, x: list[Any], u: list[Any], duration: Fraction) -> list[Any]:
-        """Return x after `duration` seconds: dx/dt = A x + c, c = B u constant: e^{AT} x + φ₁(AT) T c."""
+        """Return x after `duration` seconds: dx/dt = A x + c, c = B u constant."""
         import flint
 
-        n = len(x)
-        constant = _times(self.rates, [flint.arb(0)] * n + u)
-        if duration not in self.steps:
-            seconds = flint.arb(flint.fmpq(duration.numerator, duration.denominator))
-            self.steps[duration] = [(states, *_step(rates, seconds)) for states, rates in self.parts]
+        constant = _sums(self.rates, [flint.arb(0)] * len(x) + u)
         after = list(x)
-        for states, whole, mean in self.steps[duration]:
-            moved = _times(whole, [x[i] for i in states])
-            pushed = _times(mean, [constant[i] for i in states])
-            for i, one, other in zip(states, moved, pushed, strict=True):
-                after[i] = one + other
+        for joined in self.parts:
+            states = joined.states
+            moved = joined.moved([x[i] for i in states], [constant[i] for i in states], duration)
+            for i, one in zip(states, moved, strict=True):
+                after[i] = one
         return after
+
+
+class _Part:
+    """States that move together: e^{AT} x + φ₁(AT) T c, by both matrices or by the series of what they do.
+
+    A matrix is made once a length and costs the cube of the states; the series is summed each time, and costs
+    as much as A has entries, as often as A T is large.
+    """
+
+    def __init__(self, states: list[int], rates: Rows, lengths: Sequence[Fraction]) -> None:
+        place = {state: i for i, state in enumerate(states)}
+        self.states = states
+        self.rows: Rows = [[(place[j], one) for j, one in rates[i] if j in place] for i in states]
+        self.steps: dict[Fraction, tuple[Any, Any]] = {}
+        self.units, self.norm, n = np.ones(len(states)), np.inf, len(states)
+        if n <= FEW_TOGETHER:
+            return
+        import scipy.linalg
+
+        dense = np.zeros((n, n))
+        for i, row in enumerate(self.rows):
+            dense[i, [j for j, _ in row]] = [float(one) for _, one in row]
+        balanced, (units, _) = scipy.linalg.matrix_balance(dense, permute=False, separate=True)
+        norm = float(np.abs(balanced).sum(axis=1).max()) * (1 + n * UNIT)
+        turns = sum(max(1.0, norm * float(length)) for length in lengths)
+        if turns * sum(map(len, self.rows)) * SINGLE < len(set(lengths)) * n**3 * WITHIN:
+            self.units, self.norm = units, norm
+
+    def moved(self, x: list[Any], constant: list[Any], duration: Fraction) -> list[Any]:
+        """Return where the states x are after `duration` seconds of dx/dt = A x + c."""
+        import flint
+
+        seconds = flint.arb(flint.fmpq(duration.numerator, duration.denominator))
+        if np.isfinite(self.norm):
+            times = max(1, int(np.ceil(self.norm * float(duration) * (1 + 4 * UNIT))))
+            for _ in range(times):
+                x = self._further(x, constant, seconds / times)
+            return x
+        if duration not in self.steps:
+            n = len(x)
+            dense = flint.arb_mat(n, n)
+            for i, row in enumerate(self.rows):
+                for j, one in row:
+                    dense[i, j] = one
+            self.steps[duration] = _step(dense, seconds)
+        whole, mean = self.steps[duration]
+        return [one + other for one, other in zip(_times(whole, x), _times(mean, constant), strict=True)]
+
+    def _further(self, x: list[Any], constant: list[Any], seconds: Any) -> list[Any]:
+        """Sum x + T (A x + c) + T²/2 A (A x + c) + …, ‖A T‖ ≤ 1: the rest is below twice the last term."""
+        import flint
+
+        term = [(one + other) * seconds for one, other in zip(_sums(self.rows, x), constant, strict=True)]
+        last = TERMS * flint.ctx.prec // PRECISIONS[0]
+        for power in range(2, last + 2):
+            x = [one + other for one, other in zip(x, term, strict=True)]
+            share = seconds / power
+            term = [one * share for one in _sums(self.rows, term)]
+        left = max(
+            (float(abs(one).upper()) / unit for one, unit in zip(term, self.units.tolist(), strict=True)),
+            default=0.0,
+        )
+        rest = [flint.arb(0, 2 * left * unit) for unit in self.units.tolist()]
+        return [one + other for one, other in zip(x, rest, strict=True)]
 
 
 def _step(rates: Any, seconds: Any) -> tuple[Any, Any]:
@@ -242,62 +316,60 @@ def _step(rates: Any, seconds: Any) -> tuple[Any, Any]:
 
 
 def _probes(columns: int) -> Iterator[NDArray[np.int64]]:
-    """Yield inputs that tell the slopes: each column by itself or, of many, a few at once."""
-    together = -(-columns // MOST_PROBES)
+    """Yield inputs that tell the slopes: each column by itself or, of many, a few at once.
+
+    Of more columns there are fewer probes, as each costs more: all cost as if each column were by itself.
+    """
+    count = max(FEWEST_PROBES, MOST_PROBES**2 // max(columns, MOST_PROBES))
     weights = (
         np.random.default_rng(SEED).integers(1, 2**16, columns)
-        if together > 1
+        if columns > count
         else np.ones(columns, np.int64)
     )
-    for first in range(MOST_PROBES):
+    for first in range(count):
         probe = np.zeros(columns, np.int64)
-        probe[first::MOST_PROBES] = weights[first::MOST_PROBES]
+        probe[first::count] = weights[first::count]
         if probe.any():
             yield probe
 
 
-def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) -> Any:
+def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) -> Rows:
     """Return the slopes of an affine function as balls; they must be what it multiplies its inputs by."""
     import flint
 
     whole = np.hstack(slopes)
 
-    def values(probe: NDArray[np.int64]) -> NDArray[Any]:
+    def values(probe: NDArray[np.int64]) -> list[Fraction]:
         arguments, first = [], 0
         for size in (one.shape[1] for one in slopes):
             arguments.append([Fraction(one) for one in probe[first : first + size].tolist()])
             first += size
-        found = evaluate_exact(function, [*arguments, p, [Fraction(0)]])[0]
-        return np.array([Fraction(one) for one in found], dtype=object)
+        return evaluate_exact(function, [*arguments, p, [Fraction(0)]])[0]
 
-    rows, columns = whole.shape
-    still = values(np.zeros(columns, np.int64))
-    size = np.array([max(map(abs, row), default=Fraction(0)) for row in whole], dtype=object)
-    filled = [np.flatnonzero(column) for column in (whole != 0).T]
-    for probe in _probes(columns):
-        expected = np.full(rows, Fraction(0), dtype=object)
-        for column in np.flatnonzero(probe).tolist():
-            touched = filled[column]
-            expected[touched] += whole[touched, column] * int(probe[column])
-        apart = abs(values(probe) - still - expected)
-        allowed = COEFFICIENT_ROUNDINGS * Fraction(UNIT) * int(probe.sum()) * size
-        assert (apart <= allowed).all(), (
-            f"the slopes of {function.name()} are not what it multiplies its inputs by"
-        )
-    balls = flint.arb_mat(rows, columns)
-    for column, touched in enumerate(filled):
-        for row in touched.tolist():
-            one = whole[row, column]
-            balls[row, column] = flint.arb(flint.fmpq(one.numerator, one.denominator))
-    return balls
+    filled: list[list[tuple[int, Fraction]]] = [[] for _ in whole]
+    for row, column in np.argwhere(whole.astype(np.bool_)).tolist():
+        filled[row].append((column, whole[row, column]))
+    still = values(np.zeros(whole.shape[1], np.int64))
+    sizes = [max((abs(one) for _, one in row), default=Fraction(0)) for row in filled]
+    for probe in _probes(whole.shape[1]):
+        many, inputs = int(probe.sum()), probe.tolist()
+        for terms, size, before, after in zip(filled, sizes, still, values(probe), strict=True):
+            expected = sum((one * inputs[column] for column, one in terms if inputs[column]), Fraction(0))
+            assert abs(after - before - expected) <= COEFFICIENT_ROUNDINGS * Fraction(UNIT) * many * size, (
+                f"the slopes of {function.name()} are not what it multiplies its inputs by"
+            )
+    return [
+        [(column, flint.arb(flint.fmpq(one.numerator, one.denominator))) for column, one in row]
+        for row in filled
+    ]
 
 
-def _picked(matrix: Any, places: list[int]) -> Any:
-    """Return the rows and columns of some places."""
+def _sums(rows: Rows, vector: list[Any]) -> list[Any]:
+    """Return the products of a matrix's rows and a vector."""
     import flint
 
-    size = len(places)
-    return flint.arb_mat(size, size, [matrix[i, j] for i in places for j in places])
+    zero = flint.arb(0)
+    return [sum((one * vector[column] for column, one in row), zero) for row in rows]
 
 
 def _times(matrix: Any, vector: list[Any]) -> list[Any]:

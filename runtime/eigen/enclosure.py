@@ -35,9 +35,9 @@ Matrix = NDArray[Any]  # float64 or complex128
 SMALL = 1e-2
 
 # A radius less certain than this, or than this part of it where it is above 1, is worth more work: other
-# splits, this many.
+# splits, this many; fewer of a matrix of more states, where each takes a second.
 WIDE = 1e-9
-SPLITS_TRIED = 8
+SPLITS_TRIED, FEWER_SPLITS, MANY_STATES = 8, 2, 300
 
 # Eigenvalues nearer to one another than this, relatively, are enclosed together: their own vectors are hardly
 # two.
@@ -109,7 +109,8 @@ def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
     counts = [int(k) + 1 for k in np.argsort(ratios[:-1], kind="stable") if ratios[k] < 1 - CLOSE]
     others = [count for count in counts if count != first and sizes[count - 1] > SMALL]
     tried = [_enclose(matrix, error, values, right, left, first)]
-    for count in (*others[:SPLITS_TRIED], 0):
+    most = SPLITS_TRIED if len(matrix) <= MANY_STATES else FEWER_SPLITS
+    for count in (*others[:most], 0):
         low = max(one.low for one in tried)
         if min(one.high for one in tried) - low <= WIDE * max(low, 1.0):
             break

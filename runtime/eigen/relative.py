@@ -26,6 +26,10 @@ Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
 
+# Rows of which columns are chosen one by one, each the best of all; of more, by a QR decomposition, which
+# pivots on columns alone and costs a cube, not as many passes over all.
+MOST_PIVOTED = 64
+
 
 @dataclass(frozen=True, slots=True)
 class Relative:
@@ -58,6 +62,12 @@ def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matri
 
 def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
     """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
+    if len(rows) > MOST_PIVOTED:
+        import scipy.linalg
+
+        scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        order = scipy.linalg.qr(scaled, mode="r", pivoting=True, check_finite=False)[1]
+        return np.sort(order[: len(rows)]).astype(np.intp)
     left = np.array(rows)
     places: list[int] = []
     for _ in range(len(rows)):

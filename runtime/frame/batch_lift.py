@@ -1,7 +1,7 @@
 """One frame of many sites of one kind as linear maps, all at once.
 
 Takes: the Jacobians of a kind, a `Schedule`, and the matrices of many sites as rows (see `linearize_rows`).
-Gives: `lift_rows`; `exponential_rows`.
+Gives: `lift_rows`.
 Guarantees: the maps are those of `lift`, to rounding; every matrix comes with a bound on its error, entry by
 entry, wider than that of `lift`, as no ball arithmetic is done.
 Does not: decide which sites are alike (see `peers`), or close a loop (see `populations`).
@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import UNIT, Step
+from apc.frame.discretize import UNIT, Step, exponential_rows
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import (
-    COEFFICIENT_ROUNDINGS,
     FrameMap,
     LiftedSite,
     bounded,
@@ -46,9 +45,6 @@ HOPELESS = 1e-6
 # all of 8 once in 10⁸. Of 46,656 entries (1,080 sites with copies of 10 mg to 1 g, against 80 digits) the
 # error was at most a third of this estimate; of two frames, it was beyond it in 49, up to three times.
 PERTURBED_FRAMES, SAFE = 8, 8.0
-
-# With ‖X‖ ≤ 1/2 the Taylor series of φ₁ is right to 2^−60 after so many terms: (1/2)^16/17! < 2^−64.
-TERMS = 16
 
 
 def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedSite:
@@ -123,53 +119,3 @@ def _perturbed(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step], 
         )
         error = error.mapped(lambda e, a, b: np.maximum(e, SAFE * np.abs(a - b)), frame, other)
     return error
-
-
-def exponential_rows(a: Matrix, b: Matrix, seconds: float) -> Step:
-    """Return exp of many generators by scaling and squaring, x(t + T) = F x(t) + G u.
-
-    Parameters
-    ----------
-    a, b
-        A (k, n_x, n_x) and B (k, n_x, n_u), float64 or complex128, each entry right to
-        `COEFFICIENT_ROUNDINGS` roundings.
-    seconds
-        T.
-
-    Returns
-    -------
-    The steps of all of them, [F G] (k, n_x, n_x + n_u).
-
-    Notes
-    -----
-    With X = A T/2^s, ‖X‖ ≤ 1/2, and Y = φ₁(X) by Horner's rule, F = I + X Y and G = Y B T/2^s; then
-    s times F ← F², G ← F G + G. A rounding at the j-th step of Horner's rule reaches Y through X^(j−1)/j!,
-    so that all of them together stay below n + 3 roundings of φ₁ of the magnitudes twice as large.
-    """
-    n_x, n_u = b.shape[-2:]
-    x = a * seconds
-    norm = float(np.abs(x).sum(axis=-2).max(initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(norm))) + 1) if 0 < norm < np.inf else 0
-    x, g = x * 2.0**-squarings, b * (seconds * 2.0**-squarings)
-    phi, large = _phi(x), _phi(2 * np.abs(x))
-    step = np.concatenate([np.eye(n_x) + x @ phi, phi @ g], axis=-1)
-    charge = float(n_x + 6 + 2 * COEFFICIENT_ROUNDINGS)
-    doubled = np.concatenate([np.eye(n_x) + 2 * np.abs(x) @ large, large @ np.abs(g)], axis=-1)
-    error = (charge * UNIT) * doubled
-    below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (*b.shape[:-2], n_u, n_x + n_u))
-    for _ in range(squarings):
-        whole, off = np.concatenate([step, below], axis=-2), np.concatenate([error, 0 * below], axis=-2)
-        size = np.abs(whole)
-        error = (size[..., :n_x, :] + error) @ off + error @ size
-        error += (n_x + 2) * UNIT * (size[..., :n_x, :] @ size)
-        step = step @ whole
-    return Step(step, np.maximum(np.abs(step), error / (charge * UNIT)), charge)
-
-
-def _phi(x: Matrix) -> Matrix:
-    """Return φ₁(X) = I + X/2! + X²/3! + … of many small matrices."""
-    unit = np.eye(x.shape[-1])
-    found = unit + 0 * x
-    for term in range(TERMS, 0, -1):
-        found = unit + (x / (term + 1)) @ found
-    return np.asarray(found)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.batch_lift import exponential_rows
+from apc.frame.discretize import exponential
 from apc.frame.lift import follow
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite
@@ -81,9 +81,10 @@ def turns(
         if not most * height <= MOST or not len(left):
             break
         chunk, seen = MOST // (most * height), np.zeros(len(values), dtype=np.bool_)
+        fine = _fine(site, schedule, points)
         for first in range(0, len(left), chunk):
             some = left[first : first + chunk]
-            course = _course(site, schedule, points, start[:, some], heard[:, some], states[some])
+            course = _course(site, schedule, fine, start[:, some], heard[:, some], states[some])
             angle, widest = turned_along(course)
             before, _ = turned_along(course[::2])  # half as finely
             agreed = (np.abs(angle - before) < OFF) | (widest < CLOSE)
@@ -100,35 +101,38 @@ def _power_of_two(least: float, doubled: int) -> int:
     return int(2 ** (np.ceil(np.log2(max(least, FEWEST))) + doubled))
 
 
+def _fine(site: LinearSite, schedule: Schedule, points: dict[int, int]) -> dict[int, list[Floats]]:
+    """Return the steps between so many points of each step, of 1, 2, 4, … of these, up to the whole."""
+    n_x, n_u = site.b.shape
+    fine = {}
+    for duration, number in points.items():
+        step, units = exponential(site.a, site.b, float(duration * schedule.quantum) / number)
+        powers = [np.vstack([units * step.matrix, np.eye(n_x + n_u)[n_x:]])]
+        while 2 ** len(powers) <= number:
+            powers.append(powers[-1] @ powers[-1])
+        fine[duration] = powers
+    return fine
+
+
 def _course(
     site: LinearSite,
     schedule: Schedule,
-    points: dict[int, int],
+    fine: dict[int, list[Floats]],
     start: Complexes,
     heard: Complexes,
     states: Integers,
 ) -> Complexes:
     """Return the states followed at so many points of each step, and the end (points, k)."""
-    n_x, n_u = site.b.shape
-    count = start.shape[1]
-    steps, fine = {}, {}
-    below = np.eye(n_x + n_u)[n_x:]
-    for duration, number in points.items():
-        seconds = float(duration * schedule.quantum) / number
-        step = exponential_rows(site.a[None], site.b[None], seconds).matrix[0]
-        powers = [np.vstack([step, below])]
-        while 2 ** len(powers) <= number:
-            powers.append(powers[-1] @ powers[-1])
-        fine[duration] = powers
-        steps[duration] = powers[-1]
-    columns = np.arange(count)
+    steps = {duration: powers[-1] for duration, powers in fine.items()}
+    columns = np.arange(start.shape[1])
     rows: list[Complexes] = []
 
     def watch(duration: int, moving: NDArray[Any]) -> None:
-        path = moving[None]
+        # A complex column is two real ones: a real matrix times these is half the work.
+        path = np.ascontiguousarray(moving)[None].view(np.float64)
         for power in fine[duration][:-1]:
             path = np.concatenate([path, power @ path])
-        rows.append(path[:, states, columns])
+        rows.append(path.view(np.complex128)[:, states, columns])
 
     course = follow(site, schedule, steps, start, _heard_by(heard), watch=watch)
     while True:

@@ -1,8 +1,10 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
-Takes: the matrices of dx/dt = A x + B u, exact. Gives: `Step`, `discretize`, `moved_together`; `step_balls`.
-Guarantees: every entry is right to the last digit but one, proved by ball arithmetic, whether a mode dies
-out in a nanosecond or never.
+Takes: the matrices of dx/dt = A x + B u, exact, or of many sites at once in floats.
+Gives: `Step`, `discretize`, `moved_together`; in floats, `exponential` and `exponential_rows`; `step_balls`.
+Guarantees: every entry of `discretize` is right to the last digit but one, proved by ball arithmetic, whether
+a mode dies out in a nanosecond or never; where many states move together and it is off by no more than
+composing it rounds, it is had in floats. Every step comes with a bound.
 Does not: know when anything happens (see `scheduling`).
 
     x(t + T) = F x(t) + G u        [F G; 0 I] = exp([A B; 0 0] T)
@@ -15,7 +17,7 @@ precision loses log₂(bT/m) bits where the mass is tiny. Arb's exponential (Joh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -26,6 +28,7 @@ from numpy.typing import NDArray
 from apc.compiler.errors import ApcError, Mistake, Place
 
 Floats = NDArray[np.float64]
+Matrix = NDArray[Any]  # float64 or complex128
 Integers = NDArray[np.int64]
 
 UNIT = float(np.finfo(np.float64).eps) / 2  # the unit roundoff of double precision
@@ -37,13 +40,28 @@ PRECISIONS = (128, 256, 512, 1024, 2048)
 RADIUS = 2.0**-80
 
 
-# States of one peer, whose matrices hold a rational an entry: of 400 an analysis takes 8 s and 0.4 GB, of
-# 1,000 ten times that.
-MOST_STATES = 400
+# States of one peer, whose matrices hold a rational an entry.
+MOST_STATES = 1000
 
-# States whose exponential is one, at a cost of their cube: some seconds for so many. Inputs beside fewer.
-MOST_TOGETHER = 250
+# States that move together whose exponential is one of balls: of more, floats are looked at first, as balls
+# cost 30 times as much, and only up to so many are there balls where floats say too little: some seconds.
+FEW_TOGETHER, MOST_TOGETHER = 64, 250
+# How many times as much as composing rounds a step in floats may be off by, where balls are too many.
+DOUBTFUL = 1e4
+# Inputs beside fewer states: each is a row more of the exponential.
 FEWEST_INPUTS = 8
+
+# Entries of a large matrix, as a share of all, up to which its products leave out the zeros.
+SPARSE = 1 / 16
+
+# Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
+# short polynomials of the parameters, a few roundings an entry.
+COEFFICIENT_ROUNDINGS = 8
+
+# With ‖X‖ ≤ 1/2, or 2, the Taylor series of φ₁ is right to 2^−64 after so many terms: (1/2)^17/17! and
+# 2^27/27! are less than 2^−64, with all that follows.
+TERMS, MORE_TERMS = 16, 25
+LEFT_OUT = 2.0**-64
 
 # What a number below the range of floats may be off by when it is rounded to zero, in units of UNIT.
 UNDERFLOW = float(np.finfo(np.float64).tiny) / UNIT
@@ -84,23 +102,16 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
         E812 too many states, or too many that move together.
     """
     n_x = len(a)
-    pieces = [
-        (
-            states,
-            np.concatenate([states, n_x + inputs]),
-            _generator(a[np.ix_(states, states)], b[np.ix_(states, inputs)]),
-        )
-        for states, inputs in _pieces(a, b)
-    ]
-    steps = []
-    for duration in durations:
-        matrix = np.zeros((n_x, n_x + b.shape[1]))
-        size = np.full(matrix.shape, UNDERFLOW)
-        for states, places, generator in pieces:
-            piece = _step(generator * _rational(duration), len(states))
-            matrix[np.ix_(states, places)], size[np.ix_(states, places)] = piece.matrix, piece.size
-        steps.append(Step(matrix, size))
-    return tuple(steps)
+    matrices = np.zeros((len(durations), n_x, n_x + b.shape[1]))
+    sizes = np.full(matrices.shape, UNDERFLOW)
+    roundings = 1.0
+    for states, inputs in _pieces(a, b):
+        places = np.ix_(states, np.concatenate([states, n_x + inputs]))
+        steps = _steps(a[np.ix_(states, states)], b[np.ix_(states, inputs)], durations)
+        for matrix, size, step in zip(matrices, sizes, steps, strict=True):
+            matrix[places], size[places] = step.matrix, step.size
+            roundings = max(roundings, step.roundings)
+    return tuple(Step(*pair, roundings) for pair in zip(matrices, sizes, strict=True))
 
 
 def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Integers]]:
@@ -112,28 +123,167 @@ def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Intege
     Raises
     ------
     ApcError
-        E812 too many states, or too many that move together.
+        E812 too many states.
     """
     if len(a) > MOST_STATES:
         what = f"one peer has {len(a)} states, and {MOST_STATES} are the most that are analysed"
         raise ApcError(Mistake("E812", Place("the scene"), what, hint="smaller arrays, as count: 100"))
     for states in moved_together(a):
-        if len(states) > MOST_TOGETHER:
-            what = (
-                f"{len(states)} states of one peer move together in continuous time, "
-                f"and {MOST_TOGETHER} are the most that are analysed"
-            )
-            raise ApcError(Mistake("E812", Place("the scene"), what, hint="smaller arrays, as count: 100"))
-        inputs = np.flatnonzero((b[states] != 0).any(axis=0))
+        inputs = np.flatnonzero(b[states].astype(np.bool_).any(axis=0))
         step = max(len(states), FEWEST_INPUTS)
         for begin in range(0, max(len(inputs), 1), step):
             yield states, inputs[begin : begin + step]
 
 
+def _steps(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> list[Step]:
+    """Return the steps of states that move together: in floats where they are many, else in balls.
+
+    Raises
+    ------
+    ApcError
+        E806 as `discretize`; E812 too many for balls where floats say too little.
+    """
+    if len(a) > FEW_TOGETHER:
+        found = _balanced_steps(_floats(a), _floats(b), durations)
+        if found is not None:
+            return found
+        if len(a) > MOST_TOGETHER:
+            what = (
+                f"{len(a)} states of one peer move together in continuous time, so fast that floats lose "
+                f"them in a step, and {MOST_TOGETHER} such states are the most that are analysed"
+            )
+            hint = "smaller arrays, as count: 100, or shorter periods"
+            raise ApcError(Mistake("E812", Place("the scene"), what, hint=hint))
+    generator = _generator(a, b)
+    return [_step(generator * _rational(duration), len(a)) for duration in durations]
+
+
+def _balanced_steps(a: Floats, b: Floats, durations: Sequence[Fraction]) -> list[Step] | None:
+    """Return the steps in floats; None where one may be off by much more than composing it rounds."""
+    allowed = 2.0 if len(a) <= MOST_TOGETHER else DOUBTFUL
+    found = []
+    for duration in durations:
+        with np.errstate(all="ignore"):
+            step, units = exponential(a, b, float(duration), rounded=3)
+            matrix, size = step.matrix, step.size
+            largest = np.abs(matrix).max()
+            if not size.max() <= allowed * largest < np.inf:
+                return None
+            found.append(Step(units * matrix, units * size + UNDERFLOW, step.roundings))
+    return found
+
+
+def exponential(
+    a: Floats, b: Floats, seconds: float, *, rounded: int = 2 * COEFFICIENT_ROUNDINGS
+) -> tuple[Step, Floats]:
+    """Return [F G] of one site as `exponential_rows`, in units of its own, and what these are of it (n_x, n).
+
+    Parameters
+    ----------
+    a, b
+        A (n_x, n_x) and B (n_x, n_u).
+    seconds, rounded
+        As for `exponential_rows`.
+
+    Notes
+    -----
+    In units in which the rows of a large A are as large as its columns, powers of 2 of those given, its
+    exponential takes the fewest squarings, and the largest of it says how far any of it may be off.
+    """
+    units = np.ones(len(a))
+    if len(a) > FEW_TOGETHER:
+        import scipy.linalg
+
+        a, (units, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
+    step = exponential_rows(a[None], b[None] / units[:, None], seconds, rounded=rounded)
+    whole = units[:, None] / np.concatenate([units, np.ones(b.shape[1])])
+    return Step(step.matrix[0], step.size[0], step.roundings), whole
+
+
+def exponential_rows(
+    a: Matrix, b: Matrix, seconds: float, *, rounded: int = 2 * COEFFICIENT_ROUNDINGS
+) -> Step:
+    """Return exp of many generators by scaling and squaring, x(t + T) = F x(t) + G u.
+
+    Parameters
+    ----------
+    a, b
+        A (k, n_x, n_x) and B (k, n_x, n_u), float64 or complex128.
+    seconds
+        T.
+    rounded
+        How many roundings each entry of A T and B T may be off by, those of T and of the product included.
+
+    Returns
+    -------
+    The steps of all of them, [F G] (k, n_x, n_x + n_u).
+
+    Notes
+    -----
+    With X = A T/2^s, ‖X‖ ≤ 1/2, and Y = φ₁(X) by Horner's rule, F = I + X Y and G = Y B T/2^s; then
+    s times F ← F², G ← F G + G. A sum rounds as often as it has terms that are not zero, n of them. X^j has
+    then been rounded less than j (n + 4) times, and G's X^j B (j + 1)(n + 4) times; over all j these make
+    n + 4 roundings of |X| e^|X| and of e^|X| |B|, and F one more where I is added. What the series leaves out
+    is less than 2^−64 of the largest, which counts where more states stand in a row than it has terms.
+    """
+    n_x, n_u = b.shape[-2:]
+    x = a * seconds
+    times, limit, last = _products(x)
+    norm = float(np.abs(x).sum(axis=-2).max(initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(norm / limit)))) if 0 < norm < np.inf else 0
+    scale = 2.0**-squarings
+    x, g = x * scale, b * (seconds * scale)
+    phi = _phi(lambda other: times(other) * scale, x, last)
+    absolute = _products(np.abs(x))[0]
+    large = _phi(absolute, np.abs(x), last)
+    step = np.concatenate([np.eye(n_x) + times(phi) * scale, phi @ g], axis=-1)
+    terms = max(np.count_nonzero(x, axis=-1).max(initial=0), np.count_nonzero(g, axis=-2).max(initial=0))
+    charge = float(terms + 6 + rounded)
+    grown, pushed = np.eye(n_x) + absolute(large), np.abs(g)
+    error = (charge * UNIT) * np.concatenate([absolute(grown), grown @ pushed], axis=-1)
+    error[..., :n_x] += UNIT * np.abs(step[..., :n_x])
+    if n_x > last:
+        error[..., :n_x] += LEFT_OUT
+        error[..., n_x:] += LEFT_OUT * pushed.sum(axis=-2, keepdims=True)
+    below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (*b.shape[:-2], n_u, n_x + n_u))
+    for _ in range(squarings):
+        whole, off = np.concatenate([step, below], axis=-2), np.concatenate([error, 0 * below], axis=-2)
+        size = np.abs(whole)
+        terms = int(np.count_nonzero(whole, axis=-1).max(initial=0))
+        error = (size[..., :n_x, :] + error) @ off + error @ size
+        error += (terms + 2) * UNIT * (size[..., :n_x, :] @ size)
+        step = step @ whole
+    # Composing a step rounds it as often as it is wide: one that is off by so much is no larger for it.
+    charge = max(charge, float(n_x + n_u))
+    return Step(step, np.maximum(np.abs(step), error / (charge * UNIT)), charge)
+
+
+def _phi(times: Callable[[Matrix], Matrix], x: Matrix, last: int) -> Matrix:
+    """Return φ₁(X) = I + X/2! + X²/3! + … up to a power, from X and what multiplies by it."""
+    unit = np.eye(x.shape[-1])
+    found = unit + x / (last + 1)
+    for term in range(last - 1, 0, -1):
+        found = unit + times(found) / (term + 1)
+    return np.asarray(found)
+
+
+def _products(x: Matrix) -> tuple[Callable[[Matrix], Matrix], float, int]:
+    """Return what multiplies by matrices (k, n, n), how large they may be for a series, and its last power.
+
+    Of a large one that is mostly zero products are short and squares are not.
+    """
+    if len(x) > 1 or x.shape[-1] <= FEW_TOGETHER or np.count_nonzero(x) > SPARSE * x.size:
+        return lambda other: x @ other, 0.5, TERMS
+    import scipy.sparse
+
+    sparse = scipy.sparse.csr_array(x[0])
+    return lambda other: np.asarray(sparse @ other[0])[None], 2.0, MORE_TERMS
+
+
 def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
     """Yield the states in sets between which A has no entry."""
     neighbours: list[set[int]] = [set() for _ in a]
-    for row, column in np.argwhere(a != 0).tolist():
+    for row, column in np.argwhere(a.astype(np.bool_)).tolist():
         neighbours[row].add(column)
         neighbours[column].add(row)
     left = dict.fromkeys(range(len(a)))
@@ -180,6 +330,14 @@ def _generator(a: NDArray[Any], b: NDArray[Any]) -> Any:
     rows = [[_rational(value) for value in row] for row in np.hstack([a, b])]
     rows += [[flint.fmpq(0)] * (n_x + n_u) for _ in range(n_u)]
     return flint.fmpq_mat(n_x + n_u, n_x + n_u, [value for row in rows for value in row])
+
+
+def _floats(matrix: NDArray[Any]) -> Floats:
+    """Return a matrix of which most is zero in floats."""
+    found = np.zeros(matrix.shape)
+    filled = matrix.astype(np.bool_)
+    found[filled] = [float(value) for value in matrix[filled]]
+    return found
 
 
 def _rational(value: Any) -> Any:

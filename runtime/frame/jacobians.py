@@ -82,7 +82,8 @@ class Edge:
 class SiteJacobians:
     """The Jacobians of a kind as one CasADi function of (x, u, m, r, p, t); m and r of all clocks in a row.
 
-    The function's one output is every matrix of a `LinearSite`, in order, column-major; `shapes` cuts it.
+    The function's one output is every matrix of a `LinearSite`, in order, column-major, less what is zero by
+    structure; `shapes` cuts it.
     `edges` are those of its receives by (clock partition, receive). `timed` says that some entry depends on
     time, if only on whether something has switched (see `switches.varying_slopes`).
     """
@@ -140,7 +141,8 @@ def jacobians(kind: Kind) -> SiteJacobians:
         blocks += [casadi.jacobian(sent, of) for of in (x, u)]
 
     m_all, r_all = casadi.vertcat(*memories), casadi.vertcat(*heard)
-    flat = casadi.vertcat(*(casadi.vec(casadi.densify(block)) for block in blocks))
+    # Of many states most entries are zero by structure: they are no operations and no outputs.
+    flat = casadi.vertcat(*(casadi.vec(block) for block in blocks))
     moving = casadi.vertcat(x, u, m_all, r_all, t)
     edges = {
         (p, place): _edge(kind, partition, receive)

@@ -24,16 +24,12 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.discretize import UNIT, Step, discretize
+from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
 from apc.frame.radius import FLOATS, RADII, Arithmetic, magnitude, radius_of, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
-
-# Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
-# short polynomials of the parameters, a few roundings an entry.
-COEFFICIENT_ROUNDINGS = 8
 
 # Packets that a peer sends or hears in a frame, each a row or column of the frame's map and of the loop's.
 MOST_PACKETS = 1000

@@ -64,8 +64,7 @@ def linearize_exact(
     assert site.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
     _finite_slopes(site, parameters, listening)
     arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
-    flat = np.array(evaluate_exact(site.function, arguments)[0], dtype=object)
-    exact = assemble(site.kind, site.affine, cut(flat, site.shapes), _channels_of(site))
+    exact = site_of_entries(site, evaluate_exact(site.function, arguments)[0], Fraction(0))
     if listening is None:
         return exact
     rest = iter(listening.own)
@@ -150,10 +149,12 @@ def sites_of_rows(site: SiteJacobians, rows: NDArray[np.float64]) -> LinearSite:
     return assemble(site.kind, site.affine, matrices, _channels_of(site))
 
 
-def site_of_entries(site: SiteJacobians, flat: Sequence[Any]) -> LinearSite:
-    """Return the site of a function's output over another kind of number (see `exact`)."""
-    entries = np.empty(len(flat), dtype=object)
-    entries[:] = list(flat)
+def site_of_entries(site: SiteJacobians, found: Sequence[Any], zero: Any) -> LinearSite:
+    """Return the site of a function's output over another kind of number (see `exact`), with its zero."""
+    sparsity = site.function.sparsity_out(0)
+    entries = np.empty(sparsity.numel(), dtype=object)
+    entries[:] = [zero]
+    entries[sparsity.row()] = found
     return assemble(site.kind, site.affine, cut(entries, site.shapes), _channels_of(site))
 
 

@@ -315,4 +315,4 @@ def _all_peers(population: Population, rows: Integers, prime: int) -> LinearSite
         return zero + Fraction(value)
 
     flat = evaluate_exact(built.function, [*arguments, columns, [zero]], number=number)[0]
-    return site_of_entries(built, flat)
+    return site_of_entries(built, flat, zero)

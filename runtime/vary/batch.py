@@ -31,10 +31,9 @@ from apc.frame.batch_lift import (
     HOPELESS,
     PERTURBED_FRAMES,
     SAFE,
-    exponential_rows,
     lift_rows,
 )
-from apc.frame.discretize import UNIT, Step
+from apc.frame.discretize import UNIT, Step, exponential_rows
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, compose, lift, roundings_of, with_roundings

@@ -149,7 +149,7 @@ def _bending(function: Any, value: Any, vector: Any) -> Any:
     """Return what of a function's coefficients is not linear in a value, as a function of it."""
     zeros = [casadi.SX.zeros(function.numel_in(place)) for place in range(6)]
     (flat,) = function.call([*zeros[:4], vector, zeros[5]])
-    flat = casadi.densify(flat)
+    flat = flat.nz[:]
     moved = [place for place, one in enumerate(casadi.which_depends(flat, value, 1, True)) if one]
     if not moved:
         return None

@@ -1,7 +1,7 @@
 """What moves the spectral radius most: its derivative with respect to every parameter.
 
 Takes: a `CompiledSystem`.
-Gives: `Sensitivity`, `Sensitivities`, `sensitivities`.
+Gives: `Sensitivity`, `Sensitivities`, `sensitivities`; `varied`.
 Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, with a bound on its
 error; each name can be set as it stands; where several eigenvalues share the radius, one row for each of them
 and no gradient that belongs to none.
@@ -47,6 +47,9 @@ SHARED = 1e-10
 
 # Eigenvalues nearer to one another than this are one cluster, whose vectors are hardly several.
 CLOSE = 1e-7
+
+# Entries of matrices that are differentiated at once: some hundred megabytes with all that is made of them.
+AT_ONCE = 500_000
 
 # A cluster of vectors worse conditioned than this has no derivative worth the name.
 WORST = 1e8
@@ -105,14 +108,14 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
         As `analysis.lifted_groups`.
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        free = _without_starts(system)
+        free = varied(system)
         family = evaluator(system, free, prepared=prepared or prepare(system))
         here = np.array([parameter_of(system, one).value for one in free])
         moved = _by_points(family, here) if isinstance(family, PointEvaluator) else _by_batch(family, here)
         return _differentiate(system, free, moved)
 
 
-def _without_starts(system: CompiledSystem) -> list[Free]:
+def varied(system: CompiledSystem) -> list[Free]:
     """Return the free parameters that are no start values, and no numbers of unreliable links."""
     starts = {state.start for kind in system.kinds for state in kind.states}
     starts |= {start for kind in system.kinds for one in kind.clocks for start in one.starts}
@@ -147,18 +150,27 @@ def _by_points(family: PointEvaluator, here: Floats) -> list[_Moved]:
 def _by_batch(family: BatchEvaluator, here: Floats) -> list[_Moved]:
     """Return what moves how in a scene whose matrices follow from its parameters."""
     count = len(here)
-    points = np.repeat(here[None], max(count, 1), axis=0)
     along = np.eye(count) if count else np.zeros((1, 0))
-    pairs, errors = family.slopes(points, along), matrix_errors(family, here[None])
-    slope_errors = slope_errors_of(family, points, along)
+    errors = matrix_errors(family, here[None])
     closed = family.closed_at(here.tolist())
+    # Of large systems few parameters at once: what is made on the way takes many times what is kept.
+    some = max(1, AT_ONCE // max(len(one.matrix) ** 2 for one in closed))
+    pairs, slope_errors = [], []
+    for first in range(0, len(along), some):
+        ways = along[first : first + some]
+        points = np.repeat(here[None], len(ways), axis=0)
+        pairs.append(family.slopes(points, ways))
+        slope_errors.append(slope_errors_of(family, points, ways))
     return [
         _Moved(
-            one.name, matrix[0], error[0], slopes[:count], off[:count], _rigid_here(wiring, one, matrix[0])
+            one.name,
+            pairs[0][place][0][0],
+            errors[place][0],
+            np.concatenate([listed[place][1] for listed in pairs])[:count],
+            np.concatenate([listed[place] for listed in slope_errors])[:count],
+            _rigid_here(wiring, one, pairs[0][place][0][0]),
         )
-        for (matrix, slopes), error, off, one, wiring in zip(
-            pairs, errors, slope_errors, closed, family.wirings, strict=True
-        )
+        for place, (one, wiring) in enumerate(zip(closed, family.wirings, strict=True))
     ]
 
 

@@ -48,7 +48,7 @@ def _own(name: str, *words: str) -> tuple[str, ...]:
 
 PARTS = (
     Part("readme", "Pictures and blocks of the README", _own("readme"), timed=False),
-    Part("process", "Whole processes", _own("process"), _own("process", "--runs", "3")),
+    Part("process", "Whole processes", _own("process"), _own("process", "--runs", "3", "--quick")),
     Part(
         "scenes",
         "The default on every scene",

@@ -1,4 +1,4 @@
-"""What a person waits for: whole processes, their memory and imports: `python -m tests.bench.process`.
+"""What a person waits for: whole processes, their memory, growth, imports: `python -m tests.bench.process`.
 
 A time is the median of a few runs, from the start of the process to its end, after one that compiles Python's
 own files; memory is the most it held. This program loads nothing large itself, as a process begins as a copy.
@@ -6,6 +6,7 @@ own files; memory is the most it held. This program loads nothing large itself, 
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import resource
@@ -15,12 +16,13 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from apc.benchmark.timing import spread_of, waited
+from tests.bench.growing import SCENES, equations, kinds, row
 from tests.bench.judge import Judge, parser_of
 
-SCENES = Path(__file__).resolve().parents[2] / "models" / "scenes"
 RUNS = 7
 SCENE = "three-users-average"
 TARGETS = {"compile": 1.2, "analyze": 0.5}  # seconds, on two cores
@@ -29,6 +31,13 @@ COMMANDS = (
     ("compile", ("-m", "apc", "compile", "--force", f"{SCENE}.yaml")),
     ("analyze", ("-m", "apc", "analyze", f"{SCENE}.apc")),
     ("simulate", ("-m", "apc", "simulate", "--duration", "1 s", f"{SCENE}.apc")),
+)
+# What grows, over two decades where the largest is analysed: how many of it, and the seconds of a processor
+# that `compile` and `analyze` of the largest may take beyond those of the smallest.
+GROWTH: tuple[tuple[str, Callable[[int, Path], str], tuple[int, ...], tuple[float, float]], ...] = (
+    ("equations", equations, (10, 30, 100, 300, 1000), (1.0, 3.0)),
+    ("masses in a row", row, (4, 12, 40, 120, 400), (2.0, 3.0)),
+    ("kinds", kinds, (1, 2, 4, 8, 16, 32), (0.1, 0.1)),
 )
 MOST_PACKAGES = 8  # listed
 LINE = re.compile(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)")
@@ -68,10 +77,51 @@ def _environment(folder: Path) -> dict[str, str]:
     return kept | {"PYTHONPYCACHEPREFIX": str(folder / "python")}
 
 
+def print_growth(
+    title: str,
+    write: Callable[[int, Path], str],
+    numbers: Sequence[int],
+    targets: tuple[float, float],
+    judge: Judge,
+    folder: Path,
+) -> None:
+    """Measure `compile` and `analyze` of ever larger scenes; judge the largest, and print the exponents.
+
+    An exponent is that of the time beyond the smallest scene's, over the last step.
+    """
+    print(f"\n{title:>16}  {'compile':>17}  {'analyze':>17}   radius")
+    rows = []
+    for number in numbers:
+        scene = folder / title.replace(" ", "-") / str(number)
+        scene.mkdir(parents=True)
+        (scene / "scene.yaml").write_text(write(number, scene), encoding="utf-8")
+        model = str(scene / "scene.apc")
+        commands = (("compile", "--force", str(scene / "scene.yaml")), ("analyze", model))
+        measured = [once(("-m", "apc", *words), folder)[1:] for words in commands]
+        told = subprocess.run(
+            [sys.executable, "-m", "apc", "analyze", model],
+            cwd=folder, env=_environment(folder), capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
+        radius = next(line.split("radius")[1] for line in told.splitlines() if "spectral radius" in line)
+        rows.append([seconds for seconds, _ in measured])
+        print(
+            f"{number:>16}  "
+            + "  ".join(f"{seconds:6.2f} s {size / 2**20:4.0f} MiB" for seconds, size in measured)
+            + f" {radius}"
+        )
+    for place, (command, target) in enumerate(zip(("compile", "analyze"), targets, strict=True)):
+        first, *_, before, last = (one[place] for one in rows)
+        grown = math.log(numbers[-1] / numbers[-2])
+        exponent = math.log(max(last - first, 0.01) / max(before - first, 0.01)) / grown
+        judged = judge.in_time(f"{command}, {title}", last - first, target)
+        print(f"{command}: exponent {exponent:.1f}; target {target:g} s beyond the first {judged}")
+
+
 def main() -> None:
     """Print the tables."""
     parser = parser_of("process", __doc__)
     parser.add_argument("--runs", type=int, default=RUNS)
+    parser.add_argument("--quick", action="store_true", help="leave out the largest of what grows")
     given = parser.parse_args()
     judge = Judge(given.strict)
     with tempfile.TemporaryDirectory() as name:
@@ -95,6 +145,9 @@ def main() -> None:
             found = imports(words, folder)
             listed = ", ".join(f"{one} {size / 1e3:.0f} ms" for one, size in found.most_common(MOST_PACKAGES))
             print(f"\nimports of {title}: {sum(found.values()) / 1e3:.0f} ms in all\n  {listed}")
+        for title, write, numbers, targets in GROWTH:
+            some = numbers[:-1] if given.quick else numbers
+            print_growth(title, write, some, targets, judge, folder)
     judge.end()
 
 
