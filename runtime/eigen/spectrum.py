@@ -339,8 +339,8 @@ def whole_vectors(
     shares = np.abs(vectors * covectors)
     total = shares.sum(axis=0)
     sizes = np.abs(vectors)
-    shares = np.where(total > 0, shares / total, sizes / sizes.sum(axis=0))
-    return vectors, shares
+    shares = np.where(total > 0, shares, sizes)
+    return vectors, shares / shares.sum(axis=0)
 
 
 def oscillation(magnitude: float, angle: float, frame_s: float) -> tuple[float, float]:
