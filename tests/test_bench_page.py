@@ -17,6 +17,7 @@ HELPERS = {  # not run by themselves
     "__main__",
     "naive_region",
     "drake",
+    "growing",
     "pathsim",
     "judge",
     "paper_scene",
