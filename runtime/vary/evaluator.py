@@ -247,7 +247,7 @@ def evaluator(
 
 
 def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> LoopEvaluator | None:
-    """Return the loops of a system without their packets, None where few of these are on their way.
+    """Return the loops of a system without their packets, None unless these are many, and most of the state.
 
     Parameters
     ----------
@@ -261,7 +261,7 @@ def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared)
         return None
     groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
     loops = arrange(groups, exchange).loops
-    if max(len(loop.packets) for loop in loops) <= MANY_PACKETS:
+    if not any(len(loop.packets) > max(MANY_PACKETS, loop.states / 2) for loop in loops):
         return None
     from apc.vary.loops import loop_evaluator  # most scenes have none, and need not load it
 
