@@ -147,6 +147,12 @@ class Member:
         """The number of peers."""
         return len(self.rows)
 
+    @property
+    def constants(self) -> Floats:
+        """The constants of each of the different sites (sites, rows)."""
+        pairs = zip(self.parameters, self.transitions, strict=True)
+        return np.array([self.program.constants(vector, own) for vector, own in pairs])
+
     def each(self, values: Floats) -> Floats:
         """Return one row a peer of what is one row a site."""
         return np.ascontiguousarray(values[self.rows])
