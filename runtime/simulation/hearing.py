@@ -455,4 +455,4 @@ def _first_packet(member: Member, link: str, channel: str) -> Floats:
     sent = next((one.channels for one in member.program.kind.sends if one.link == link), ())
     if channel not in sent:
         return np.zeros(member.count)
-    return member.each(np.array([one[link][sent.index(channel)] for one in member.sends]))
+    return member.each(member.sends[link][:, sent.index(channel)])

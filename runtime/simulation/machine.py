@@ -6,7 +6,7 @@ Guarantees: the numbers of `stepwise` to a few roundings of the sums, and the sa
 on what a peer does in a frame, not on how many peers there are or on their numbers.
 Does not: compile (see `native`), or play kernels that are not straight code, such as solvers.
 
-Why C, and not numba or LLVM: see tests/bench/README.md, under simulation.
+C, and not numba or LLVM: its compiler is of the machine, where these would be further packages to install.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ Integers = NDArray[np.int64]
 
 # More operations than this in one kernel: optimizing straight code costs more than linear time.
 MOST_OPERATIONS = 20_000
+MANY = 32  # peers of a member from which on their loop is put into lanes
 KINDS = ("total", "complete", "weighed", "deliver", "on ways", "copy", "copy ways", "look", "move", "work")
 OPERATORS = {"sum": 0, "mean": 0, "max": 1, "min": 2}
 DISTRIBUTIONS = {"uniform": 0, "normal": 1, "pareto": 2}
@@ -55,7 +56,7 @@ typedef int64_t whole;
 #elif defined(__GNUC__)
 #define LANES _Pragma("GCC ivdep")
 #define INSIDE static inline __attribute__((always_inline))
-#if defined(__x86_64__) && defined(__gnu_linux__)
+#if defined(MANY) && defined(__x86_64__) && defined(__gnu_linux__)
 #define CLONES __attribute__((target_clones("avx2", "default")))
 #else
 #define CLONES
@@ -185,8 +186,12 @@ INSIDE void inside{place}({PARAMETERS.format(own="const int own, ")}) {{
   }}
 }}
 CLONES static void kernel{place}({PARAMETERS.format(own="int own, ")}) {{
+#ifdef MANY
   if (own) inside{place}({given.format("1, ")});
   else inside{place}({given.format("0, ")});
+#else
+  inside{place}({given.format("own, ")});
+#endif
 }}
 """
 
@@ -263,7 +268,8 @@ def library_of(population: Population) -> Library | None:
     if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(_is_worth_it(one) for one in (*functions, *looks)):
         return None
     kernels = [Kernel(straight(one.kernel), len(own.recorded)) for one, own in segments.values()]
-    loaded = native(program_text(kernels, [straight(one) for one in looks]))
+    many = max(member.count for member in population.members) >= MANY
+    loaded = native(program_text(kernels, [straight(one) for one in looks]), many=many)
     if loaded is None:
         return None
     return Library(loaded, {key: place for place, key in enumerate(segments)})

@@ -22,21 +22,26 @@ from pathlib import Path
 from apc.compiler.seal import cache_folder, is_sealed, seal
 
 # Contracted products and sums would round differently from CasADi's virtual machine.
-OPTIONS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+OPTIONS = ("-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+# Loops over many peers are worth the threefold time that it takes to put them into lanes.
+MANY, FEW = ("-O3", "-DMANY"), ("-O2",)
 COMPILERS = ("cc", "gcc", "clang")
 PATIENCE = 120.0  # seconds; a frame's straight code takes a fraction of one
 
 
-def native(text: str) -> ctypes.CDLL | None:
+def native(text: str, *, many: bool = False) -> ctypes.CDLL | None:
     """Return a library, None if it can't be had.
 
     Parameters
     ----------
     text
         In C.
+    many
+        Whether its loops run often enough to be put into lanes; it sees the macro MANY then.
     """
     found = compiler()
-    library = _library(text, found) if found is not None else None
+    options = (*(MANY if many else FEW), *OPTIONS)
+    library = _library(text, found, options) if found is not None else None
     try:
         return None if library is None else ctypes.CDLL(str(library))
     except OSError:  # it can't be loaded: of another machine, or the folder forbids it
@@ -58,10 +63,10 @@ def compiler() -> tuple[str, str] | None:
     return None
 
 
-def _library(text: str, found: tuple[str, str]) -> Path | None:
+def _library(text: str, found: tuple[str, str], options: tuple[str, ...]) -> Path | None:
     """Return the library of a text, compiled now or before; None if it can't be had."""
     path, version = found
-    digest = hashlib.sha256("\0".join((text, path, version, *OPTIONS)).encode()).hexdigest()
+    digest = hashlib.sha256("\0".join((text, path, version, *options)).encode()).hexdigest()
     folder = cache_folder()
     if folder is None:
         return None
@@ -73,7 +78,7 @@ def _library(text: str, found: tuple[str, str]) -> Path | None:
             source, built, sealed = (Path(name) / part for part in ("frames.c", "frames.so", "seal"))
             source.write_text(text, encoding="utf-8")
             subprocess.run(
-                [path, *OPTIONS, str(source), "-o", str(built), "-lm"],
+                [path, *options, str(source), "-o", str(built), "-lm"],
                 capture_output=True,
                 timeout=PATIENCE,
                 check=True,

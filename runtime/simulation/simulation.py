@@ -37,7 +37,7 @@ from apc.simulation.population import (
     refuse_unheard_of,
 )
 from apc.simulation.program import Member, Program, build_member
-from apc.simulation.propagate import Transitions, perturbed, rates, transitions
+from apc.simulation.propagate import Transitions, exact_rates, perturbed, rates, transition_rows
 from apc.simulation.quadrature import Kernel, kernel_of
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import (
@@ -286,11 +286,13 @@ def _members(plan: _Plan, choices: Sequence[Choice], method: Method) -> list[Mem
     groups = zip(system.groups, plan.schedules, choices, strict=True)
     for group, (one, schedule, choice) in enumerate(groups):
         rows, vectors = numbers.rows[group], numbers.parameters[group]
+        moves: Transitions | None = None
         for peers, recorded in _recorded_and_not(choice):
             key = (one.kind, id(schedule), recorded)
             if key not in programs:
                 programs[key] = build_program(linear[one.kind], schedule, recorded, cuts, flows[one.kind])
-            moves = _transitions(programs[key], vectors, method)
+            if moves is None:
+                moves = _transitions(programs[key], vectors, method)
             numbered, site = plan.exchange.starts[group] + peers, plan.sites[one.kind]
             members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
     return members
@@ -397,20 +399,11 @@ def _check_step(
     check_step(system, method, fastest, max(lengths, default=fastest))
 
 
-def _transitions(program: Program, vectors: Floats, method: Method) -> list[Transitions]:
-    """Return what each different site of a group does over every interval; equal ones are one object."""
+def _transitions(program: Program, vectors: Floats, method: Method) -> Transitions:
+    """Return what the different sites of a group do over every interval."""
     seconds = [length * program.schedule.quantum for length in program.durations]
-    known: dict[bytes, Transitions] = {}
-    found = []
-    for vector in vectors:
-        # Sites that differ in nothing the continuous equations read share a transition.
-        key = np.asarray(program.rates.matrices(vector)).tobytes()
-        if key not in known:
-            known[key] = transitions(program.rates, vector, seconds)
-            if method.perturbed:
-                known[key] = perturbed(known[key], len(known))
-        found.append(known[key])
-    return found
+    found = transition_rows(program.rates, vectors, seconds)
+    return perturbed(found, 0) if method.perturbed else found
 
 
 def _forces(member: Member) -> tuple[SiteForcing, ...]:
@@ -419,10 +412,14 @@ def _forces(member: Member) -> tuple[SiteForcing, ...]:
     if not program.impulse_rows:
         return ()
     seconds = [length * program.schedule.quantum for length in program.durations]
-    forcing = forcing_of(program.rates)
-    kernels: dict[int, tuple[Kernel, ...]] = {}
-    for one in member.transitions:  # equal ones are one object
-        if id(one) not in kernels:
-            kernels[id(one)] = tuple(kernel_of(one.a, forcing.pushed, length) for length in seconds)
-    pairs = zip(member.parameters, member.transitions, strict=True)
-    return tuple(SiteForcing(forcing, vector, kernels[id(own)]) for vector, own in pairs)
+    forcing, n_x = forcing_of(program.rates), program.layout.states
+    kernels: dict[bytes, tuple[Kernel, ...]] = {}
+    found = []
+    for vector in member.parameters:
+        # Sites that differ in nothing the continuous equations read share a kernel.
+        key = np.asarray(program.rates.matrices(vector)).tobytes()
+        if key not in kernels:
+            a = exact_rates(program.rates, vector)[:, :n_x]
+            kernels[key] = tuple(kernel_of(a, forcing.pushed, length) for length in seconds)
+        found.append(SiteForcing(forcing, vector, kernels[key]))
+    return tuple(found)
