@@ -51,7 +51,7 @@ HOUSE = (
         lift batch_lift course residues
         """,
     ),
-    ("apc.network", "channel nominal timetable"),
+    ("apc.network", "philox channel nominal timetable"),
     (
         "apc.eigen",
         """
@@ -86,7 +86,7 @@ HOUSE = (
         "apc.simulation",
         """
         settings integrate propagate flow quadrature forcing
-        signals pairs program writing native selection frame_packets population
+        signals pairs program writing native hearing population machine stepwise
         simulation blocks accuracy summary trajectory ensemble
         """,
     ),

@@ -19,7 +19,7 @@ from apc.eigen.balls import precision
 from apc.frame.parameters import resolve
 from apc.simulation import forcing as forcings
 from apc.simulation.forcing import Forcing, SiteForcing, forcing_of, impulses
-from apc.simulation.propagate import rates, transitions
+from apc.simulation.propagate import exact_rates, rates
 from apc.simulation.quadrature import kernel_of
 from apc.simulation.trajectory import simulate
 from tests.fifty_digits.pushes import Push, impulse, push_of, switches
@@ -141,7 +141,7 @@ def test_an_impulse_is_that_of_ball_arithmetic(what: str, device: str, tmp_path:
     vector = resolve(system).parameters[0][0]
     linear = rates(kind)
     tick, count = Fraction(1, 1000), 20
-    a = transitions(linear, vector, [tick]).a
+    a = exact_rates(linear, vector)[:, : len(kind.states)]
     forcing = forcing_of(linear)
     site = SiteForcing(forcing, vector, (kernel_of(a, forcing.pushed, tick),))
     found = impulses(site, np.arange(count) / 1000, np.zeros(count, np.int64))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from apc.network.channel import PacketSource
+from apc.network.philox import words
 from tests.lossy import BURSTS, RELIABLE, delays, recorded
 
 
@@ -48,15 +49,13 @@ def test_both_states_lose_packets_with_their_own_probability() -> None:
 @pytest.mark.parametrize(("p", "r"), list(itertools.product([0.0, 0.3, 0.5, 1.0], repeat=2)))
 def test_states_follow_each_other_as_one_step_after_the_other_says(p: float, r: float) -> None:
     law = replace(RELIABLE, p=p, r=r)
-    source = PacketSource(law, "lan", [(0, 1)])
-    twin = PacketSource(law, "lan", [(0, 1)])
-    lost = np.isinf(source.take(500)[0])
-    bad, expected = bool(twin._bad[0]), []
-    for turn in twin._uniforms(500)[0, :, 0].tolist():
+    lost = np.isinf(PacketSource(law, "lan", [(0, 1)]).take(500)[0])
+    first, *turns = (words[0] for words in luck(0, 0, 0, 1, 501))
+    bad, expected = first < law.bad, []
+    for turn in turns:
         expected.append(bad)
         bad = turn < 1 - r if bad else turn < p
     assert lost.tolist() == expected
-    assert source._bad.tolist() == [bad]
 
 
 def test_the_first_packet_is_lost_as_often_as_any_other() -> None:
@@ -82,18 +81,42 @@ def test_nothing_arrives_before_it_was_sent() -> None:
     assert (found == 0).mean() == pytest.approx(0.4207, abs=0.02)  # the normal's share below −1/5
 
 
+def luck(seed: int, run: int, sender: int, receiver: int, blocks: int) -> list[list[float]]:
+    """Return the blocks of a way's stream over "lan", whose CRC-32 is 0x6860FDEF, in whole numbers.
+
+    Philox-4x64-10 as Salmon et al. (SC '11) write it: ten rounds of two products, the key going up between.
+    """
+    found = []
+    for block in range(1, blocks + 1):
+        r0, l0, r1, l1, k0, k1 = block, sender, receiver, 0, seed, 0x6860FDEF + (run << 32)
+        for _ in range(10):
+            one, two = 0xD2E7470EE14C6C93 * r0, 0xCA5A826395121157 * r1
+            r0, l0 = (two >> 64) ^ l0 ^ k0, two % 2**64
+            r1, l1 = (one >> 64) ^ l1 ^ k1, one % 2**64
+            k0, k1 = (k0 + 0x9E3779B97F4A7C15) % 2**64, (k1 + 0xBB67AE8584CAA73B) % 2**64
+        found.append([(word >> 11) / 2**53 for word in (r0, l0, r1, l1)])
+    return found
+
+
 def test_the_same_seed_gives_the_same_packets_for_ever() -> None:
-    """PCG64 seeded with entropy 7 and the key (CRC-32 of "lan", 3, 0, 1), worked out by hand."""
-    key = (0x6860FDEF, 3, 0, 1)
-    words = np.random.PCG64(np.random.SeedSequence(7, spawn_key=key)).random_raw(44)
-    uniforms = [word / 2**64 for word in words.tolist()]
-    found = delays(replace(RELIABLE, jitter=0.008, p=0.3, r=0.7), 10, seed=7, run=3)
-    bad = uniforms[0] < 0.3
-    for i in range(10):
-        turn, _, late, _ = uniforms[4 * (i + 1) : 4 * (i + 2)]
+    blocks = luck(7, 3, 4, 1, 11)
+    law = replace(RELIABLE, jitter=0.008, p=0.3, r=0.7)
+    found = PacketSource(law, "lan", [(4, 1)], seed=7, run=3).take(10)[0]
+    bad = blocks[0][0] < 0.3
+    for i, (turn, _, late, _) in enumerate(blocks[1:]):
         expected = math.inf if bad else 0.008 + 0.008 * (2 * late - 1)
         assert found[i] == pytest.approx(expected, rel=1e-12, abs=1e-15)
         bad = turn < 0.3
+
+
+def test_the_words_are_those_of_numpys_philox_in_any_order() -> None:
+    key, random = (7, 2**63 + 5), np.random.default_rng(1)
+    for sender, receiver in random.integers(0, 2**40, (5, 2)).tolist():
+        counter = np.array([0, sender, receiver, 0], np.uint64)
+        stream = np.random.Philox(key=np.array(key, np.uint64), counter=counter).random_raw(4 * 50)
+        order = random.permutation(50)
+        found = words(key, (order + 1, sender, receiver))
+        assert found.tolist() == stream.reshape(50, 4)[order].tolist()
 
 
 def test_ways_runs_seeds_and_links_are_independent() -> None:

@@ -12,7 +12,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.modes import dense
 from apc.simulation.population import exchanges_within
 from apc.simulation.settings import Settings
-from apc.simulation.simulation import Simulation, prepare
+from apc.simulation.simulation import prepare
 from tests.scheduled import schedules
 from tests.sites import MS, columned, grouped, linked, paper
 
@@ -25,22 +25,12 @@ def test_peers_meet_within_a_frame_only_where_something_is_heard_in_the_frame_it
 
 def _frames(system: CompiledSystem, count: int) -> np.ndarray:
     """Return the continuous states of all peers after each frame, peer by peer."""
-    simulation = prepare(system, Settings(Fraction(1), jit=False))
-    population, states = simulation.population, list(simulation.population.start)
+    player = prepare(system, Settings(Fraction(1), jit=False)).player()
     rows = []
     for number in range(count):
-        found = population.frame.call(
-            [*(one.T for one in states), *_nothing(simulation, len(states)), number]
-        )
-        states = [np.asarray(one).T for one in found[: len(states)]]
-        rows.append(np.concatenate([states[g][:, :4].ravel() for g in range(len(population.members))]))
+        player.play(number, 1, [None] * 2)
+        rows.append(np.concatenate([one[:4].T.ravel() for one in player.carries]))
     return np.array(rows)
-
-
-def _nothing(simulation: Simulation, first: int) -> list[np.ndarray]:
-    """Return the impulses of a frame without forces that change with time."""
-    frame = simulation.population.frame
-    return [np.zeros(frame.size_in(place)) for place in range(first, frame.n_in() - 1)]
 
 
 STARTS = [0.01, -0.02, 0.03, 0.0]

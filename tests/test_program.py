@@ -26,7 +26,7 @@ def test_at_time_0_nothing_is_computed_and_memories_hold_their_start_values() ->
     [schedule] = schedules(system)
     program = build_program(rates(system.kinds[0]), schedule, (), ())
     # x, the output as remembered, and what its hold puts out until the first tick.
-    assert program.start([2.5], [[7.0]]).tolist() == [2.5, 7.0, 0.0]
+    assert program.start([2.5], [[7.0]]).tolist() == [[2.5, 7.0, 0.0]]
 
 
 def test_a_sites_constants_are_its_parameters_and_what_each_duration_does() -> None:

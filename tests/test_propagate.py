@@ -11,8 +11,16 @@ import pytest
 
 from apc.compiler.compiled import Kind
 from apc.frame.parameters import resolve
-from apc.simulation.propagate import nonlinear_rows, perturbed, rates, transitions
-from tests.sites import NAMES, alone, paper
+from apc.simulation.propagate import (
+    CLOSE,
+    MOST_EXACT,
+    nonlinear_rows,
+    perturbed,
+    rates,
+    transition_rows,
+    transitions,
+)
+from tests.sites import NAMES, alone, columned, paper
 
 mpmath = pytest.importorskip("mpmath")
 PARAMETERS = resolve(paper()).parameters[0][0]
@@ -62,3 +70,16 @@ def test_perturbed_transitions_are_off_by_one_rounding_and_zeros_stay() -> None:
     assert abs(other[0, 0] - one[0, 0]) == np.spacing(one[0, 0])
     assert other[0, 1] == one[0, 1] == 0.0
     assert perturbed(exact, 1).matrices[0].tolist() == other.tolist()
+
+
+def test_many_different_sites_move_as_each_by_itself() -> None:
+    """Masses over nine decades: where a motion dies out at once, floats are not enough, and are not used."""
+    count = 3 * MOST_EXACT
+    system = columned(paper(peers=count), device__mass=np.geomspace(1e-6, 1e3, count))
+    linear, vectors = rates(system.kinds[0]), resolve(system).parameters[0]
+    lengths = [Fraction(1, 1000), Fraction(1, 3)]
+    found = transition_rows(linear, vectors, lengths)
+    for place in range(0, count, 7):
+        own = transitions(linear, vectors[place], lengths)
+        for many, one in zip(found.matrices, own.matrices, strict=True):
+            assert np.abs(many[place] - one).max() <= CLOSE * np.abs(one).max()

@@ -12,7 +12,7 @@ from apc.compiler.errors import ApcError
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
 from apc.network.channel import PacketSource, channel_law
-from apc.network.timetable import Listener, Timetable, routes_of
+from apc.network.timetable import Listener, Timetable, luck_of, routes_of
 from tests.sites import MS
 from tests.topologies import AVERAGE, compiled, replaced
 
@@ -28,7 +28,8 @@ def timetable(system: CompiledSystem, *, seed: int = 0, run: int = 0, quantum: F
     timings = resolve(system).timings
     exchange = build_exchange(system, timings)
     routes = routes_of(system, timings, exchange, 8 * MS)
-    return Timetable(system, timings, exchange, routes, quantum, seed=seed, run=run)
+    lucks = [luck_of(system, timings, exchange, route, quantum) for route in routes]
+    return Timetable(routes, lucks, seed=seed, run=run)
 
 
 def test_a_scene_of_reliable_links_has_no_timetable() -> None:
@@ -85,8 +86,8 @@ def test_clocks_and_graphs_and_delays_between_groups_are_kept() -> None:
     fast, slow = timetable(system).routes
     assert (fast.clock, fast.pairs.tolist(), fast.weights.tolist()) == (
         "haptic",
-        [[0, 1], [1, 0], [2, 0]],
-        [0.5, 1, 1],
+        [[1, 0], [2, 0], [0, 1]],
+        [1, 1, 0.5],
     )
     assert (slow.clock, slow.pairs.tolist()) == ("slow", [[0, 2]])
     assert (fast.longest, slow.longest) == (0.02, 0.02)
@@ -94,7 +95,7 @@ def test_clocks_and_graphs_and_delays_between_groups_are_kept() -> None:
     near, far = timetable(system).take(60)
     ticks = np.arange(60)
     assert near.packets[:, 0].tolist() == np.maximum((ticks - 8) // 8, -1).tolist()
-    assert near.packets[:, 2].tolist() == np.maximum((ticks - 20) // 8, -1).tolist()
+    assert near.packets[:, 1].tolist() == np.maximum((ticks - 20) // 8, -1).tolist()
     assert far.packets[:, 0].tolist() == np.maximum((ticks[1::2] - 8) // 8, -1).tolist()
 
 
@@ -109,8 +110,8 @@ def test_no_packet_arrives_later_than_the_longest_delay() -> None:
 
 
 def test_too_many_ways_are_refused() -> None:
-    with pytest.raises(ApcError, match=r"E892 lan is unreliable, and 1000 peers .* 999000 ways"):
-        timetable(system_of("loss: 1 %", ("count: 3", "count: 1000")))
+    with pytest.raises(ApcError, match=r"E892 lan is unreliable, and 2000 peers .* 3998000 ways"):
+        timetable(system_of("loss: 1 %", ("count: 3", "count: 2000")))
     assert (
         len(timetable(system_of("loss: 1 %, graph: ring", ("count: 3", "count: 500"))).routes[0].pairs)
         == 1000

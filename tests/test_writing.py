@@ -59,7 +59,7 @@ def test_a_frame_of_a_linear_site_is_its_lifted_map(values: dict[str, Any]) -> N
         for name, value in zip(group.lifted.z_names, random.standard_normal(99), strict=False)
     }
     x = [start[state.name] for state in program.kind.states]
-    carry = program.start(x, [[]])
+    carry = program.start(x, [[]])[0]
     first = layout.states + len(layout.outputs)
     for place, value in enumerate(layout.later):
         if value in schedule.carried:  # else it acts for no time at all
@@ -75,7 +75,7 @@ def test_cut_into_segments_a_frame_is_the_same() -> None:
     whole, constants = _program(comm=Fraction(0))
     cut, _ = _program((0,), comm=Fraction(0))
     assert (len(whole.segments), len(cut.segments)) == (1, 2)
-    carry = whole.start([0.01, 0.0, 0.02, 0.0], [[]])
+    carry = whole.start([0.01, 0.0, 0.02, 0.0], [[]])[0]
     heard = dict.fromkeys(range(len(whole.schedule.heard)), 0.5)
     one, other = (_played(program, constants, carry, heard) for program in (whole, cut))
     assert one.tolist() == other.tolist()
@@ -83,7 +83,7 @@ def test_cut_into_segments_a_frame_is_the_same() -> None:
 
 def test_a_row_is_recorded_at_every_mark_with_the_values_before_the_tick() -> None:
     program, constants = _program(comp=Fraction(0))
-    carry = program.start([0.01, 0.0, 0.0, 0.0], [[]])
+    carry = program.start([0.01, 0.0, 0.0, 0.0], [[]])[0]
     [segment] = program.segments
     rows = np.asarray(segment.kernel(carry, [0.0] * len(segment.heard), constants, [], 0.0)[2])
     table = rows.reshape(len(program.schedule.marks) - 1, len(program.recorded))

@@ -2,14 +2,16 @@
 
 Takes: a link's `Channel` and the scene's numbers; the two peers of each way, a seed.
 Gives: `ChannelLaw`, `channel_law`, `LATEST`; `deviates`, the jitter's distributions; `PacketSource`, the
-delays of packets.
+delays of packets; `luck_key`.
 Guarantees: one law for all ways of a link with one delay. Equal seeds give equal packets, in any order of the
 ways, whoever else is there, however time is cut into pieces, with every version of NumPy; every way from peer
 to peer is independent of the others.
 Does not: know what is in a packet, or which of them a tick sees (see `timetable`).
 
-Each packet of a way uses up `WORDS` random words, whatever the channel: the change of state after it, its
-loss, and two for its jitter. So runs of other probabilities meet the same luck: a packet that is lost at some
+The luck of packet k of a way is block k + 2 of the stream `numpy.random.Philox` with the key (seed, CRC-32 of
+the link's name + 2³² run) and the counter (0, sender, receiver, 0); its first block is that of the way's
+state at the start. A packet's four words are the change of state after it, its loss, and two for its jitter,
+whatever the channel. So runs of other probabilities meet the same luck: a packet that is lost at some
 probability of independent losses is lost at any larger one.
 
 A way starts in its stationary state: the first packet is as likely to be lost as any other (in netem, a way
@@ -20,20 +22,19 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.network.philox import words
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-
-WORDS = 4  # random words a packet
 
 # netem's Pareto table (iproute2, netem/pareto.c): shape 3, its mean 3/2 taken off, times 4/3, and no more
 # than 4, the largest number that the table can hold (32767/8192).
@@ -143,12 +144,15 @@ def deviates(distribution: str, one: Floats, two: Floats) -> Floats:
     return np.asarray(np.minimum(late, PARETO_MOST), dtype=np.float64)
 
 
+def luck_key(link: str, seed: int, run: int) -> tuple[int, int]:
+    """Return the key of a link's luck: its name, not its place, as another link changes nothing here."""
+    return seed, zlib.crc32(link.encode()) + (run << 32)
+
+
 class PacketSource:
     """The packets of some ways of one link, in the order they are sent; what is taken is gone."""
 
-    def __init__(
-        self, law: ChannelLaw, link: str, pairs: Sequence[tuple[int, int]], *, seed: int = 0, run: int = 0
-    ) -> None:
+    def __init__(self, law: ChannelLaw, link: str, pairs: ArrayLike, *, seed: int = 0, run: int = 0) -> None:
         """Start at the first packet.
 
         Parameters
@@ -158,21 +162,16 @@ class PacketSource:
         link
             The link's name.
         pairs
-            The peers (sender, receiver) of each of the M ways, by their numbers, from 0.
+            The peers (sender, receiver) of each of the M ways (M, 2), by their numbers, from 0.
         seed, run
             The experiment's seed, and which run of it this is; 0 or more.
         """
         self.law = law
-        self.ways = len(pairs)
         self.taken = 0  # packets of each way
-        # A name, not a place among the links: another link beside this one changes nothing here.
-        number = zlib.crc32(link.encode())
-        # A bit generator's words are the same in every version of NumPy (NEP 19), a distribution's are not.
-        self._bits = [
-            np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(number, run, sender, receiver)))
-            for sender, receiver in pairs
-        ]
-        self._bad: Flags = self._uniforms(1)[:, 0, 0] < law.bad
+        self._key = luck_key(link, seed, run)
+        self._pairs = np.asarray(pairs, np.int64).reshape(-1, 2, 1)
+        self.ways = len(self._pairs)
+        self._bad: Flags = self._uniforms(np.array([1]))[:, 0, 0] < law.bad
 
     def take(self, count: int) -> Floats:
         """Return the delays (M, count) in seconds of the next packets, infinite for those that get lost."""
@@ -181,20 +180,17 @@ class PacketSource:
         if law.trace is not None:
             recorded = law.trace[np.arange(first, first + count) % law.trace.size]
             return np.broadcast_to(recorded, (self.ways, count))
-        uniforms = self._uniforms(count)
+        uniforms = self._uniforms(np.arange(first, first + count) + 2)
         bad = self._states(uniforms[..., 0])
         lost = uniforms[..., 1] < np.where(bad, law.one_minus_h, law.one_minus_k)
         late = deviates(law.distribution, uniforms[..., 2], uniforms[..., 3]) if law.jitter else 0.0
         # Nothing arrives before it was sent: as in netem, a delay that would be negative is none.
         return np.where(lost, np.inf, np.maximum(law.delay + law.jitter * late, 0.0))
 
-    def _uniforms(self, count: int) -> Floats:
-        """Return numbers (M, count, WORDS) from 0 to less than 1, of 53 bits each."""
-        words = np.empty((self.ways, count * WORDS), np.uint64)
-        for row, bits in zip(words, self._bits, strict=True):
-            row[:] = bits.random_raw(count * WORDS)
-        uniforms = np.asarray((words >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
-        return uniforms.reshape(self.ways, count, WORDS)
+    def _uniforms(self, blocks: Integers) -> Floats:
+        """Return the numbers (M, blocks, BLOCK) of some blocks, from 0 to less than 1, of 53 bits each."""
+        found = words(self._key, (blocks, self._pairs[:, 0], self._pairs[:, 1]))
+        return np.asarray((found >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
 
     def _states(self, uniforms: Floats) -> Flags:
         """Return whether each way is bad at each packet (M, count).

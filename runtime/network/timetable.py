@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem` with its numbers, who hears whom, the frame and the quantum of its schedules, a
 seed.
-Gives: `Route`, `routes_of`; `Timetable`, `Listener`, `Seen`, `START`.
+Gives: `Route`, `routes_of`; `Luck`, `luck_of`; `Timetable`, `Listener`, `Seen`, `START`.
 Guarantees: without loss and jitter a tick sees the packet that `scheduling` says; a way is heard alike by all
 clocks of a receiver; it does not matter how time is cut into pieces; what is remembered does not grow with
 time.
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem, Kind, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange
-from apc.network.channel import PacketSource, channel_law
+from apc.network.channel import ChannelLaw, PacketSource, channel_law
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-# Ways from peer to peer: each has a random stream of its own, 2 KiB, and takes 0.1 ms a second at 1 kHz.
-MOST_WAYS = 100_000
+# Ways from peer to peer: of each some packets are on their way, and 200 bytes are kept.
+MOST_WAYS = 2_000_000
 
 START = -1  # the "packet" before the first: the sender's start values
 
@@ -44,10 +44,10 @@ LONGEST = 2**40
 class Route:
     """What is heard over one unreliable link at the ticks of one clock.
 
-    `pairs` (M, 2) are the peers (sender, receiver), counted from 0, `weights` (M,) the graph's; `longest` is
-    the link's longest time in seconds from a packet's sample to its arrival. A frame has so many `ticks` of
-    the clock and `slots` of the link's; packets are kept for so many `frames`. `zero` says that the
-    receiver's own value stands in for a missing one.
+    `pairs` (M, 2) are the peers (sender, receiver), counted from 0, receiver by receiver, `weights` (M,) the
+    graph's; `longest` is the link's longest time in seconds from a packet's sample to its arrival. A frame
+    has so many `ticks` of the clock and `slots` of the link's; packets are kept for so many `frames`. `zero`
+    says that the receiver's own value stands in for a missing one.
     """
 
     link: str
@@ -73,6 +73,82 @@ class Seen:
 
     packets: Integers
     missing: Flags
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Luck:
+    """What chance does on the ways of a route, in numbers; times in quanta of `quantum` seconds.
+
+    `law` is that of all ways but for their `delays` (M,), in seconds; `nominal` (M,) are the same in quanta.
+    Packet k is sent at phase + k*period, tick k is at tick_phase + k*tick_period. `newest` as in `Listener`.
+    """
+
+    law: ChannelLaw
+    delays: Floats
+    nominal: Integers
+    phase: int
+    period: int
+    tick_phase: int
+    tick_period: int
+    quantum: Fraction
+    newest: bool
+
+    def kept(self, route: Route) -> int:
+        """Return how many packets of a way may be sent before the first of them is heard, or missed."""
+        return route.slots * (self._latest(route) // (route.ticks * self.tick_period) + 3)
+
+    def buckets(self, route: Route) -> int:
+        """Return how many ticks may be before the first to see a packet, from the frame on that sends it."""
+        return self._latest(route) // self.tick_period + 2 * route.ticks + 2
+
+    def _latest(self, route: Route) -> int:
+        longest = max(route.longest, float(self.delays.max(initial=0.0)))
+        return math.ceil(min(longest / float(self.quantum), LONGEST)) + 1
+
+
+def luck_of(
+    system: CompiledSystem,
+    timings: Mapping[str, Fraction],
+    exchange: Exchange,
+    route: Route,
+    quantum: Fraction,
+) -> Luck:
+    """Return what chance does on the ways of a route.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to use (see `overrides.apply`).
+    timings
+        Seconds by the name of the timing.
+    exchange
+        Who hears whom.
+    route
+        The route.
+    quantum
+        The time in seconds of which every period, phase and delay in use is a whole multiple.
+
+    Raises
+    ------
+    ApcError
+        E891 a group sets a number of the link for itself.
+    """
+    link = exchange.links[route.link]
+    assert link.channel is not None
+    grids = {one.name: (timings[one.phase] / quantum, timings[one.period] / quantum) for one in system.clocks}
+    groups, of_way = _groups(exchange, route.pairs)
+    late = [timings[exchange.delay(link.name, *pair)] for pair in groups]
+    return Luck(
+        law=channel_law(system, link, timings[link.delay]),
+        delays=np.array([float(one) for one in late])[of_way],
+        nominal=np.array([int(one / quantum) for one in late], np.int64)[of_way],
+        phase=int(grids[link.clock][0]),
+        period=int(grids[link.clock][1]),
+        tick_phase=int(grids[route.clock][0]),
+        tick_period=int(grids[route.clock][1]),
+        quantum=quantum,
+        newest=link.channel.reorder == "newest",
+    )
 
 
 class Listener:
@@ -169,49 +245,26 @@ class Timetable:
     """The packets of all unreliable links of a scene, from time 0 on; time only goes forward."""
 
     def __init__(
-        self,
-        system: CompiledSystem,
-        timings: Mapping[str, Fraction],
-        exchange: Exchange,
-        routes: Sequence[Route],
-        quantum: Fraction,
-        *,
-        seed: int = 0,
-        run: int = 0,
+        self, routes: Sequence[Route], lucks: Sequence[Luck], *, seed: int = 0, run: int = 0
     ) -> None:
         """Start at time 0.
 
         Parameters
         ----------
-        system
-            The compiled scene, with the numbers to use (see `overrides.apply`).
-        timings
-            Seconds by the name of the timing.
-        exchange, routes
-            Who hears whom, and over which unreliable links (see `routes_of`).
-        quantum
-            The time in seconds of which every period, phase and delay in use is a whole multiple.
+        routes, lucks
+            The unreliable links (see `routes_of`), and what chance does on each (see `luck_of`).
         seed, run
             The experiment's seed, and which run of it this is.
         """
-        self._system, self._timings, self._exchange = system, timings, exchange
-        self._quantum, self._seed, self._run = quantum, seed, run
-        self._grids = {
-            clock.name: (
-                int(timings[clock.phase] / quantum),
-                int(timings[clock.period] / quantum),
-            )
-            for clock in system.clocks
-        }
-        self.routes = tuple(routes)
-        self._listeners = [self._listen(route) for route in self.routes]
+        self.routes, self._lucks = tuple(routes), tuple(lucks)
+        self._listeners = [_listen(route, luck, seed, run) for route, luck in zip(routes, lucks, strict=True)]
         self._now = 0
 
     def take(self, until: int) -> tuple[Seen, ...]:
         """Return what each route's ticks see, from where the last call ended to before `until`, in quanta."""
         seen = []
-        for route, listeners in zip(self.routes, self._listeners, strict=True):
-            phase, period = self._grids[route.clock]
+        for route, luck, listeners in zip(self.routes, self._lucks, self._listeners, strict=True):
+            phase, period = luck.tick_phase, luck.tick_period
             first = -(-(self._now - phase) // period)
             ticks = phase + period * np.arange(max(first, 0), -(-(until - phase) // period), dtype=np.int64)
             packets = np.empty((len(ticks), len(route.pairs)), np.int64)
@@ -223,35 +276,23 @@ class Timetable:
         self._now = until
         return tuple(seen)
 
-    def _listen(self, route: Route) -> list[tuple[Integers, Listener]]:
-        """Return a listener for the ways of each delay of a route, with their places in it."""
-        link = self._exchange.links[route.link]
-        assert link.channel is not None
-        phase, period = self._grids[link.clock]
-        ways_of: dict[Fraction, list[int]] = {}
-        for way, pair in enumerate(_groups(self._exchange, route.pairs)):
-            delay = self._timings[self._exchange.delay(link.name, *pair)]
-            ways_of.setdefault(delay, []).append(way)
-        return [
-            (
-                np.array(ways),
-                Listener(
-                    PacketSource(
-                        channel_law(self._system, link, delay),
-                        link.name,
-                        route.pairs[ways].tolist(),
-                        seed=self._seed,
-                        run=self._run,
-                    ),
-                    phase=phase,
-                    period=period,
-                    delay=int(delay / self._quantum),
-                    quantum=self._quantum,
-                    newest=link.channel.reorder == "newest",
-                ),
-            )
-            for delay, ways in ways_of.items()
-        ]
+
+def _listen(route: Route, luck: Luck, seed: int, run: int) -> list[tuple[Integers, Listener]]:
+    """Return a listener for the ways of each delay of a route, with their places in it."""
+    found = []
+    for nominal in np.unique(luck.nominal).tolist():
+        ways = np.flatnonzero(luck.nominal == nominal)
+        law = replace(luck.law, delay=float(luck.delays[ways[0]]))
+        listener = Listener(
+            PacketSource(law, route.link, route.pairs[ways], seed=seed, run=run),
+            phase=luck.phase,
+            period=luck.period,
+            delay=nominal,
+            quantum=luck.quantum,
+            newest=luck.newest,
+        )
+        found.append((ways, listener))
+    return found
 
 
 def routes_of(
@@ -262,7 +303,7 @@ def routes_of(
     Parameters
     ----------
     system, timings, exchange
-        As `Timetable` has them.
+        As `luck_of` has them.
     frame_s
         The length of a frame in seconds.
 
@@ -294,6 +335,8 @@ def _routes_over(
         raise ApcError(Mistake("E892", Place(system.name), what, hint="graph: ring"))
     kind_of = np.repeat([group.kind for group in system.groups], np.diff(exchange.starts))
     pairs, weights = exchange.arcs(link.name)
+    order = np.lexsort((pairs[:, 0], pairs[:, 1]))  # receiver by receiver: what each hears stands together
+    pairs, weights = pairs[order], weights[order]
     sends = np.array([any(one.link == link.name for one in kind.sends) for kind in system.kinds])
     used = {}
     for clock in system.clocks:
@@ -301,7 +344,7 @@ def _routes_over(
         ways = sends[kind_of[pairs[:, 0]]] & hears[kind_of[pairs[:, 1]]]
         if ways.any():
             used[clock.name] = pairs[ways], weights[ways]
-    groups = {pair for some, _ in used.values() for pair in _groups(exchange, some)}
+    groups = {pair for some, _ in used.values() for pair in _groups(exchange, some)[0]}
     delays = {timings[exchange.delay(link.name, *pair)] for pair in groups}
     longest = max((channel_law(system, link, delay).longest for delay in delays), default=0.0)
     periods = {one.name: timings[one.period] for one in system.clocks}
@@ -327,10 +370,12 @@ def _hears(kind: Kind, link: str, clock: str) -> bool:
     return any(receive.link == link for partition in ticking for receive in partition.receives)
 
 
-def _groups(exchange: Exchange, pairs: Integers) -> list[tuple[int, int]]:
-    """Return the groups of each pair of peers."""
+def _groups(exchange: Exchange, pairs: Integers) -> tuple[list[tuple[int, int]], Integers]:
+    """Return the different pairs of groups of pairs of peers, and which of them each pair (M,) is."""
     groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
-    return [(int(sender), int(receiver)) for sender, receiver in groups]
+    count = len(exchange.groups)
+    found, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
+    return [divmod(one, count) for one in found.tolist()], of_pair
 
 
 def _highest(ticks: Integers, ways: Integers, when: Integers, ranks: Integers, first: Integers) -> Integers:

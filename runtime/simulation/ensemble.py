@@ -18,6 +18,7 @@ from fractions import Fraction
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -32,14 +33,19 @@ from apc.processes import (
     this_process,
 )
 from apc.result import Result
-from apc.simulation.blocks import blocks
+from apc.simulation.blocks import blocks, instants_of, pushes
+from apc.simulation.population import Player
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
-from apc.simulation.summary import Watch
+from apc.simulation.summary import Watch, is_position
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 QUANTILES = (0.05, 0.5, 0.95)
 SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
-PART = 20  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
+PART = 100  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
+TOGETHER = 2**19  # numbers of the rows of runs that are looked at side by side
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +176,14 @@ def _workers(
 
 
 def _runs(simulation: Simulation, part: range) -> list[Run]:
-    return [_played(simulation, number) for number in part]
+    """Play some runs, as many side by side as their rows stay in the caches."""
+    player, last = simulation.player(), int(simulation.settings.duration / simulation.quantum)
+    if last // simulation.frame >= simulation.length:  # of a long run the rows pass, and are gone
+        return [_alone(simulation, player, number) for number in part]
+    numbers = simulation.length * len(simulation.marks) * max(simulation.population.width, 1)
+    side = max(1, TOGETHER // numbers)
+    parts = (part[first : first + side] for first in range(0, len(part), side))
+    return [run for some in parts for run in _together(simulation, player, some, last)]
 
 
 def _part(shared: tuple[bytes, Settings], part: range) -> list[Run]:
@@ -182,18 +195,52 @@ def _opened(model: bytes, settings: Settings) -> Simulation:
     return prepare(model_of_bytes(model), settings)
 
 
-def _played(simulation: Simulation, number: int) -> Run:
-    watch = Watch(simulation)
-    for block in blocks(simulation, run=number):
-        watch.take(block)
-    found = watch.summary()
-    force = found.largest_force
-    positions = {state.name for kind in simulation.system.kinds for state in kind.states if state.unit == "m"}
-    apart = [distance for name, distance in found.copies if name in positions]
-    return Run(
-        number,
-        found.verdict,
-        found.settled,
-        None if force is None else force[1],
-        max(apart) if apart else None,
-    )
+def _together(simulation: Simulation, player: Player, runs: range, last: int) -> list[Run]:
+    """Play runs whose frames are one call of a player each; what leaves the range of floats goes alone."""
+    signals = [simulation.signals[i] for i in np.argsort(simulation.order)]
+    instants, kept = instants_of(simulation, 0, last)
+    time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
+    some: slice | Flags = slice(len(time)) if kept[: len(time)].all() else kept
+    places = [i for i, one in enumerate(signals) if is_position(one)]
+    forces = [i for i, one in enumerate(signals) if one.unit == "N"]
+    positions = np.empty((len(time), len(runs), len(places)))
+    largest, most = np.zeros((2, len(runs)))
+    push, whole = pushes(simulation, 0), np.ones(len(runs), np.bool_)
+    for place, number in enumerate(runs):
+        player.begin(number)
+        played = player.play(0, simulation.length, push)
+        rows = played.rows[some]
+        whole[place] = played.frames == simulation.length
+        positions[:, place] = rows[:, places]
+        size = np.abs(rows)
+        most[place] = size.max(initial=0.0)
+        largest[place] = size[:, forces].max(initial=0.0)
+    watch = Watch(simulation, [signals[i] for i in places], len(runs))
+    with np.errstate(all="ignore"):  # of what has diverged
+        watch.take(time, positions.reshape(len(time), -1))
+        found = _amounts(watch, runs, largest if forces else None)
+    whole &= np.isfinite(most)
+    for place in np.flatnonzero(~whole).tolist():
+        found[place] = _alone(simulation, player, runs[place])
+    return found
+
+
+def _alone(simulation: Simulation, player: Player, number: int) -> Run:
+    """Play one run block by block."""
+    watch, block = Watch(simulation), None
+    for block in blocks(simulation, run=number, player=player):
+        watch.take(block.time, block.values)
+    largest = watch.peak[watch.forces].max(keepdims=True) if watch.forces else None
+    with np.errstate(all="ignore"):
+        return _amounts(watch, range(number, number + 1), largest, stopped=bool(block and block.stopped))[0]
+
+
+def _amounts(watch: Watch, runs: range, forces: Floats | None, *, stopped: bool = False) -> list[Run]:
+    """Return what runs side by side amount to; `forces` (runs,) are the largest of each."""
+    judged = watch.judged(stopped=stopped)
+    apart = [distance for _, unit, distance in watch.copies() if unit == "m"]
+    none = [None] * len(runs)
+    settled = [None if math.isnan(one) else one for one in judged.settled_at.tolist()]
+    largest = none if forces is None else forces.tolist()
+    copies = np.max(apart, axis=0).tolist() if apart else none
+    return [Run(*one) for one in zip(runs, judged.verdict.tolist(), settled, largest, copies, strict=True)]

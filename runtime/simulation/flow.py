@@ -44,6 +44,7 @@ Rate = Callable[[Any, Any], Any]  # (x, t) -> dx/dt
 
 # Where the scene has no number in a state's unit: a thousandth of it, as the millimetres of a hand's work.
 UNKNOWN = 1e-3
+MOST_UNROLLED = 64  # steps between two events that are written out, and so can be machine code
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,9 @@ class Flow:
     def over(self, duration: Fraction) -> Any:
         """Return the function (x, u, p, t) -> x after `duration` seconds, of these states."""
         if self.method.step is not None:
-            return stepped(self.rate, self.method, duration, integrals(self.rate))
+            move = stepped(self.rate, self.method, duration, integrals(self.rate))
+            short = self.rate.is_a("SXFunction") and duration <= MOST_UNROLLED * self.method.step
+            return move.expand() if short else move
         assert self.method.tolerance is not None
         return integrated(self.rate, self.scale, self.method.tolerance, duration)
 

@@ -1,60 +1,51 @@
-"""CasADi functions in machine code, by the C compiler of the machine, where it has one.
+"""A C text as a loaded library, by the C compiler of the machine, where it has one.
 
-Takes: CasADi functions. Gives: `native`, `compiler`.
-Guarantees: the same roundings as CasADi's virtual machine (no contraction, no reordering); what was compiled
-once is found again by a digest of its C text, the compiler and its options; a library is written whole or not
-at all, into a folder of the user's own, and is loaded only as it was written (see `seal`): a damaged one is
-compiled again. Without a compiler or such a folder, or where it fails, the functions as they were.
-Does not: decide what is worth compiling.
+Takes: the text of a library. Gives: `native`, `compiler`.
+Guarantees: the roundings of the operations as they are written (no contraction, no reordering); what was
+compiled once is found again by a digest of its text, the compiler and its options; a library is written whole
+or not at all, into a folder of the user's own, and is loaded only as it was written (see `seal`): a damaged
+one is compiled again. None without a compiler or such a folder, or where it fails.
+Does not: write the text (see `machine`).
 """
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import hashlib
 import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import casadi
 
 from apc.compiler.seal import cache_folder, is_sealed, seal
 
-# Contracted products and sums would round differently from the virtual machine.
-OPTIONS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+# Contracted products and sums would round differently from CasADi's virtual machine.
+OPTIONS = ("-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+# Loops over many peers are worth the threefold time that it takes to put them into lanes.
+MANY, FEW = ("-O3", "-DMANY"), ("-O2",)
 COMPILERS = ("cc", "gcc", "clang")
 PATIENCE = 120.0  # seconds; a frame's straight code takes a fraction of one
-# Kinds of functions that are written as C whole; solvers are calls into libraries.
-STRAIGHT = ("SXFunction", "MXFunction", "Map", "MapSum")
-# More instructions than this in one function: optimizing straight code costs more than linear time.
-MOST_INSTRUCTIONS = 100_000
 
 
-def native(functions: Sequence[Any]) -> tuple[Any, ...]:
-    """Return the functions in machine code, each as it is if that can't be had.
+def native(text: str, *, many: bool = False) -> ctypes.CDLL | None:
+    """Return a library, None if it can't be had.
 
     Parameters
     ----------
-    functions
-        CasADi functions, of any names.
+    text
+        In C.
+    many
+        Whether its loops run often enough to be put into lanes; it sees the macro MANY then.
     """
     found = compiler()
-    # One library holds all that can be compiled, each under a name of its own.
-    named = {
-        place: _renamed(one, f"kernel{place}") for place, one in enumerate(functions) if _is_worth_it(one)
-    }
-    library = _library(list(named.values()), found) if found is not None and named else None
-    if library is None:
-        return tuple(functions)
+    options = (*(MANY if many else FEW), *OPTIONS)
+    library = _library(text, found, options) if found is not None else None
     try:
-        ready = {place: casadi.external(one.name(), str(library)) for place, one in named.items()}
-    except RuntimeError:  # it can't be loaded: of another machine, or the folder forbids it
-        return tuple(functions)
-    return tuple(ready.get(place, one) for place, one in enumerate(functions))
+        return None if library is None else ctypes.CDLL(str(library))
+    except OSError:  # it can't be loaded: of another machine, or the folder forbids it
+        return None
 
 
 @functools.cache
@@ -72,28 +63,10 @@ def compiler() -> tuple[str, str] | None:
     return None
 
 
-def _is_worth_it(function: Any) -> bool:
-    """Say whether a function, with all that it calls, is straight code that is not too long."""
-    called = [function, *function.find_functions(-1)]
-    if not all(one.class_name() in STRAIGHT for one in called):
-        return False
-    own = [one for one in called if not one.class_name().startswith("Map")]
-    return bool(sum(one.n_instructions() for one in own) <= MOST_INSTRUCTIONS)
-
-
-def _renamed(function: Any, name: str) -> Any:
-    arguments = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
-    return casadi.Function(name, arguments, function.call(arguments), function.name_in(), function.name_out())
-
-
-def _library(functions: Sequence[Any], found: tuple[str, str]) -> Path | None:
-    """Return the library of some functions, compiled now or before; None if it can't be had."""
+def _library(text: str, found: tuple[str, str], options: tuple[str, ...]) -> Path | None:
+    """Return the library of a text, compiled now or before; None if it can't be had."""
     path, version = found
-    generator = casadi.CodeGenerator("kernels.c")
-    for function in functions:
-        generator.add(function)
-    text = generator.dump()
-    digest = hashlib.sha256("\0".join((text, path, version, *OPTIONS)).encode()).hexdigest()
+    digest = hashlib.sha256("\0".join((text, path, version, *options)).encode()).hexdigest()
     folder = cache_folder()
     if folder is None:
         return None
@@ -102,10 +75,10 @@ def _library(functions: Sequence[Any], found: tuple[str, str]) -> Path | None:
         if _is_ours(library, mark):
             return library
         with tempfile.TemporaryDirectory(dir=folder) as name:
-            source, built, sealed = (Path(name) / part for part in ("kernels.c", "kernels.so", "seal"))
+            source, built, sealed = (Path(name) / part for part in ("frames.c", "frames.so", "seal"))
             source.write_text(text, encoding="utf-8")
             subprocess.run(
-                [path, *OPTIONS, str(source), "-o", str(built), "-lm"],
+                [path, *options, str(source), "-o", str(built), "-lm"],
                 capture_output=True,
                 timeout=PATIENCE,
                 check=True,
@@ -113,7 +86,7 @@ def _library(functions: Sequence[Any], found: tuple[str, str]) -> Path | None:
             sealed.write_text(seal(_sealed(library, built)), encoding="ascii")
             built.replace(library)
             sealed.replace(mark)
-    except (OSError, RuntimeError, subprocess.SubprocessError):
+    except (OSError, subprocess.SubprocessError):
         return None
     return library
 

@@ -1,32 +1,24 @@
-"""What peers make of those they hear: their weights, and reductions that look at each pair of peers.
+"""What peers make of those they hear, where they look at each pair of peers.
 
 Takes: a kind's receives over an edge function, or of a maximum or minimum; who hears whom.
-Gives: `Arcs`; `pair_function`, `Pairwise`, `reduction`; `count_pairs`.
-Guarantees: one evaluation a pair of peers that hear each other, by one function for all of them.
-Does not: say when anything is sent or heard (see `scheduling`), or keep packets (see `frame_packets`).
+Gives: `pair_function`, `Pairwise`; `count_pairs`.
+Guarantees: one function for all pairs.
+Does not: say when anything is sent or heard (see `scheduling`), or who hears whom (see `hearing`).
 
     r_i = op_j e(x_i, u_i, m_i, s_ij, p_i, t)
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
-import numpy as np
-from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.weights import sum_weights
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import edge_name
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
-JOINS = {"max": casadi.fmax, "min": casadi.fmin}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,32 +34,6 @@ class Pairwise:
     constants: tuple[int, ...]
     heard: tuple[int, ...]
     now: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Arcs:
-    """Who of a member's peers hears whom, arc by arc (M,): `receivers` are places among those peers.
-
-    `senders` are places in what is heard, which is `width` packets wide.
-    """
-
-    senders: Integers
-    receivers: Integers
-    weights: Floats
-    width: int
-
-    def chosen(self, which: NDArray[np.bool_]) -> Arcs:
-        """Return some of the arcs."""
-        return Arcs(self.senders[which], self.receivers[which], self.weights[which], self.width)
-
-    def averaging(self, count: int) -> Arcs:
-        """Return the same arcs with the weights of a mean: those of each of `count` peers add up to 1."""
-        totals = sum_weights(self.receivers, self.weights, count).floats
-        return replace(self, weights=self.weights / totals[self.receivers])
-
-    def matrix(self, count: int) -> Any:
-        """Return the weights as a casadi.DM (width, count): a product costs a multiplication an arc."""
-        return _sparse(self.weights, self.senders, self.receivers, (self.width, count))
 
 
 def pair_function(kind: Kind, partition: int, receive: int) -> tuple[Any, tuple[int, ...]]:
@@ -122,58 +88,3 @@ def count_pairs(system: CompiledSystem, exchange: Exchange) -> int:
     }
     n = exchange.peers
     return sum(n * (n - 1) if exchange.is_complete(one) else len(exchange.arcs(one)[0]) for one in links)
-
-
-def reduction(pair: Any, operator: str, arcs: Arcs, count: int) -> Any:
-    """Return the function (own, s of all that is heard, missing, t) -> what each of `count` peers hears.
-
-    Parameters
-    ----------
-    pair
-        A `pair_function`, in the form in which it runs.
-    operator
-        "sum", "mean", "max" or "min".
-    arcs
-        Who hears whom; of a mean as `Arcs.averaging` gives them.
-    count
-        How many peers the member has.
-    """
-    own = casadi.MX.sym("own", pair.size1_in(0), count)
-    sent = casadi.MX.sym("s", pair.size1_in(1), arcs.width)
-    missing, t = casadi.MX.sym("missing", 1, arcs.width), casadi.MX.sym("t")
-    senders, receivers = arcs.senders.tolist(), arcs.receivers
-    if not senders:
-        result = casadi.MX.zeros(1, count)
-    else:
-        every = pair.map(len(senders))
-        values = every(own[:, receivers.tolist()], sent[:, senders], missing[:, senders], t)
-        if operator in JOINS:
-            result = _joined(values, receivers, JOINS[operator])
-        else:
-            places, shape = np.arange(len(receivers)), (len(receivers), count)
-            result = casadi.densify(values @ _sparse(arcs.weights, places, receivers, shape))
-    return casadi.Function("look", [own, sent, missing, t], [result])
-
-
-def _joined(values: Any, receivers: Integers, join: Callable[[Any, Any], Any]) -> Any:
-    """Return the maximum or minimum of each receiver's values, two at a time: log₂ steps."""
-    order = np.argsort(receivers, kind="stable")
-    values, receivers = values[:, order.tolist()], receivers[order]
-    while len(receivers) > len(np.unique(receivers)):
-        first = np.searchsorted(receivers, receivers)  # where each one's receiver begins
-        even = np.flatnonzero((np.arange(len(receivers)) - first) % 2 == 0)
-        after = np.minimum(even + 1, len(receivers) - 1)
-        # The last of an odd number is joined with itself.
-        odd = np.where(receivers[after] == receivers[even], after, even)
-        values = join(values[:, even.tolist()], values[:, odd.tolist()])
-        receivers = receivers[even]
-    return values
-
-
-def _sparse(weights: Floats, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:
-    """Return the casadi.DM of this shape with each weight (k,) at its row and its column."""
-    import scipy.sparse
-
-    whole = scipy.sparse.coo_array((weights, (rows, columns)), shape=shape).tocsc()
-    whole.sort_indices()  # CasADi wants the rows of a column in order
-    return casadi.DM(whole)

@@ -1,25 +1,20 @@
-"""All peers of a scene over one frame: each one's program, and the packets between them.
+"""All peers of a scene over one frame: each one's program, and what they hear of each other.
 
 Takes: a `CompiledSystem`, who hears whom, and the members, with their programs.
-Gives: `Population`, `build_population`; `exchanges_within`, `refuse_unheard_of`.
-Guarantees: sums and means over a complete graph cost one addition a peer, over any other graph one product
-an arc; a reduction that looks at each pair of peers costs one evaluation a pair; before a packet arrives a
-receiver holds the sender's start values.
-Does not: run it (see `simulation`).
+Gives: `Population`, `build_population`; `Played`, `Player`; `exchanges_within`, `refuse_unheard_of`.
+Guarantees: what many peers have in common is kept once.
+Does not: play it (see `stepwise`, `machine`).
 
-    (carries, histories, impulses, number of the frame) -> (carries⁺, histories⁺, rows)
-
-with one of each a member, a column a peer. A member is a group of the scene, or those of its peers that are
-recorded, or those that are not.
+A member is a group of the scene, or those of its peers that are recorded, or those that are not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from fractions import Fraction
+from typing import Protocol
 
-import casadi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,21 +23,56 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange
 from apc.frame.schedule import Propagate, Schedule, Tick
 from apc.network.timetable import Route
-from apc.simulation.frame_packets import FramePackets
+from apc.simulation.hearing import Hearing, hearing_of
 from apc.simulation.program import Member
 
 Floats = NDArray[np.float64]
 
-Compile = Callable[[Sequence[Any]], Sequence[Any]]  # the kernels in another form, as fast as can be had
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """`frame` is the function above; `start` are its first carries and histories, a row a peer."""
+    """All peers. A frame is so many quanta long and has so many rows, at `marks`, of `width` numbers.
+
+    A row holds, member by member from `columns` on, each signal of all its peers. `parts` are those whose
+    work is added up.
+    """
 
     members: tuple[Member, ...]
-    frame: Any  # casadi.Function
-    start: tuple[Floats, ...]
+    hearing: Hearing
+    quantum: Fraction
+    frame: int
+    marks: int
+    width: int
+    columns: tuple[int, ...]
+    parts: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Played:
+    """Some frames: `rows` (frames · marks, width), `work` (frames, parts) in J until each of them begins.
+
+    Only the first `frames` of them could be played.
+    """
+
+    rows: Floats
+    work: Floats
+    frames: int
+
+
+class Player(Protocol):
+    """Plays a population, frame after frame."""
+
+    def begin(self, run: int) -> None:
+        """Go back to time 0; `run` is which of many runs of one seed."""
+
+    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
+        """Play the frames from number `first` on; of the members with impulses `pushes` are these.
+
+        They are (frames, rows, sites). What is returned may be written over by the next call.
+        """
+
+    def in_range(self) -> bool:
+        """Say whether all that moves, recorded or not, is still a number; the work done may not be."""
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
@@ -91,10 +121,7 @@ def refuse_unheard_of(system: CompiledSystem) -> None:
 
 
 def build_population(
-    exchange: Exchange,
-    members: Sequence[Member],
-    kernels: Compile,
-    routes: Sequence[Route] = (),
+    exchange: Exchange, members: Sequence[Member], routes: Sequence[Route] = ()
 ) -> Population:
     """Join the programs of all groups by the packets between them.
 
@@ -104,8 +131,6 @@ def build_population(
         Who hears whom.
     members
         What each group brings, in the scene's order.
-    kernels
-        Turns the segments' functions into the form in which they run.
     routes
         The unreliable links.
 
@@ -114,73 +139,16 @@ def build_population(
     ApcError
         E801 a mean over nobody, E802 a mean whose weights add up to 0.
     """
-    segments = [segment for one in members for segment in one.program.segments]
-    looked = [pairwise.function for segment in segments for pairwise in segment.pairs]
-    found = _distinct([*(segment.kernel for segment in segments), *looked])
-    ready = dict(zip(found, kernels(list(found.values())), strict=True))
-    packets = FramePackets(exchange, members, routes)
-    carries = [casadi.MX.sym(f"carry{g}", len(one.carry[0]), one.count) for g, one in enumerate(members)]
-    histories = [
-        casadi.MX.sym(f"history{g}", sum(one.program.schedule.depths), one.count)
-        for g, one in enumerate(members)
-    ]
-    impulses = [
-        casadi.MX.sym(f"impulses{g}", one.program.impulse_rows, len(one.parameters))
-        for g, one in enumerate(members)
-    ]
-    number = casadi.MX.sym("frame")
-    constants = [casadi.DM(one.each(_constants(one)).T) for one in members]
-    packets.remember(histories)
-    now, taken = list(carries), [0] * len(members)
-    rows: list[list[Any]] = [[] for _ in members]
-    for index in range(len(members[0].program.segments)):
-        # All that is heard in a segment was sent before it began.
-        heard = [
-            casadi.vertcat(
-                packets.hear(g, member.program.segments[index]),
-                *packets.look(g, member.program.segments[index], now[g], constants[g], number, ready),
-            )
-            for g, member in enumerate(members)
-        ]
-        for g, member in enumerate(members):
-            segment = member.program.segments[index]
-            size = segment.kernel.numel_in("impulses")
-            pushed = impulses[g][taken[g] : taken[g] + size, :]
-            taken[g] += size
-            many = ready[id(segment.kernel)].map(member.count)
-            every = pushed[:, member.rows.tolist()] if size else casadi.MX(0, member.count)
-            now[g], sent, recorded = many(now[g], heard[g], constants[g], every, number)
-            rows[g].append(recorded)
-            packets.send(g, segment, sent)
-    frame = casadi.Function(
-        "frame",
-        [*carries, *histories, *packets.selection.held, *impulses, *packets.selection.inputs, number],
-        [*now, *packets.histories(), *packets.selection.finish(), *(casadi.vertcat(*one) for one in rows)],
+    schedule = members[0].program.schedule
+    columns = np.cumsum([0, *(len(one.program.recorded) * one.count for one in members)]).tolist()
+    listed = (part for member in members for part in member.program.layout.parts)
+    return Population(
+        members=tuple(members),
+        hearing=hearing_of(exchange, members, routes),
+        quantum=schedule.quantum,
+        frame=schedule.frame,
+        marks=len(schedule.marks) - 1,
+        width=columns[-1],
+        columns=tuple(columns[:-1]),
+        parts=tuple(dict.fromkeys(listed)),
     )
-    start = [one.each(one.carry) for one in members] + [_first_history(one) for one in members]
-    start += packets.selection.start()
-    return Population(tuple(members), frame, tuple(start))
-
-
-def _distinct(functions: Sequence[Any]) -> dict[int, Any]:
-    return {id(function): function for function in functions}
-
-
-def _constants(member: Member) -> Floats:
-    pairs = zip(member.parameters, member.transitions, strict=True)
-    return np.array([member.program.constants(vector, own) for vector, own in pairs])
-
-
-def _first_history(member: Member) -> Floats:
-    """Return the packets on their way at time 0: the senders' start values."""
-    schedule, kind = member.program.schedule, member.program.kind
-    channels = {sending.link: sending.channels for sending in kind.sends}
-    rows = [
-        [
-            one[sent.link][channels[sent.link].index(sent.channel)]
-            for sent, depth in zip(schedule.sent, schedule.depths, strict=True)
-            for _ in range(depth)
-        ]
-        for one in member.sends
-    ]
-    return member.each(np.array(rows).reshape(len(rows), sum(schedule.depths)))

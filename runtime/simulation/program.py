@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Kind
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import Schedule, Value
-from apc.frame.start import start_sends, start_values
+from apc.frame.start import start_values
 from apc.simulation.pairs import Pairwise
 from apc.simulation.propagate import Rates, Transitions
 from apc.simulation.signals import LocalSignal
@@ -93,29 +93,35 @@ class Program:
         return int(self.rates.g.sum()) * len(self.intervals) if self.rates.timed else 0
 
     def constants(self, parameters: Floats, transitions: Transitions) -> Floats:
-        """Return a site's constants: its parameters, then E, F and c of every duration."""
+        """Return a site's constants, of many (sites, rows): parameters, then E, F and c of each duration."""
         rates, n_x = self.rates, self.layout.states
         parts = [parameters]
         for matrix in transitions.matrices:
-            e, f, c = np.split(matrix, [n_x, matrix.shape[1] - 1], axis=1)
-            parts += [e[rates.e], f[rates.f], c[rates.g, 0]]
-        return np.concatenate(parts)
+            e, f, c = np.split(matrix, [n_x, matrix.shape[-1] - 1], axis=-1)
+            parts += [e[..., rates.e], f[..., rates.f], c[..., rates.g, 0]]
+        return np.concatenate(parts, axis=-1)
 
-    def start(self, x: Sequence[float], remembered: Sequence[Sequence[float]]) -> Floats:
-        """Return the carry at time 0, when nothing is computed yet.
+    def start(
+        self, x: Sequence[Floats | float], remembered: Sequence[Sequence[Floats | float]], *, sites: int = 1
+    ) -> Floats:
+        """Return the carry at time 0 (sites, rows), when nothing is computed yet.
 
         Parameters
         ----------
         x
-            The states' start values (n_x,).
+            The states' start values, each a number or (sites,).
         remembered
             Those of the remembered outputs of every clock partition.
+        sites
+            How many.
         """
-        newest = dict.fromkeys(self.layout.outputs, 0.0)
+        newest: dict[tuple[int, int], Floats | float] = dict.fromkeys(self.layout.outputs, 0.0)
         for p, (partition, values) in enumerate(zip(self.kind.clocks, remembered, strict=True)):
             newest |= {(p, o): one for o, one in zip(partition.memories, values, strict=True)}
-        head = [*x, *(newest[one] for one in self.layout.outputs)]
-        return np.concatenate([head, np.zeros(self.layout.size - len(head))])
+        carry = np.zeros((sites, self.layout.size))
+        for row, one in enumerate([*x, *(newest[one] for one in self.layout.outputs)]):
+            carry[:, row] = one
+        return carry
 
 
 def seconds_at(schedule: Schedule, frame: Any, now: int) -> Any:
@@ -129,8 +135,8 @@ class Member:
     """Peers of one group of the scene in a population.
 
     `peers` (count,) are their numbers in the scene. `rows` (count,) says which of the different sites each
-    is; `parameters` are those sites' vectors, `transitions` theirs; `sends` is what each of them sends at the
-    start, by link.
+    is; `parameters` (sites, n_p) are those sites' vectors, `constants` (sites, rows) what their programs
+    take; `sends` is what they send at the start (sites, channels), by link.
     """
 
     group: int
@@ -138,8 +144,8 @@ class Member:
     program: Program
     rows: NDArray[np.int64]
     parameters: Floats
-    transitions: tuple[Transitions, ...]
-    sends: tuple[Mapping[str, Sequence[float]], ...]
+    constants: Floats
+    sends: Mapping[str, Floats]
     carry: Floats  # (sites, rows of the carry)
 
     @property
@@ -159,7 +165,7 @@ def build_member(
     rows: NDArray[np.int64],
     vectors: Floats,
     program: Program,
-    transitions: Sequence[Transitions],
+    transitions: Transitions,
 ) -> Member:
     """Collect what some peers of a group bring to a population.
 
@@ -173,16 +179,25 @@ def build_member(
         The group's kind.
     rows, vectors, transitions
         Which of the group's different sites each peer is (count,), their parameters (sites, n_p), and what
-        each does over the program's intervals.
+        they do over the program's intervals.
     program
         What each peer does in a frame.
     """
     used, own = np.unique(rows, return_inverse=True)
-    sends, carries = [], []
-    for vector in vectors[used]:
-        listed = [float(one) for one in vector]
-        x, _, remembered = start_values(site, listed)
-        carries.append(program.start(x, remembered))
-        sends.append(start_sends(site, listed, float))
-    moves = tuple(transitions[place] for place in used)
-    return Member(group, peers, program, own, vectors[used], moves, tuple(sends), np.array(carries))
+    some = vectors[used]
+    x, _, remembered = start_values(site, list(some.T))
+    kind, states = site.kind, np.array(x).reshape(len(x), len(some))
+    still = np.zeros((len(kind.holds), len(some)))
+    return Member(
+        group=group,
+        peers=peers,
+        program=program,
+        rows=own,
+        parameters=some,
+        constants=program.constants(some, transitions.chosen(used)),
+        sends={
+            one.link: np.asarray(one.send.map(len(some))(states, still, some.T, 0.0), np.float64).T
+            for one in kind.sends
+        },
+        carry=program.start(x, remembered, sites=len(some)),
+    )

@@ -1,8 +1,10 @@
 """What a site's continuous states do from event to event: the exact transition of a linear partition.
 
 Takes: a `Kind` and parameter vectors.
-Gives: `Rates`, `rates`, `Transitions`, `transitions`, `perturbed`; `nonlinear_rows`.
-Guarantees: no step size; every entry of a transition is right to the last digit but one.
+Gives: `Rates`, `rates`, `Transitions`, `transitions`, `transition_rows`, `perturbed`; `exact_rates`;
+`nonlinear_rows`.
+Guarantees: no step size; every entry of a transition is right to the last digit but one, of many different
+sites to some tens of roundings of the largest.
 Does not: integrate what is not linear (see `flow`), or know what changes with time alone (see `forcing`).
 
     dx/dt = A x + B u + g(t)        x(t + T) = E x(t) + F u + c,  u held
@@ -21,10 +23,15 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.discretize import discretize
+from apc.frame.discretize import UNIT, discretize, exponential_rows
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import guards_of, structural_pattern
 from apc.frame.parameters import exact_numbers
+
+# Different sites whose transitions are computed one by one, exactly, in half a millisecond each.
+MOST_EXACT = 100
+# The largest part of a transition that one of many may be off by: some tens of roundings.
+CLOSE = 1e-14
 
 Floats = NDArray[np.float64]
 Pattern = NDArray[np.bool_]
@@ -51,10 +58,13 @@ class Rates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transitions:
-    """[E F c] (n_x, n_x + n_u + 1) of one site for every duration, and A (n_x, n_x), exact."""
+    """[E F c] (n_x, n_x + n_u + 1) of one site for every duration, of many sites (sites, …)."""
 
     matrices: tuple[Floats, ...]
-    a: NDArray[Any]
+
+    def chosen(self, sites: NDArray[np.int64]) -> Transitions:
+        """Return those of some of many sites."""
+        return Transitions(tuple(one[sites] for one in self.matrices))
 
 
 def nonlinear_rows(kind: Kind) -> tuple[int, ...]:
@@ -137,7 +147,7 @@ def perturbed(exact: Transitions, seed: int) -> Transitions:
         towards = np.where(chance.random(matrix.shape) < 0.5, -np.inf, np.inf)
         return np.where(matrix == 0, 0.0, np.nextafter(matrix, towards))
 
-    return Transitions(tuple(moved(one) for one in exact.matrices), exact.a)
+    return Transitions(tuple(moved(one) for one in exact.matrices))
 
 
 def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fraction]) -> Transitions:
@@ -157,6 +167,14 @@ def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fractio
     ApcError
         E806 something grows beyond the range of floats within a duration.
     """
+    n_x = len(rates_of.kind.states)
+    whole = exact_rates(rates_of, parameters)
+    steps = discretize(whole[:, :n_x], whole[:, n_x:], durations)
+    return Transitions(tuple(step.matrix for step in steps))
+
+
+def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
+    """Return [A B g] (n_x, n_x + n_u + 1) of a site, exact."""
     kind = rates_of.kind
     n_x, n_u = len(kind.states), len(kind.holds)
     if rates_of.matrices.is_a("SXFunction"):
@@ -165,9 +183,49 @@ def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fractio
         )[0]
     else:
         exact = [Fraction(float(one)) for one in np.asarray(rates_of.matrices(parameters)).ravel()]
-    whole = np.array(exact, dtype=object).reshape((n_x, n_x + n_u + 1), order="F")
-    steps = discretize(whole[:, :n_x], whole[:, n_x:], durations)
-    return Transitions(tuple(step.matrix for step in steps), whole[:, :n_x])
+    return np.array(exact, dtype=object).reshape((n_x, n_x + n_u + 1), order="F")
+
+
+def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fraction]) -> Transitions:
+    """Return what many sites do in every duration, (sites, n_x, n_x + n_u + 1) each.
+
+    Sites that differ in nothing the continuous equations read share a transition. More than `MOST_EXACT`
+    different ones are stepped in floats, all at once, but for those whose bound says that this is less exact
+    than `CLOSE`.
+
+    Parameters
+    ----------
+    rates_of
+        The kind's equations.
+    vectors
+        The sites' parameters (sites, n_p).
+    durations
+        In seconds.
+
+    Raises
+    ------
+    ApcError
+        As `transitions`.
+    """
+    n_x, width = len(rates_of.kind.states), len(rates_of.kind.states) + len(rates_of.kind.holds) + 1
+    flat = np.asarray(rates_of.matrices.map(len(vectors))(vectors.T), np.float64).T
+    keys = np.ascontiguousarray(flat + 0.0).view(np.dtype((np.void, flat.shape[1] * flat.itemsize or 1)))
+    _, first, which = np.unique(keys.reshape(len(vectors), -1)[:, 0], return_index=True, return_inverse=True)
+    exactly = np.ones(len(first), np.bool_)
+    found = [np.empty((len(first), n_x, width)) for _ in durations]
+    if len(first) > MOST_EXACT:
+        whole = flat[first].reshape(len(first), width, n_x).swapaxes(1, 2)
+        exactly[:] = False
+        for matrix, duration in zip(found, durations, strict=True):
+            step = exponential_rows(whole[:, :, :n_x], whole[:, :, n_x:], float(duration))
+            matrix[:] = step.matrix
+            error, size = step.roundings * UNIT * step.size, np.abs(matrix)
+            exactly |= ~(error <= CLOSE * size.max(axis=(1, 2), keepdims=True)).all(axis=(1, 2))
+    for place in np.flatnonzero(exactly).tolist():
+        own = transitions(rates_of, vectors[first[place]], durations)
+        for matrix, one in zip(found, own.matrices, strict=True):
+            matrix[place] = one
+    return Transitions(tuple(matrix[which] for matrix in found))
 
 
 def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:

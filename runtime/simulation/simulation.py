@@ -1,4 +1,4 @@
-"""A scene made ready to be played in time: one function for a stretch of frames of all peers.
+"""A scene made ready to be played in time: all peers, what they hear, what is recorded, who plays them.
 
 Takes: a `CompiledSystem`, its `Settings`, the signals wanted.
 Gives: `Simulation`, `prepare`; `check_length`, `size_note`, what it will come to.
@@ -25,30 +25,42 @@ from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.scheduling import build_schedules
-from apc.network.timetable import Route, routes_of
+from apc.network.timetable import Luck, Route, Timetable, luck_of, routes_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
 from apc.simulation.forcing import SiteForcing, forcing_of
-from apc.simulation.native import native
+from apc.simulation.machine import Library, Machine, library_of
 from apc.simulation.pairs import count_pairs
-from apc.simulation.population import Population, build_population, exchanges_within, refuse_unheard_of
+from apc.simulation.population import (
+    Player,
+    Population,
+    build_population,
+    exchanges_within,
+    refuse_unheard_of,
+)
 from apc.simulation.program import Member, Program, build_member
-from apc.simulation.propagate import Transitions, perturbed, rates, transitions
+from apc.simulation.propagate import Transitions, exact_rates, perturbed, rates, transition_rows
 from apc.simulation.quadrature import Kernel, kernel_of
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
-from apc.simulation.signals import Choice, LocalSignal, Signal, choose, local_signals, signals_of
+from apc.simulation.signals import (
+    Choice,
+    LocalSignal,
+    Signal,
+    choose,
+    local_signals,
+    sent_states,
+    signals_of,
+)
+from apc.simulation.stepwise import Stepwise
 from apc.simulation.writing import build_program
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Numbers that one call of the chunked function gives out, at most, if a frame gives fewer: 4 MiB stay in the
-# machine's caches, and CasADi builds the function in a tenth of a second.
+# Numbers that one call of a player gives out, at most, if a frame gives fewer: 4 MiB stay in the machine's
+# caches.
 CHUNK = 2**19
 ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
-# Numbers that come into one call, at most: 4 MiB. Of an unreliable link they are one a way and tick. For
-# twice as many, CasADi builds the function in more than a second instead of a tenth.
-TOLD = 2**19
-MOST_FRAMES = 2000  # of one chunk: the function of a chunk is built in a time that grows with it
+MOST_FRAMES = 2000  # of one chunk: what has left the range of floats is noticed at its end
 NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
 # Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
 MOST_NUMBERS = 2**26
@@ -68,11 +80,12 @@ BINARY, DECIMAL = 8, 20
 class Simulation:
     """A scene ready to be played.
 
-    `signals` are the columns of what comes out; `marks` the instants of a frame's rows, in quanta, of which
-    those not in `ticks` make a row at time 0 only; `forces` are those that change with time, of each group's
-    different sites. `chunk` is the frame of all peers, `length` times in a row;
-    `compiled` says that it runs in machine code. `routes` are the unreliable links, `seed` is what their luck
-    begins from: that of the settings, or of the experiment. `tolerances` are of the states that CVODES moves.
+    `signals` are the columns of what comes out, the `order` (signals,) of which in a row of the population is
+    another; `marks` the instants of a frame's rows, in quanta, of which those not in `ticks` make a row at
+    time 0 only; `forces` are those that change with time, of each member's different sites. `lucks` are what
+    chance does on the unreliable links, `seed` is what it begins from: that of the settings, or of the
+    experiment. `library` is the machine code, None if there is none. `length` frames are played at a time.
+    `tolerances` are of the states that CVODES moves, `sent` the names of those that peers send as they are.
     """
 
     system: CompiledSystem
@@ -80,17 +93,23 @@ class Simulation:
     population: Population
     choices: tuple[Choice, ...]
     signals: tuple[Signal, ...]
+    order: Integers
     forces: tuple[tuple[SiteForcing, ...], ...]
-    routes: tuple[Route, ...]
+    lucks: tuple[Luck, ...]
     seed: int
     tolerances: tuple[Tolerance, ...]
+    sent: tuple[str, ...]
     quantum: Fraction
     frame: int
     marks: tuple[int, ...]
     ticks: frozenset[int]
-    compiled: bool
+    library: Library | None
     length: int
-    chunk: Any  # casadi.Function
+
+    @property
+    def compiled(self) -> bool:
+        """Whether it runs in machine code."""
+        return self.library is not None
 
     @property
     def how(self) -> str:
@@ -103,8 +122,16 @@ class Simulation:
     @property
     def parts(self) -> tuple[str, ...]:
         """The parts whose work is added up."""
-        listed = (part for member in self.population.members for part in member.program.layout.parts)
-        return tuple(dict.fromkeys(listed))
+        return self.population.parts
+
+    def player(self) -> Player:
+        """Return what plays it, with memory of its own."""
+        if self.library is not None:
+            return Machine(self.library, self.population, self.lucks, self.seed)
+        return Stepwise(self.population, self._timetable if self.lucks else None)
+
+    def _timetable(self, run: int) -> Timetable:
+        return Timetable(self.population.hearing.routes, self.lucks, seed=self.seed, run=run)
 
 
 @part("prepare")
@@ -132,34 +159,28 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
         plan = _plan(system, settings.method)
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method)
-        compiled: list[bool] = []
-
-        def kernels(functions: Sequence[Any]) -> Sequence[Any]:
-            ready = native(functions) if settings.jit else functions
-            compiled.append(any(new is not old for new, old in zip(ready, functions, strict=True)))
-            return ready
-
-        population = build_population(plan.exchange, members, kernels, plan.routes)
+        population = build_population(plan.exchange, members, plan.routes)
     schedule = plan.schedules[0]
     marks = schedule.marks[:-1]
-    length = _chunk_length(population.frame, settings.duration, schedule.frame_s)
+    timings, quantum = plan.numbers.timings, schedule.quantum
     return Simulation(
         system=system,
         settings=settings,
         population=population,
         choices=choices,
         signals=signals_of(system, choices),
+        order=_order(system, population, choices),
         forces=tuple(_forces(member) for member in members),
-        routes=plan.routes,
+        lucks=tuple(luck_of(system, timings, plan.exchange, route, quantum) for route in plan.routes),
         seed=system.experiment.seed if settings.seed is None else settings.seed,
         tolerances=_tolerances(system, plan.flows),
-        quantum=schedule.quantum,
+        sent=tuple(dict.fromkeys(one.states[i].name for one in system.kinds for i in sent_states(one))),
+        quantum=quantum,
         frame=schedule.frame,
         marks=marks,
         ticks=frozenset(marks if _ticks_at_zero(system, plan.numbers) else marks[1:]),
-        compiled=compiled[0],
-        length=length,
-        chunk=population.frame.mapaccum("chunk", length, len(population.start)),
+        library=library_of(population) if settings.jit else None,
+        length=_chunk_length(population, settings.duration),
     )
 
 
@@ -267,22 +288,40 @@ def _members(plan: _Plan, choices: Sequence[Choice], method: Method) -> list[Mem
     groups = zip(system.groups, plan.schedules, choices, strict=True)
     for group, (one, schedule, choice) in enumerate(groups):
         rows, vectors = numbers.rows[group], numbers.parameters[group]
+        moves: Transitions | None = None
         for peers, recorded in _recorded_and_not(choice):
             key = (one.kind, id(schedule), recorded)
             if key not in programs:
                 programs[key] = build_program(linear[one.kind], schedule, recorded, cuts, flows[one.kind])
-            moves = _transitions(programs[key], vectors, method)
+            if moves is None:
+                moves = _transitions(programs[key], vectors, method)
             numbered, site = plan.exchange.starts[group] + peers, plan.sites[one.kind]
             members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
     return members
 
 
-def _chunk_length(frame: Any, duration: Fraction, frame_s: Fraction) -> int:
+def _chunk_length(population: Population, duration: Fraction) -> int:
     """Return how many frames to play at once: equal chunks, none larger than need be."""
-    frames = int(duration / frame_s) + 1
-    told = int(frame.nnz_in())
-    most = max(1, min(MOST_FRAMES, CHUNK // max(1, int(frame.nnz_out())), TOLD // max(1, told), frames))
+    frames = int(duration / (population.frame * population.quantum)) + 1
+    pushed = sum(one.program.impulse_rows * len(one.parameters) for one in population.members)
+    numbers = population.marks * population.width + pushed
+    most = max(1, min(MOST_FRAMES, CHUNK // max(1, numbers), frames))
     return -(-frames // -(-frames // most))
+
+
+def _order(system: CompiledSystem, population: Population, choices: Sequence[Choice]) -> Integers:
+    """Return where each signal stands in a row of a population."""
+    first = np.cumsum([0] + [int(choice.wanted.sum()) for choice in choices])
+    starts = np.cumsum([0] + [group.count for group in system.groups])
+    order = np.empty(int(first[-1]), np.int64)
+    for member, column in zip(population.members, population.columns, strict=True):
+        if member.program.recorded:
+            wanted = choices[member.group].wanted
+            own = member.peers - starts[member.group]
+            place = first[member.group] + np.cumsum(wanted).reshape(wanted.shape) - 1
+            here = column + np.arange(member.count * wanted.shape[1]).reshape(-1, member.count).T
+            order[place[own][wanted[own]]] = here[wanted[own]]
+    return order
 
 
 def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
@@ -362,20 +401,11 @@ def _check_step(
     check_step(system, method, fastest, max(lengths, default=fastest))
 
 
-def _transitions(program: Program, vectors: Floats, method: Method) -> list[Transitions]:
-    """Return what each different site of a group does over every interval; equal ones are one object."""
+def _transitions(program: Program, vectors: Floats, method: Method) -> Transitions:
+    """Return what the different sites of a group do over every interval."""
     seconds = [length * program.schedule.quantum for length in program.durations]
-    known: dict[bytes, Transitions] = {}
-    found = []
-    for vector in vectors:
-        # Sites that differ in nothing the continuous equations read share a transition.
-        key = np.asarray(program.rates.matrices(vector)).tobytes()
-        if key not in known:
-            known[key] = transitions(program.rates, vector, seconds)
-            if method.perturbed:
-                known[key] = perturbed(known[key], len(known))
-        found.append(known[key])
-    return found
+    found = transition_rows(program.rates, vectors, seconds)
+    return perturbed(found, 0) if method.perturbed else found
 
 
 def _forces(member: Member) -> tuple[SiteForcing, ...]:
@@ -384,10 +414,14 @@ def _forces(member: Member) -> tuple[SiteForcing, ...]:
     if not program.impulse_rows:
         return ()
     seconds = [length * program.schedule.quantum for length in program.durations]
-    forcing = forcing_of(program.rates)
-    kernels: dict[int, tuple[Kernel, ...]] = {}
-    for one in member.transitions:  # equal ones are one object
-        if id(one) not in kernels:
-            kernels[id(one)] = tuple(kernel_of(one.a, forcing.pushed, length) for length in seconds)
-    pairs = zip(member.parameters, member.transitions, strict=True)
-    return tuple(SiteForcing(forcing, vector, kernels[id(own)]) for vector, own in pairs)
+    forcing, n_x = forcing_of(program.rates), program.layout.states
+    kernels: dict[bytes, tuple[Kernel, ...]] = {}
+    found = []
+    for vector in member.parameters:
+        # Sites that differ in nothing the continuous equations read share a kernel.
+        key = np.asarray(program.rates.matrices(vector)).tobytes()
+        if key not in kernels:
+            a = exact_rates(program.rates, vector)[:, :n_x]
+            kernels[key] = tuple(kernel_of(a, forcing.pushed, length) for length in seconds)
+        found.append(SiteForcing(forcing, vector, kernels[key]))
+    return tuple(found)

@@ -1,6 +1,6 @@
 """What a simulated motion amounts to, in numbers and a word: whether it settles, and how far it goes.
 
-Takes: the blocks of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`.
+Takes: the rows of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`, `Judged`.
 Guarantees: the memory used does not grow with the duration.
 Does not: prove anything: what it says holds for the time that was simulated (see `analysis` for proof).
 
@@ -22,9 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
 from apc.simulation.blocks import Block
-from apc.simulation.signals import Signal, sent_states
+from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation
 
 Floats = NDArray[np.float64]
@@ -76,43 +75,76 @@ class Summary:
     extents: tuple[Extent, ...]
 
 
-class Watch:
-    """Looks at the blocks of a simulation as they pass and keeps extremes, bucket by bucket of rows."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """What several runs of one scene amount to, side by side.
 
-    def __init__(self, simulation: Simulation) -> None:
-        self.simulation = simulation
-        n = len(simulation.signals)
+    `verdict` (runs,) are words; `settled` (runs, signals) seconds, NaN where a signal does not settle, and of
+    all positions together (runs,), NaN but for runs that settle; `swing` (runs, signals) is the way to and
+    fro at the end, `rate` how often a second, `restless` (runs,) the signal that swings most, −1 if none
+    does.
+    """
+
+    verdict: NDArray[np.str_]
+    settled: Floats
+    settled_at: Floats
+    swing: Floats
+    rate: Floats
+    restless: NDArray[np.int64]
+
+
+class Watch:
+    """Looks at some runs of a simulation as they pass and keeps extremes, bucket by bucket of rows."""
+
+    def __init__(self, simulation: Simulation, signals: Sequence[Signal] = (), runs: int = 1) -> None:
+        """Begin before the first row.
+
+        Parameters
+        ----------
+        simulation
+            What is played.
+        signals
+            What to look at, all signals of the simulation if there is none.
+        runs
+            How many runs stand side by side: the signals of the first are followed by those of the next.
+        """
+        self.simulation, self.runs = simulation, runs
+        self.listed = tuple(signals) or simulation.signals
+        self.signals = len(self.listed)
+        n = self.signals * runs
         rows = int(simulation.settings.duration / (simulation.frame * simulation.quantum)) + 1
         rows *= len(simulation.marks)
-        most = max(16, min(BUCKETS, MOST_EXTREMES // max(n, 1)))
+        most = max(16, min(BUCKETS, MOST_EXTREMES // max(len(simulation.signals), 1)))
         self.width = -(-rows // most)
         self.ends: list[float] = []
         self.low, self.high = np.empty((0, n)), np.empty((0, n))
-        self.turns = np.empty((0, n), dtype=np.int64)
+        self.positions = [i for i, one in enumerate(self.listed) if is_position(one)]
+        self.forces = [i for i, one in enumerate(self.listed) if one.unit == "N"]
+        self.turning = _of_every_run(self.positions, self.signals, runs)
+        self.turns = np.empty((0, len(self.turning)), dtype=np.int64)
         self.pending, self.times = np.empty((0, n)), np.empty(0)
-        self.before: Floats = np.empty((0, n))  # the last two rows already in a bucket
+        self.before: Floats = np.empty((0, len(self.turning)))  # the last two rows already in a bucket
         self.first: Floats = np.zeros(n)
         self.last: Floats = np.zeros(n)
         self.peak, self.peak_at = np.zeros(n), np.zeros(n)
         self.rows = 0
-        self.block: Block | None = None
 
-    def take(self, block: Block) -> None:
-        """Look at one block."""
-        self.block = block
-        if not len(block.time):
+    def take(self, time: Floats, values: Floats) -> None:
+        """Look at some rows: `time` (rows,), `values` (rows, runs · signals)."""
+        if not len(time):
             return
         if not self.rows:
-            self.first = block.values[0].copy()
-        self.last = block.values[-1].copy()
-        self.rows += len(block.time)
-        size = np.abs(block.values)
-        at = size.argmax(axis=0)
-        largest = size[at, np.arange(size.shape[1])]
-        higher = largest > self.peak
-        self.peak = np.where(higher, largest, self.peak)
-        self.peak_at = np.where(higher, block.time[at], self.peak_at)
-        self._fill(np.concatenate([self.times, block.time]), np.concatenate([self.pending, block.values]))
+            self.first = values[0].copy()
+        self.last = values[-1].copy()
+        self.rows += len(time)
+        for column in self.forces if self.runs == 1 else ():
+            size = np.abs(values[:, column])
+            at = size.argmax()
+            if size[at] > self.peak[column]:
+                self.peak[column], self.peak_at[column] = size[at], time[at]
+        if len(self.times):
+            time, values = np.concatenate([self.times, time]), np.concatenate([self.pending, values])
+        self._fill(time, values)
 
     def _fill(self, times: Floats, values: Floats, *, all_of_it: bool = False) -> None:
         whole = len(times) // self.width
@@ -129,98 +161,143 @@ class Watch:
         self.low = np.concatenate([self.low, shaped.min(axis=1)])
         self.high = np.concatenate([self.high, shaped.max(axis=1)])
         self.ends += times.reshape(number, -1)[:, -1].tolist()
-        steps = np.sign(np.diff(np.concatenate([self.before, values]), axis=0))
-        turned = np.zeros(values.shape, dtype=np.int64)
-        found = steps[1:] * steps[:-1] < 0
+        moving = np.concatenate([self.before, values[:, self.turning]])
+        up, down = moving[1:] > moving[:-1], moving[1:] < moving[:-1]
+        found = (up[1:] & down[:-1]) | (down[1:] & up[:-1])
+        turned = np.zeros((len(values), len(self.turning)), dtype=np.bool_)
         if len(found):
             turned[-len(found) :] = found
-        self.turns = np.concatenate([self.turns, turned.reshape(shaped.shape).sum(axis=1)])
-        self.before = np.concatenate([self.before, values])[-2:].copy()
+        self.turns = np.concatenate(
+            [self.turns, turned.reshape(*shaped.shape[:2], len(self.turning)).sum(axis=1)]
+        )
+        self.before = moving[-2:].copy()
 
-    def summary(self) -> Summary:
-        """Return what has been seen."""
+    def judged(self, *, stopped: bool = False) -> Judged:
+        """Return what has been seen of every run; `stopped` says that something left the range of floats."""
         self._fill(self.times, self.pending, all_of_it=True)
-        signals, block = self.simulation.signals, self.block
-        assert block is not None and self.rows, "a simulation has a row at time 0"
-        end = self.ends[-1]
-        low, high = self.low.min(axis=0), self.high.max(axis=0)
-        with np.errstate(over="ignore"):  # of what has diverged
-            settled = self._settled(self._spans(high - low), end)
+        assert self.rows, "a simulation has a row at time 0"
+        low, high = self._of_runs(self.low), self._of_runs(self.high)
+        settled = self._settled(low, high)
+        number = len(self.ends)
+        tail = max(1, round(TAIL * number))
+        now, then = slice(number - tail, number), slice(max(0, number - 2 * tail), number - tail)
+        swing = high[now].max(axis=0) - low[now].min(axis=0)
+        span = np.maximum(high.max(axis=0) - low.min(axis=0), np.finfo(float).tiny)
+        turns = np.zeros(swing.shape, np.int64)
+        turns[:, self.positions] = self.turns[now].sum(axis=0).reshape(self.runs, -1)
+        # Of the positions that turn and don't settle, the one that swings most.
+        restless = np.isnan(settled[:, self.positions]) & (turns[:, self.positions] >= FEWEST_TURNS)
+        restless &= number >= 2 * tail
+        share = np.where(restless, (swing / span)[:, self.positions], -1.0)
+        which = np.full(self.runs, -1, np.int64)
+        if self.positions:
+            which = np.where(restless.any(axis=1), np.array(self.positions)[share.argmax(axis=1)], -1)
+        earlier = np.zeros(swing.shape)
+        if then.stop > then.start:
+            earlier = high[then].max(axis=0) - low[then].min(axis=0)
+        smaller = swing < SMALLER * earlier
+        dying = smaller[np.arange(self.runs), which] if self.positions else np.zeros(self.runs, np.bool_)
+        verdict = np.where(which < 0, "moves on", np.where(dying, "dies away", "shakes"))
+        times = settled[:, self.positions]
+        calm = ~np.isnan(times).any(axis=1)
+        whole = (high.max(axis=0) - low.min(axis=0))[:, self.positions]
+        still = calm & ~whole.any(axis=1) & bool(self.positions)
+        verdict = np.where(still, "rests", np.where(calm, "settles", verdict))
+        verdict = np.where(stopped, "diverges", verdict)
+        seconds = self.ends[-1] - (self.ends[number - tail - 1] if number > tail else 0.0)
+        return Judged(
+            verdict=verdict,
+            settled=settled,
+            settled_at=np.where(verdict == "settles", times.max(axis=1, initial=0.0), np.nan),
+            swing=swing,
+            rate=turns / 2 / seconds if seconds > 0 else np.zeros(turns.shape),
+            restless=np.where(calm | stopped, -1, which),
+        )
+
+    def summary(self, block: Block) -> Summary:
+        """Return what has been seen of the only run; `block` is its last."""
+        with np.errstate(over="ignore", invalid="ignore"):  # of what has diverged
+            judged = self.judged(stopped=bool(block.stopped))
+        signals = self.listed
+        listed = [None if np.isnan(one) else float(one) for one in judged.settled[0]]
         extents = tuple(
             Extent(one.name, one.unit, float(first), float(last), float(least), float(most), since)
             for one, first, last, least, most, since in zip(
-                signals, self.first, self.last, low, high, settled, strict=True
+                signals,
+                self.first,
+                self.last,
+                self.low.min(axis=0),
+                self.high.max(axis=0),
+                listed,
+                strict=True,
             )
         )
-        positions = [i for i, one in enumerate(signals) if one.role == "state" and one.unit in ("m", "rad")]
-        verdict, swing = self._verdict(positions, settled, bool(block.stopped))
-        if verdict == "settles" and positions and not np.any((high - low)[positions]):
-            verdict = "rests"
-        times = [settled[i] for i in positions]
-        forces = [i for i, one in enumerate(signals) if one.unit == "N"]
-        largest = max(forces, key=lambda i: float(self.peak[i]), default=None)
+        verdict, restless = str(judged.verdict[0]), int(judged.restless[0])
+        swing = (
+            (signals[restless].name, float(judged.swing[0, restless]), float(judged.rate[0, restless]))
+            if restless >= 0
+            else None
+        )
+        largest = max(self.forces, key=lambda i: float(self.peak[i]), default=-1)
         return Summary(
             verdict=verdict,
-            settled=max((one for one in times if one is not None), default=0.0)
-            if verdict == "settles"
-            else None,
+            settled=float(judged.settled_at[0]) if verdict == "settles" else None,
             stopped=block.stopped,
             stopped_at=block.stopped_at if block.stopped else None,
             swing=swing,
-            overshoot=_overshoot([extents[i] for i in positions]) if verdict == "settles" else None,
+            overshoot=_overshoot([extents[i] for i in self.positions]) if verdict == "settles" else None,
             largest_force=None
-            if largest is None
+            if largest < 0
             else (signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest])),
-            copies=_copies(self.simulation.system, signals, self.last),
+            copies=tuple((name, float(distance[0])) for name, _, distance in self.copies()),
             # Of a motion without bound the work is as meaningless as it is large.
             work=() if block.stopped else tuple(zip(self.simulation.parts, block.work.tolist(), strict=True)),
             rows=self.rows,
             signals=len(signals),
-            end=end,
+            end=self.ends[-1],
             extents=extents,
         )
 
-    def _spans(self, own: Floats) -> Floats:
-        """Return the largest range of each signal's name among the peers."""
-        largest: dict[str, float] = {}
-        for one, span in zip(self.simulation.signals, own, strict=True):
-            largest[one.local] = max(largest.get(one.local, 0.0), float(span))
-        return np.array([largest[one.local] for one in self.simulation.signals])
+    def copies(self) -> list[tuple[str, str, Floats]]:
+        """Return how far apart the peers' copies of each state that is sent as it is are at the end.
 
-    def _settled(self, span: Floats, end: float) -> list[float | None]:
-        """Return when each signal is within its band for good; None if that is not well before the end."""
-        outside = (self.high - self.last > BAND * span) | (self.last - self.low > BAND * span)
-        found: list[float | None] = []
-        for column in outside.T:
-            left = np.flatnonzero(column)
-            at = self.ends[int(left[-1])] if len(left) else 0.0
-            found.append(at if at <= LATE * end else None)
+        Name, unit, and distances (runs,).
+        """
+        signals = self.listed
+        last = self.last.reshape(self.runs, -1)
+        found = []
+        for name in self.simulation.sent:
+            here = [i for i, one in enumerate(signals) if one.local == name and one.unit in ("m", "rad")]
+            if len(here) > 1:
+                found.append((name, signals[here[0]].unit, np.ptp(last[:, here], axis=1)))
         return found
 
-    def _verdict(
-        self, positions: Sequence[int], settled: Sequence[float | None], stopped: bool
-    ) -> tuple[str, tuple[str, float, float] | None]:
-        """Return the word for the motion, and who swings by how much and how often a second, if anyone."""
-        if stopped:
-            return "diverges", None
-        if all(settled[i] is not None for i in positions):
-            return "settles", None
-        number = len(self.ends)
-        tail = max(1, round(TAIL * number))
-        now, then = slice(number - tail, number), slice(max(0, number - 2 * tail), number - tail)
-        span = np.maximum(self.high.max(axis=0) - self.low.min(axis=0), np.finfo(float).tiny)
-        swing = self.high[now].max(axis=0) - self.low[now].min(axis=0)
-        turns = self.turns[now].sum(axis=0)
-        restless = [i for i in positions if settled[i] is None and turns[i] >= FEWEST_TURNS]
-        if not restless or number < 2 * tail:
-            return "moves on", None
-        most = max(restless, key=lambda i: float(swing[i] / span[i]))
-        earlier = self.high[then].max(axis=0) - self.low[then].min(axis=0)
-        seconds = self.ends[-1] - (self.ends[number - tail - 1] if number > tail else 0.0)
-        name = self.simulation.signals[most].name
-        rate = float(turns[most]) / 2 / seconds if seconds > 0 else 0.0
-        word = "dies away" if swing[most] < SMALLER * earlier[most] else "shakes"
-        return word, (name, float(swing[most]), rate)
+    def _of_runs(self, table: Floats) -> Floats:
+        return table.reshape(len(table), self.runs, self.signals)
+
+    def _settled(self, low: Floats, high: Floats) -> Floats:
+        """Return when each signal is within its band for good; NaN if that is not well before the end."""
+        with np.errstate(over="ignore"):  # of what has diverged
+            own = high.max(axis=0) - low.min(axis=0)
+        span, names = np.empty(own.shape), [one.local for one in self.listed]
+        for name in dict.fromkeys(names):  # the largest range among the peers
+            here = [i for i, one in enumerate(names) if one == name]
+            span[:, here] = own[:, here].max(axis=1, keepdims=True)
+        last, end = self.last.reshape(self.runs, self.signals), self.ends[-1]
+        outside = (high - last > BAND * span) | (last - low > BAND * span)
+        ends = np.concatenate([[0.0], self.ends])  # of the last bucket outside the band, 0 if there is none
+        after = np.where(outside.any(axis=0), len(outside) - np.argmax(outside[::-1], axis=0), 0)
+        return np.where(ends[after] <= LATE * end, ends[after], np.nan)
+
+
+def is_position(signal: Signal) -> bool:
+    """Say whether a signal is a place, which decides whether a motion settles."""
+    return signal.role == "state" and signal.unit in ("m", "rad")
+
+
+def _of_every_run(places: Sequence[int], signals: int, runs: int) -> NDArray[np.int64]:
+    """Return the columns of some signals of every run."""
+    return (np.arange(runs)[:, None] * signals + np.array(places, np.int64)).reshape(-1)
 
 
 def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
@@ -232,14 +309,3 @@ def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
             beyond = one.high - one.last if way > 0 else one.last - one.low
             found.append((one.name, beyond / abs(way)))
     return max(found, key=lambda pair: pair[1], default=None)
-
-
-def _copies(system: CompiledSystem, signals: Sequence[Signal], last: Floats) -> tuple[tuple[str, float], ...]:
-    """Return how far apart the peers' copies of each state that is sent as it is are at the end."""
-    names = dict.fromkeys(kind.states[i].name for kind in system.kinds for i in sent_states(kind))
-    found = []
-    for name in names:
-        values = [last[i] for i, one in enumerate(signals) if one.local == name and one.unit in ("m", "rad")]
-        if len(values) > 1:
-            found.append((name, float(np.max(values) - np.min(values))))
-    return tuple(found)

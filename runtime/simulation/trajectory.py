@@ -179,7 +179,7 @@ def play(
     watch, interrupted = Watch(simulation), False
     try:
         for block in blocks(simulation):
-            watch.take(block)
+            watch.take(block.time, block.values)
             for sink in sinks:
                 sink.take(block)
             if progress is not None and len(block.time):
@@ -188,7 +188,7 @@ def play(
         if not watch.rows:
             raise
         interrupted = True
-    return watch.summary(), interrupted
+    return watch.summary(block), interrupted
 
 
 def simulate(

@@ -108,11 +108,11 @@ class _Writer:
             *(one.send for one in kind.sends),
             *([kind.ports.port] if kind.ports else []),
         ]
-        plain = flow is None and all(function.is_a("SXFunction") for function in self.functions)
-        self.type_: Any = casadi.SX if plain else casadi.MX
         lengths = [event.duration for event in schedule.events if isinstance(event, Propagate)]
         self.durations = tuple(sorted(set(lengths)))
         self.moves = [flow.over(length * schedule.quantum) for length in self.durations] if flow else []
+        plain = all(function.is_a("SXFunction") for function in (*self.functions, *self.moves))
+        self.type_: Any = casadi.SX if plain else casadi.MX
         self.intervals: list[tuple[int, int]] = []
         outputs = tuple(
             (p, o) for p in ticking_partitions(schedule) for o in range(len(kind.clocks[p].outputs))

@@ -1,0 +1,251 @@
+"""All peers' frames one by one: CasADi's virtual machine moves the peers, NumPy what they hear.
+
+Takes: a `Population`, the packets of its unreliable links.
+Gives: `Stepwise`.
+Guarantees: any kernel can be played, solvers too; a frame that can't be is told, and those before are kept.
+Does not: run fast: where there is a compiler and every kernel is straight code, see `machine`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.network.timetable import START, Seen, Timetable
+from apc.simulation.hearing import Complete, Deliver, Look, OnWays, Operation, Sparse, Total, Weighed
+from apc.simulation.population import Played, Population
+from apc.simulation.program import Member, Segment, seconds_at
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+MOST_SEEN = 2**20  # packets that ticks see, drawn at once
+JOINS = {"max": np.fmax, "min": np.fmin}
+
+
+class Stepwise:
+    """The memory of all peers, and what moves them in it."""
+
+    def __init__(self, population: Population, timetable: Callable[[int], Timetable] | None) -> None:
+        """Make the memory.
+
+        Parameters
+        ----------
+        population
+            All peers.
+        timetable
+            Gives the packets of a run; None if every link is reliable.
+        """
+        self.population, self.timetable = population, timetable
+        self.segments = [[_Moving(m, one) for one in m.program.segments] for m in population.members]
+        self.looks: dict[tuple[int, int], Callable[..., Any]] = {}
+        self.begin(0)
+
+    def begin(self, run: int) -> None:
+        """Go back to time 0; `run` is which of many runs of one seed."""
+        hearing = self.population.hearing
+        self.table = None if self.timetable is None else self.timetable(run)
+        self.packets = np.repeat(hearing.start[None], hearing.ring, axis=0)
+        self.totals = np.zeros(hearing.totals)
+        self.carries = [member.each(member.carry).T for member in self.population.members]
+        self.held = [one.copy() for one in hearing.held]
+        self.effective = [np.full(len(one.pairs), START, np.int64) for one in hearing.routes]
+        self.missing = [np.zeros(len(one.pairs), np.bool_) for one in hearing.routes]
+
+    def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
+        """Play the frames from number `first` on (see `Player`)."""
+        population, marks = self.population, self.population.marks
+        rows = np.full((count * marks, population.width), np.nan)
+        work = np.zeros((count, len(population.parts)))
+        seen = self._seen(first, count)
+        for n in range(count):
+            for g, member in enumerate(population.members):
+                for part, done in zip(
+                    member.program.layout.parts, self.carries[g][member.program.layout.work], strict=True
+                ):
+                    work[n, population.parts.index(part)] += done.sum()
+            # Where a solver gives up CasADi prints its arguments, and then the ones that it was called from.
+            with contextlib.redirect_stderr(io.StringIO()), np.errstate(all="ignore"):
+                try:
+                    now = [None if one is None else one[n] for one in pushes]
+                    self._frame(first + n, rows[n * marks : (n + 1) * marks], next(seen, ()), now)
+                except RuntimeError:
+                    return Played(rows, work, n)
+        return Played(rows, work, count)
+
+    def in_range(self) -> bool:
+        """Say whether all that moves, recorded or not, is still a number; the work done may not be."""
+        moving = (
+            carry[: member.program.layout.work.start]
+            for carry, member in zip(self.carries, self.population.members, strict=True)
+        )
+        return all(bool(np.isfinite(one).all()) for one in (self.packets, *moving))
+
+    def _seen(self, first: int, count: int) -> Iterator[tuple[Seen, ...]]:
+        """Yield what the ticks of each frame see on every route."""
+        if self.table is None:
+            return
+        routes = self.population.hearing.routes
+        each = max(1, MOST_SEEN // max(1, sum(one.ticks * len(one.pairs) for one in routes)))
+        for begin in range(first, first + count, each):
+            end = min(begin + each, first + count)
+            whole = self.table.take(end * self.population.frame)
+            for n in range(end - begin):
+                yield tuple(_of_frame(one, n, route.ticks) for one, route in zip(whole, routes, strict=True))
+
+    def _frame(
+        self, number: int, rows: Floats, seen: tuple[Seen, ...], pushes: Sequence[Floats | None]
+    ) -> None:
+        """Play one frame; `rows` (marks, width) are filled in."""
+        population, hearing = self.population, self.population.hearing
+        marks, pushed = [0] * len(population.members), [0] * len(population.members)
+        now = self.packets[number % hearing.ring]
+        for index, operations in enumerate(hearing.segments):
+            heard = [
+                np.empty((one[index].heard, member.count))
+                for one, member in zip(self.segments, population.members, strict=True)
+            ]
+            for operation in operations:
+                self._hear(operation, number, heard, seen)
+            for g, member in enumerate(population.members):
+                moving, program = self.segments[g][index], member.program
+                push = pushes[g]
+                own = np.empty((0, member.count))
+                if push is not None:
+                    own = push[pushed[g] : pushed[g] + moving.impulses][:, member.rows]
+                pushed[g] += moving.impulses
+                after, sent, recorded = moving.move(self.carries[g], heard[g], own, number)
+                self.carries[g] = after
+                columns = slice(int(hearing.first[g]), int(hearing.first[g + 1]))
+                for row, one in zip(program.segments[index].sent, sent, strict=True):
+                    now[hearing.sent[g][row], columns] = one
+                if program.recorded:
+                    height = len(recorded) // len(program.recorded)
+                    to = slice(
+                        population.columns[g], population.columns[g] + len(program.recorded) * member.count
+                    )
+                    rows[marks[g] : marks[g] + height, to] = recorded.reshape(height, to.stop - to.start)
+                    marks[g] += height
+
+    def _packet(self, number: int, key: int, lag: int) -> Floats:
+        return np.asarray(self.packets[(number - lag) % self.population.hearing.ring, key])
+
+    def _hear(self, one: Operation, number: int, heard: Sequence[Floats], seen: tuple[Seen, ...]) -> None:
+        hearing = self.population.hearing
+        match one:
+            case Total(place, key, lag, ranges):
+                row = self._packet(number, key, lag)
+                self.totals[place] = sum(row[begin:end].sum() for begin, end in ranges)
+            case Complete(g, place, total, key, lag, divisor):
+                own: Floats | float = 0.0
+                if key >= 0:
+                    own = self._packet(number, key, lag)[hearing.first[g] : hearing.first[g + 1]]
+                heard[g][place] = (self.totals[total] - own) / divisor
+            case Weighed(g, place, key, lag, weights):
+                heard[g][place] = _weighed(weights, self._packet(number, key, lag))
+            case Deliver(route, tick):
+                self._deliver(route, seen[route], tick)
+            case OnWays(g, place, route, channel, gap, weights):
+                gone = self.missing[route]
+                what = gone.astype(np.float64) if gap else np.where(gone, 0.0, self.held[route][channel])
+                heard[g][place] = _weighed(weights, what)
+            case Look():
+                heard[one.member][one.row] = self._look(one, number)
+
+    def _deliver(self, place: int, seen: Seen, tick: int) -> None:
+        """Bring in effect what a tick sees on a route."""
+        hearing, route = self.population.hearing, self.population.hearing.routes[place]
+        if route.zero:
+            self.missing[place] = seen.missing[tick]
+        new = np.flatnonzero(seen.packets[tick] != self.effective[place])
+        self.effective[place] = seen.packets[tick]
+        numbers = seen.packets[tick][new]
+        keys = hearing.channels[place][:, numbers % route.slots]
+        columns = hearing.column_of[route.pairs[new, 0]]
+        self.held[place][:, new] = self.packets[numbers // route.slots % hearing.ring, keys, columns]
+
+    def _look(self, one: Look, number: int) -> Floats:
+        """Return what a member makes of each pair."""
+        population = self.population
+        member, missing = population.members[one.member], np.zeros(one.width)
+        if one.route >= 0:
+            gone = self.missing[one.route]
+            sent = np.where(gone, 0.0, self.held[one.route][list(one.channels)])
+            missing = gone.astype(np.float64) if one.gap else missing
+        else:
+            sent = np.array([
+                np.concatenate([
+                    self._packet(number, key, lag)[begin:end]
+                    for key, lag, ranges in source for begin, end in ranges
+                ]) for source in one.sources
+            ]).reshape(len(one.sources), one.width)  # fmt: skip
+        result = np.zeros(member.count) if one.operator not in JOINS else np.full(member.count, np.nan)
+        if not len(one.senders):
+            return np.zeros(member.count)
+        own = np.concatenate([
+            self.carries[one.member][list(one.pairwise.carry)],
+            member.each(member.constants[:, list(one.pairwise.constants)]).T,
+        ])  # fmt: skip
+        key = (one.function, len(one.senders))
+        if key not in self.looks:
+            function: Any = population.hearing.functions[one.function]
+            self.looks[key] = function.map(len(one.senders))
+        t = seconds_at(member.program.schedule, float(number), one.pairwise.now)
+        values = np.asarray(
+            self.looks[key](own[:, one.receivers], sent[:, one.senders], missing[None, one.senders], t)
+        )[0]
+        if one.operator in JOINS:
+            JOINS[one.operator].at(result, one.receivers, values)
+        else:
+            np.add.at(result, one.receivers, one.weights * values)
+        return result
+
+
+def _of_frame(seen: Seen, number: int, ticks: int) -> Seen:
+    """Return what the ticks of one of several frames see."""
+    own = slice(number * ticks, (number + 1) * ticks)
+    return Seen(seen.packets[own], seen.missing[own])
+
+
+def _weighed(weights: Sparse, values: Floats) -> Floats:
+    """Return the weighed sum of each receiver."""
+    count = len(weights.starts) - 1
+    receivers = np.repeat(np.arange(count), np.diff(weights.starts))
+    found = np.bincount(receivers, weights.weights * values[weights.columns], minlength=count)
+    return np.asarray(found, np.float64)
+
+
+class _Moving:
+    """A segment of a member's program, mapped over its peers, with the memory that CasADi works in."""
+
+    def __init__(self, member: Member, segment: Segment) -> None:
+        kernel, count = segment.kernel, member.count
+        self.impulses = kernel.numel_in("impulses")
+        self.heard = len(segment.heard) + len(segment.pairs)
+        self._function = kernel.map(count)  # the buffer looks at it
+        self._buffer, self._call = self._function.buffer()
+        shapes = [(self._function.size1_in(i), self._function.size2_in(i)) for i in range(5)]
+        self._in = [np.zeros(shape, order="F") for shape in shapes]
+        shapes = [(self._function.size1_out(i), self._function.size2_out(i)) for i in range(3)]
+        self._out = [np.zeros(shape, order="F") for shape in shapes]
+        for i, one in enumerate(self._in):
+            self._buffer.set_arg(i, memoryview(one.reshape(-1, order="F").data))
+        for i, one in enumerate(self._out):
+            self._buffer.set_res(i, memoryview(one.reshape(-1, order="F").data))
+        self._in[2][:] = member.each(member.constants).T
+
+    def move(
+        self, carry: Floats, heard: Floats, impulses: Floats, number: int
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return the carry after the segment, what is sent, and the rows: a column a peer."""
+        self._in[0][:], self._in[1][:], self._in[3][:], self._in[4][:] = carry, heard, impulses, number
+        self._call()
+        if self._buffer.ret():
+            raise RuntimeError("a solver gave up")
+        after, sent, rows = self._out
+        return after.copy(), sent, rows
