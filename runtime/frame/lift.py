@@ -1,7 +1,8 @@
 """One frame of one site as one linear map.
 
 Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
-Gives: `FrameMap`, `compose`; `BoundedMap`, `LiftedSite`, `lift`, `bounded`; `follow`, event by event.
+Gives: `FrameMap`, `compose`; `BoundedMap`, `LiftedSite`, `lift`, `bounded`, `composed_bounded`; `follow`,
+event by event.
 Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
 exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
 Does not: know who the others are (see `modes`).
@@ -158,12 +159,17 @@ def bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> 
     Each coefficient carries its own roundings as a radius, and each event adds its own to these (see
     `radius`). The bound holds whatever the scaling of the states.
     """
+    both = composed_bounded(site, schedule, steps)
+    return both.mapped(value_of), both.mapped(radius_of)
+
+
+def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> FrameMap:
+    """Return `bounded` as one map of matrices with their radii."""
     off = {
         duration: with_radius(step.matrix, step.roundings * UNIT * step.size)
         for duration, step in steps.items()
     }
-    both = compose(with_roundings(site), schedule, off, numbers=RADII)
-    return both.mapped(value_of), both.mapped(radius_of)
+    return compose(with_roundings(site), schedule, off, numbers=RADII)
 
 
 def with_roundings(site: LinearSite) -> LinearSite:

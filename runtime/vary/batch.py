@@ -13,7 +13,7 @@ Trapp, SIAM Review 40, 1998), through the composition of the frame; CasADi diffe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import ClosedSystem, close, close_loop, feedback_of
+from apc.eigen.closing import Closed, ClosedSystem, close, close_loop
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
@@ -36,7 +36,7 @@ from apc.frame.batch_lift import (
 from apc.frame.discretize import UNIT, Step, exponential_rows
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import FrameMap, compose, lift, roundings_of, with_roundings
+from apc.frame.lift import FrameMap, compose, composed_bounded, lift, roundings_of, with_roundings
 from apc.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
 from apc.frame.parameters import free_rows
@@ -94,6 +94,30 @@ class Evaluator(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Lift:
+    """A group's sites at k points: their matrices, exponentials by quanta, and frames with their radii."""
+
+    site: LinearSite
+    steps: Mapping[int, Step]
+    frame: FrameMap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bounded:
+    """A closed system at k points.
+
+    `matrix` is that of relative coordinates, NaN where the motions taken out are not rigid, and `error` bounds
+    what it is off by; `whole` is that of the whole state, `heard` what each site hears over it.
+    """
+
+    matrix: Floats  # (k, m, m)
+    error: Floats  # (k, m, m)
+    whole: Floats  # (k, n, n)
+    heard: tuple[Floats, ...]  # (n_r, n) or (k, n_r, n), one a site
+    sites: tuple[Lift, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BatchEvaluator:
     """An `Evaluator` of a scene whose matrices follow from its parameters in closed form.
 
@@ -110,7 +134,7 @@ class BatchEvaluator:
     wirings: tuple[Wiring, ...]
     durations: Mapping[int, tuple[float, float]]
     tangents: Mapping[str, Any]  # casadi.Function by the kind's name
-    fixed: Mapping[tuple[int, int], Mapping[int, Matrices]]  # exponentials that nothing free reaches
+    fixed: Mapping[tuple[int, int], Mapping[int, Step]]  # exponentials that nothing free reaches
 
     @property
     def closed(self) -> tuple[ClosedSystem, ...]:
@@ -204,22 +228,59 @@ class BatchEvaluator:
                 found[site_key(group)] = self._lift(group, values)
         return found
 
+    def bounded(self, vectors: Callable[[PeerGroup], Floats]) -> tuple[Bounded, ...]:
+        """Return each system at k points with bounds on all its errors; no time varies.
+
+        Parameters
+        ----------
+        vectors
+            Gives the parameters of a group at each point (k, n_p), or (1, n_p) where no value reaches it.
+        """
+        assert not self.timed, "the errors of a step belong to its time"
+        lifts: dict[tuple[int, int], Lift] = {}
+        for group in self.groups:
+            if site_key(group) not in lifts:
+                lifts[site_key(group)] = self._lift_bounded(group, vectors(group))
+        maps = {key: one.frame for key, one in lifts.items()}
+        found = []
+        for wiring in self.wirings:
+            closed = _closed_bounded(wiring, maps)
+            whole, error = value_of(closed.matrix), radius_of(closed.matrix)
+            at, sound = relative_at(wiring, whole)
+            matrix, off = relative_bounded(whole, error, at)
+            sound = sound & np.isfinite(off).all(axis=(1, 2))
+            matrix = np.where(sound[:, None, None], matrix, np.nan)
+            sites = tuple(lifts[site_key(group)] for group in wiring.system.sites)
+            found.append(Bounded(matrix, off, whole, tuple(map(value_of, closed.heard)), sites))
+        return tuple(found)
+
+    def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> Lift:
+        site, steps, lost = self._placed(group, linearize_rows(group.jacobians, vectors), np.zeros((1, 1)))
+        with np.errstate(all="ignore"):
+            frame = composed_bounded(site, group.schedule, steps)
+        _lose(frame, lost)
+        return Lift(site, steps, frame)
+
     def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
-        built, schedule = group.jacobians, group.schedule
-        rows = self.rows(built, self.vectors(group, values))
-        site = sites_of_rows(built, rows)
+        site, steps, lost = self._placed(group, self.rows(group.jacobians, self.vectors(group, values)), values)
+        with np.errstate(all="ignore"):
+            frame = compose(site, group.schedule, {quanta: step.matrix for quanta, step in steps.items()})
+        _lose(frame, lost)
+        return frame
+
+    def _placed(
+        self, group: PeerGroup, rows: Matrices, values: Matrices
+    ) -> tuple[LinearSite, Mapping[int, Step], NDArray[np.bool_]]:
+        """Return a group's sites with their exponentials, and which of them are beyond any."""
+        site = sites_of_rows(group.jacobians, rows)
         beyond = _beyond(site.a, site.b)
         steps = self.fixed.get(site_key(group))
         if steps is None:
             site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
             steps = self.steps(site, values)
-        with np.errstate(all="ignore"):
-            frame = compose(site, schedule, steps)
-        lost = beyond if len(beyond) == len(frame.p) else slice(0, len(frame.p) if beyond.any() else 0)
-        frame.p[lost] = frame.q[lost] = np.nan
-        return frame
+        return site, steps, beyond
 
-    def steps(self, site: LinearSite, values: Matrices) -> dict[int, Matrices]:
+    def steps(self, site: LinearSite, values: Matrices) -> dict[int, Step]:
         """Return the exponentials of every step, one for all points where A, B and the time stay."""
         a, b = _shared(site.a, site.b)
         steps = {}
@@ -231,7 +292,7 @@ class BatchEvaluator:
                 gone = np.abs(seconds) < VANISHING * abs(constant)
                 seconds = np.where(gone, seconds - seconds.real, seconds)
             with np.errstate(all="ignore"):
-                steps[quanta] = exponential_rows(a * seconds, b * seconds, 1.0).matrix
+                steps[quanta] = exponential_rows(a * seconds, b * seconds, 1.0)
         return steps
 
     def rows(self, built: SiteJacobians, vectors: Matrices) -> Matrices:
@@ -318,11 +379,11 @@ def _generic(count: int) -> tuple[Floats, Floats]:
     return 0.5 + np.mod(GENERIC_POINT * places, 1.0)[None], 0.5 + np.mod(GENERIC_RATIO * places, 1.0)[None]
 
 
-def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Matrices]]:
+def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step]]:
     """Return the exponentials of the groups whose A and B no free parameter moves, at a meaningless point."""
     if evaluator.timed:
         return {}
-    found: dict[tuple[int, int], Mapping[int, Matrices]] = {}
+    found: dict[tuple[int, int], Mapping[int, Step]] = {}
     point, along = _generic(len(evaluator.free))
     for group in evaluator.groups:
         if site_key(group) in found:
@@ -352,18 +413,18 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
         bounded[site_key(group)] = lift_rows(group.jacobians, group.schedule, rows).bounded
     found = []
     for wiring in evaluator.wirings:
-        closed = _closed_bounded(wiring, bounded)
+        closed = _closed_bounded(wiring, bounded).matrix
         matrix, error = value_of(closed), radius_of(closed)
         _, own = relative_bounded(matrix, error, _relative_here(wiring, matrix, error))
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
 
 
-def _closed_bounded(wiring: Wiring, maps: Mapping[tuple[int, int], FrameMap]) -> Matrices:
+def _closed_bounded(wiring: Wiring, maps: Mapping[tuple[int, int], FrameMap]) -> Closed:
     """Return the closed matrices (k, 2, n, n) of a system with their radii, from such maps of its sites."""
     system = wiring.system
     sites = [maps[site_key(group)] for group in system.sites]
-    return close(sites, feedback_of(system, system.layout), system.layout, numbers=RADII).matrix
+    return close(sites, wiring.feedback, system.layout, numbers=RADII)
 
 
 def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tuple[Floats, ...]:
@@ -393,7 +454,7 @@ def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tu
         bounded[site_key(group)] = frame.mapped(with_radius, both)
     found = []
     for wiring, error in zip(evaluator.wirings, matrix_errors(evaluator, values), strict=True):
-        closed = _closed_bounded(wiring, bounded)
+        closed = _closed_bounded(wiring, bounded).matrix
         matrix, off = value_of(closed), radius_of(closed).imag / STEP
         at = relative_at(wiring, matrix)[0]
         turned = np.abs(at.weights.imag / STEP)
@@ -500,6 +561,12 @@ def _beyond(a: Matrices, b: Matrices) -> NDArray[np.bool_]:
     size = np.abs(a).sum(axis=(1, 2)) + np.abs(b).sum(axis=(1, 2))
     beyond: NDArray[np.bool_] = ~(size < LARGEST)
     return beyond
+
+
+def _lose(frame: FrameMap, lost: NDArray[np.bool_]) -> None:
+    """Make NaN of the frames of sites that have no exponentials."""
+    which = lost if len(lost) == len(frame.p) else slice(0, len(frame.p) if lost.any() else 0)
+    frame.p[which] = frame.q[which] = np.nan
 
 
 def _shared(a: Matrices, b: Matrices) -> tuple[Matrices, Matrices]:

@@ -44,7 +44,7 @@ class Wiring:
     """
 
     system: ClosedSystem
-    feedback: tuple[Feedback, ...]  # one a site
+    feedback: tuple[Feedback, ...]  # one a site, with its radii
     rigid: RigidModes
     relative: Relative
     moving: bool  # the directions follow the free parameters, and W with them
@@ -57,7 +57,7 @@ def site_key(group: PeerGroup) -> tuple[int, int]:
 
 def wire(system: ClosedSystem) -> Wiring:
     """Take down who hears whom in a closed system, and its rigid motions."""
-    feedback = tuple(one.plain for one in feedback_of(system, system.layout))
+    feedback = tuple(feedback_of(system, system.layout))
     rigid = find_rigid_modes(system, with_drifts=False)
     wiring = _without(system, feedback, rigid)
     if rigid.names:
@@ -98,7 +98,7 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
 def closed_loop(wiring: Wiring, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
     """Close the loop of one system at all points: its matrices (k, n, n), see `closing.close`."""
     maps = [lifted[site_key(group)] for group in wiring.system.sites]
-    return close(maps, wiring.feedback, wiring.system.layout).matrix
+    return close(maps, [one.plain for one in wiring.feedback], wiring.system.layout).matrix
 
 
 def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
