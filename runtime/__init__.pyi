@@ -8,6 +8,9 @@ from .api import (
     analyze as analyze,
 )
 from .api import (
+    analyze_many as analyze_many,
+)
+from .api import (
     bench as bench,
 )
 from .api import (
@@ -65,6 +68,7 @@ from .regions.region import Region as Region
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.sweep import Sweep as Sweep
 from .vary.critical import Critical as Critical
+from .vary.many import Analyses as Analyses
 from .vary.margins import Margins as Margins
 from .vary.sensitivity import Sensitivities as Sensitivities
 

@@ -56,7 +56,7 @@ HOUSE = (
         "apc.eigen",
         """
         graph_modes peer_group listening peers closing graph_loops modes
-        rigid pseudospectrum relative eigenpairs enclosure balls roots certify ratios spectrum
+        rigid pseudospectrum dominant relative eigenpairs enclosure balls roots certify ratios spectrum
         """,
     ),
     (
@@ -76,8 +76,8 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch crossings plane bracket counting loops evaluator bends marginal delays lags search
-        critical margins sensitivity
+        wiring batch crossings plane bracket counting loops evaluator leading many bends marginal delays lags
+        search critical margins sensitivity
         """,
     ),
     ("apc", "answer"),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.overrides import apply, parse_override
+from apc.sweeps.grid import build_grid, parse_axis
 from apc.sweeps.quantities import QUANTITIES, faulty, find_quantity
 from apc.sweeps.sweep import sweep
 from tests.sweeping import CHEAP
 from tests.topologies import compiled, told
 
 MODEL = compiled(CHEAP)
+GRID = build_grid([parse_axis(MODEL, "tick.period", "1,2 ms")])
 
 
 @pytest.mark.parametrize("text", ["analyze", "critical:it.stiffness"])
@@ -20,15 +21,15 @@ def test_every_quantity_has_verdict_first_and_message_last(text: str) -> None:
     quantity = find_quantity(MODEL, text)
     names = [column.name for column in quantity.columns]
     assert (names[0], names[-1]) == ("verdict", "message")
-    assert len(quantity.evaluate(MODEL)) == len(names)
+    (row,) = quantity.rows(GRID, [0])
+    assert len(row) == len(names)
 
 
 def test_a_row_does_not_depend_on_the_rows_before() -> None:
     quantity = find_quantity(MODEL, "analyze")
-    first = quantity.evaluate(MODEL)
-    slower = apply(MODEL, [parse_override(MODEL, "tick.period=2 ms")])
-    assert quantity.evaluate(slower) != first
-    assert quantity.evaluate(MODEL) == first == find_quantity(MODEL, "analyze").evaluate(MODEL)
+    first, slower = quantity.rows(GRID, [0])[0], quantity.rows(GRID, [1])[0]
+    assert slower != first
+    assert quantity.rows(GRID, [0])[0] == first == find_quantity(MODEL, "analyze").rows(GRID, [0])[0]
 
 
 def test_the_critical_stiffness_of_a_wall_is_swept_over_its_delay() -> None:

@@ -1,7 +1,8 @@
 """Is it stable, and by how much: the whole road from a compiled system to its spectrum.
 
 Takes: a `CompiledSystem`.
-Gives: `Analysis`, `analyze`; `Prepared`, `prepare` and `prepare_at_start` for many analyses of one system.
+Gives: `Analysis`, `analyze`; `Prepared`, `prepare`, `timed` and `prepare_at_start` for many analyses of one
+system.
 Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
 delay; of equal input comes equal output.
 Does not: read files, or draw.
@@ -163,7 +164,7 @@ def analyze(
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         numbers = resolve(system)
-        prepared = _timed(system, prepared or prepare(system), numbers)
+        prepared = timed(system, prepared or prepare(system), numbers)
         exchange = build_exchange(system, numbers.timings)
         plan = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange, method)
         if not plan.groups:
@@ -317,14 +318,14 @@ def lifted_groups(
         As `plan.refuse_varying` and `peers.peer_groups`.
     """
     numbers = resolve(system)
-    prepared = _timed(system, prepared or prepare(system), numbers)
+    prepared = timed(system, prepared or prepare(system), numbers)
     refuse_varying(system, prepared.jacobians)
     exchange = build_exchange(system, numbers.timings)
     groups = peer_groups(system, prepared.jacobians, prepared.schedules, numbers, exchange)
     return groups, exchange
 
 
-def _timed(system: CompiledSystem, prepared: Prepared, numbers: Numbers) -> Prepared:
+def timed(system: CompiledSystem, prepared: Prepared, numbers: Numbers) -> Prepared:
     """Return what was prepared, with the schedules of these timings."""
     if numbers.timings == prepared.timings:
         return prepared

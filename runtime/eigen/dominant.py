@@ -1,7 +1,7 @@
 """The largest eigenvalue of each of many matrices, with a bound, by products of small matrices alone.
 
 Takes: matrices (k, n, n), and bounds on what each entry may be off by.
-Gives: `Dominant`, `powers_of`, `dominant`; `all_within`; `misses_one`.
+Gives: `largest_pairs`; `Dominant`, `enclosed`; `all_within`, `misses_one`.
 Guarantees: the bounds hold for every matrix within the errors, whatever their conditioning; rounding in the
 bounds themselves is charged. What is not shown is said to be open, never guessed.
 Does not: give the other eigenvalues (see `enclosure`), or decide where two are about as large.
@@ -41,15 +41,18 @@ Complexes = NDArray[np.complex128]
 Truths = NDArray[np.bool_]
 Matrix = NDArray[Any]
 
-# M is squared so many times: what is smaller than the largest by 4 % is then gone to rounding; where it is not
-# gone, so many times more, which leaves nothing of what is smaller by 0.1 %.
-SQUARINGS, MORE = 10, 6
+# M is squared so many times: what is smaller than the largest by an eighth is then gone to rounding; where it
+# is not gone, so many times more, which leaves nothing of what is smaller by 0.1 %.
+SQUARINGS, MORE = 8, 8
+
+# After so many squarings the largest entry is brought to 1: none has left the range of floats by then.
+EVERY = 3
 
 # A power of a matrix with one largest eigenvalue is of rank 1 up to this.
 ALONE = 1e-8
 
 # A residual up to which vectors are taken as they are, relative to these.
-SETTLED = 1e-11
+SETTLED = 1e-14
 
 # The largest has to be larger than the others by this share of it; its own bound has to be smaller.
 APART = 1e-6
@@ -72,50 +75,54 @@ class Dominant:
     value: Complexes  # (k,)
     error: Floats  # (k,)
     others: Floats  # (k,)
-    right: Complexes  # (k, n)
-    left: Complexes  # (k, n)
 
 
-def dominant(matrix: Floats, error: Floats) -> Dominant:
-    """Find and enclose the largest eigenvalue of each of many matrices.
+def largest_pairs(matrix: Floats) -> tuple[Complexes, Complexes, Complexes]:
+    """Return the largest eigenvalue (k,) of each of many matrices, and its right and left vectors (k, n).
+
+    Nothing says here that they are; where there is nothing to find they are NaN.
 
     Parameters
     ----------
-    matrix, error
-        Real matrices (k, n, n), their states scaled alike (see `pseudospectrum.balance`), and a bound on what
-        each entry is off by.
+    matrix
+        Real matrices (k, n, n), their states scaled alike (see `pseudospectrum.balance`).
     """
     with np.errstate(all="ignore"):
-        value, right, left = _largest_pairs(matrix, SQUARINGS)
+        power = _squared(matrix / _peaks(matrix), SQUARINGS)
+        value, right, left = _left_by(power, matrix)
         moved = (matrix @ right[:, :, None])[:, :, 0] - value[:, None] * right
-        again = ~(np.abs(moved).max(axis=1, initial=0.0) <= SETTLED * np.abs(value))
-        if again.any():
-            value[again], right[again], left[again] = _largest_pairs(matrix[again], SQUARINGS + MORE)
-        return _enclosed(matrix, error, value, right, left)
+        again = np.flatnonzero(~(np.abs(moved).max(axis=1, initial=0.0) <= SETTLED * np.abs(value)))
+        if len(again):
+            some = matrix[again]
+            value[again], right[again], left[again] = _left_by(_squared(power[again], MORE), some)
+        return value, right, left
 
 
-def _largest_pairs(matrix: Floats, squarings: int) -> tuple[Complexes, Complexes, Complexes]:
-    """Return the eigenvalue (k,), and its right and left vectors (k, n), that a power of each matrix leaves."""
-    k, n = len(matrix), matrix.shape[-1]
-    power = matrix / _peaks(matrix)
-    for _ in range(squarings):
+def _squared(power: Floats, times: int) -> Floats:
+    """Square matrices (k, n, n) so many times, and bring their largest entries to 1."""
+    for time in range(times):
         power = power @ power
-        power /= _peaks(power)
-    # What is left is of rank 1 or 2: its largest entry's column and row, and those of the rest.
+        if time % EVERY == EVERY - 1 or time == times - 1:
+            power /= _peaks(power)
+    return power
+
+
+def _left_by(power: Floats, matrix: Floats) -> tuple[Complexes, Complexes, Complexes]:
+    """Return the eigenvalue (k,), and its right and left vectors (k, n), that a power of a matrix leaves."""
+    # It is of rank 1 or 2: its largest entry's column and row, and those of the rest.
     one = _cross(power)
     rest = power - one[0][:, :, None] * one[1][:, None]
     two = _cross(rest)
-    alone = ~(np.abs(rest).reshape(k, -1).max(axis=1) > ALONE)
+    alone = ~(np.abs(rest).max(axis=(1, 2)) > ALONE)
     right, left = np.stack([one[0], two[0]], axis=2), np.stack([one[1], two[1]], axis=1)
     form, pairing = left @ (matrix @ right), left @ right
     form[alone, 1], form[alone, 0, 1] = 0.0, 0.0
     pairing[alone, 1], pairing[alone, :, 1] = 0.0, [0.0, 1.0]
     value, along, across = _larger(_solved(pairing, form))
-    right = (right @ along[:, :, None])[:, :, 0]
-    left = (_solved(pairing.swapaxes(1, 2), across[:, :, None]).swapaxes(1, 2) @ left)[:, 0]
-    right /= np.abs(right).max(axis=1, keepdims=True)
-    left /= (left * right).sum(axis=1, keepdims=True)
-    return value, right, left
+    v = (right @ along[:, :, None])[:, :, 0]
+    w = (_solved(pairing.swapaxes(1, 2), across[:, :, None]).swapaxes(1, 2) @ left)[:, 0]
+    v = v / np.abs(v).max(axis=1, keepdims=True)
+    return value, v, w / (w * v).sum(axis=1, keepdims=True)
 
 
 def _peaks(matrix: Floats) -> Floats:
@@ -151,10 +158,21 @@ def _larger(form: Floats) -> tuple[Complexes, Complexes, Complexes]:
     return value, along, across
 
 
-def _enclosed(
-    matrix: Floats, error: Floats, value: Complexes, right: Complexes, left: Complexes
-) -> Dominant:
-    """Bound what the eigenvalues are off by, see the notes above."""
+def enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes, left: Complexes) -> Dominant:
+    """Bound what the largest eigenvalues are off by, and show that they are the largest.
+
+    Parameters
+    ----------
+    matrix, error
+        The matrices (k, n, n), and a bound on what each entry is off by.
+    value, right, left
+        From `largest_pairs`.
+    """
+    with np.errstate(all="ignore"):
+        return _enclosed(matrix, error, value, right, left)
+
+
+def _enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes, left: Complexes) -> Dominant:
     n = matrix.shape[-1]
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
     a, b = value.real[:, None, None], value.imag[:, None, None]
@@ -194,14 +212,14 @@ def _enclosed(
     within = _resolvent(remainder / others[:, None, None])
     slack = within * (away + 2 * UNIT * large) / others
     second = inverse * apart**2 * rest_x * rest_w * 2 * within / others
-    mixed = inverse * norm_w * rest_x + second
     radius = first + inverse * wrong * norm_w * rest_x + second
-    radius += np.where(paired, 2 * mixed * mixed / np.abs(value.imag), 0.0)
+    mixed = radius  # |w R v̄| has the bound of |w R v|
+    radius = radius + np.where(paired, 2 * mixed * mixed / np.abs(value.imag), 0.0)
     radius *= 1 + 64 * charge
     known = (wrong < 0.1) & (slack < 0.5) & (radius < APART / 2 * size)
     known &= ~paired | (mixed < np.abs(value.imag) / 4)
     nothing = np.where(known, 0.0, np.nan)
-    return Dominant(value + nothing, radius + nothing, others + nothing, right, left)
+    return Dominant(value + nothing, radius + nothing, others + nothing)
 
 
 def all_within(matrix: Floats, error: Floats, radius: Floats) -> Truths:
@@ -258,5 +276,5 @@ def _resolvent(matrix: Floats) -> Floats:
 
 def _norms(matrix: Floats) -> Floats:
     """Return upper bounds on the 2-norms of matrices (k, n, m)."""
-    flat = matrix.reshape(len(matrix), -1)
+    flat = matrix.reshape(len(matrix), matrix.shape[1] * matrix.shape[2])
     return np.asarray(np.sqrt(np.einsum("ki,ki->k", flat, flat)) * (1 + 4 * flat.shape[1] * UNIT) + HIDDEN)

@@ -1,7 +1,7 @@
 """What a mode does inside a frame: by how much it turns, whole turns counted.
 
 Takes: a site with its schedule, its state at a frame's start and what it hears, as a mode has them.
-Gives: `turns`.
+Gives: `turns`, of one site in many modes; `turns_of_many`, of many sites, each in a mode of its own.
 Guarantees: between events the motion is followed along the exact exponential, as finely as it takes; what
 can't be told is NaN.
 Does not: find modes (see `spectrum`).
@@ -14,6 +14,7 @@ vector are real, each change of sign is half a turn.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from apc.frame.discretize import exponential
 from apc.frame.lift import follow
 from apc.frame.schedule import Propagate, Schedule
-from apc.frame.site import LinearSite
+from apc.frame.site import LinearSite, every_matrix
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -33,6 +34,9 @@ FEWEST, A_TURN = 4, 16
 
 # How often they may be doubled until two counts agree, and how many numbers are held at once.
 DOUBLINGS, MOST = 8, 2**22
+
+# Of many sites, so many points at most from one event to the next.
+A_FEW = 256
 
 # From point to point a motion that turns by less is followed closely enough.
 CLOSE = 1.0
@@ -92,6 +96,91 @@ def turns(
             seen[some[agreed]] = True
         left = left[~seen[left]]
     return found
+
+
+def turns_of_many(
+    site: LinearSite,
+    schedule: Schedule,
+    start: Complexes,
+    heard: Complexes,
+    states: Integers,
+    values: Complexes,
+) -> Floats:
+    """Return by how much a mode of each of many sites turns in a frame (k,), see `turns`; NaN sooner.
+
+    Parameters
+    ----------
+    site, schedule
+        The sites' matrices (k, …), or (1, …) of what all have in common, and what happens in their frame.
+    start, heard
+        Their states z at the frame's start (k, n_z), and what they hear r (k, n_r).
+    states, values
+        Which continuous state is followed (k,), and the eigenvalues (k,).
+    """
+    found = np.full(len(values), np.nan)
+    swing = float(np.abs(np.linalg.eigvals(site.a).imag).max(initial=0.0)) / (2 * np.pi)
+    durations = {event.duration for event in schedule.events if isinstance(event, Propagate)}
+    left = np.arange(len(values))
+    for doubled in (0, 1):
+        points = {
+            duration: _power_of_two(A_TURN * swing * float(duration * schedule.quantum), doubled)
+            for duration in durations
+        }
+        if max(points.values(), default=0) > A_FEW or not len(left):
+            break
+        mine = every_matrix(site, partial(_some_of, left))
+        course = _courses(mine, schedule, points, start[left], heard[left], states[left])
+        angle, widest = turned_along(course)
+        agreed = widest < CLOSE
+        if doubled:
+            agreed |= np.abs(angle - turned_along(course[::2])[0]) < OFF
+        found[left[agreed]] = _of_eigenvalue(angle[agreed], values[left[agreed]])
+        left = left[~agreed]
+    return found
+
+
+def _some_of(places: Integers, matrix: Floats) -> Floats:
+    return matrix if len(matrix) == 1 else matrix[places]
+
+
+def _courses(
+    site: LinearSite,
+    schedule: Schedule,
+    points: dict[int, int],
+    start: Complexes,
+    heard: Complexes,
+    states: Integers,
+) -> Complexes:
+    """Return the state followed of each site at so many points of each step, and the end (points, k)."""
+    n_x, n_u = site.b.shape[-2:]
+    a, b = site.a, site.b
+    below = np.eye(n_x + n_u)[n_x:]
+    steps, fine = {}, {}
+    for duration, number in points.items():
+        step = exponential_rows(a, b, float(duration * schedule.quantum) / number).matrix
+        power = np.concatenate([step, np.broadcast_to(below, (len(step), *below.shape))], axis=1)
+        # Rows of the powers 0, 1, … of a step: of the state that is followed.
+        rows = np.zeros((len(states), 1, n_x + n_u))
+        rows[np.arange(len(states)), 0, states] = 1.0
+        for _ in range(number.bit_length() - 1):
+            rows = np.concatenate([rows, rows @ power], axis=1)
+            power = power @ power
+        fine[duration] = rows
+        steps[duration] = power[:, :n_x]
+    halves = [np.stack([one.real, one.imag], axis=-1) for one in (start, heard)]
+    parts: list[NDArray[Any]] = []
+
+    def watch(duration: int, moving: NDArray[Any]) -> None:
+        parts.append(fine[duration] @ moving)
+
+    course = follow(site, schedule, steps, halves[0], lambda row: halves[1][:, row], watch=watch)
+    while True:
+        try:
+            next(course)
+        except StopIteration as end:
+            last = np.take_along_axis(end.value, states[:, None, None], axis=1)
+            path = np.concatenate([*parts, last], axis=1)
+            return np.ascontiguousarray((path[..., 0] + 1j * path[..., 1]).T)
 
 
 def _power_of_two(least: float, doubled: int) -> int:

@@ -273,14 +273,14 @@ def follow(
     n_x = len(site.kind.states)
     nothing = np.zeros((*start.shape[:-2], start.shape[-1]), dtype=start.dtype)
     value: dict[Value, Matrix] = {one: start[..., n_x + row, :] for row, one in enumerate(schedule.carried)}
-    many = np.broadcast_shapes(*(one.shape[:-2] for one in (site.a, start, *steps.values())))
-    number = np.result_type(start, site.a, *steps.values())
+    sends = [np.concatenate([send.x, send.u], axis=-1) for send in site.sends]
+    ticks = [np.concatenate([tick.x, tick.u, tick.m, tick.r], axis=-1) for tick in site.ticks]
+    parts = (site.a, start, *steps.values(), *sends, *ticks)
+    many, number = np.broadcast_shapes(*(one.shape[:-2] for one in parts)), np.result_type(*parts)
     # The continuous states above what the holds put out: a step multiplies both at once.
     acting = [nothing if one is None else value.get(one, nothing) for one in schedule.acting]
     x = np.broadcast_to(start[..., :n_x, :].astype(number), (*many, n_x, start.shape[-1]))
     moving = _over(x, acting)
-    sends = [np.concatenate([send.x, send.u], axis=-1) for send in site.sends]
-    ticks = [np.concatenate([tick.x, tick.u, tick.m, tick.r], axis=-1) for tick in site.ticks]
     for event in schedule.events:
         match event:
             case Propagate(duration):

@@ -22,9 +22,6 @@ from apc.frame.parameters import exact_numbers
 from apc.frame.site import LinearSite, assemble, cut, matrices_of, with_own_parts
 from apc.frame.start import Listening, start_arguments
 
-# Parameter vectors evaluated by one call: of many more at once, CasADi's copies take longer than its work.
-MAPPED = 1024
-
 
 def linearize(
     site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None = None
@@ -127,15 +124,18 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     The rows (k, …) hold what `site_of_row` makes a site of.
     """
     assert site.parameters_suffice, "the start matters"
-    zeros = [np.zeros(site.function.numel_in(argument)) for argument in range(4)]
-    rows = np.empty((len(parameters), site.function.numel_out(0)))
-    many = None
-    for start in range(0, len(parameters), MAPPED):
-        some = parameters[start : start + MAPPED]
-        if many is None or len(some) != MAPPED:
-            many = site.function.map(len(some))
-        flats = many(*(np.repeat(zero[:, None], len(some), axis=1) for zero in zeros), some.T, 0.0)
-        rows[start : start + MAPPED] = np.asarray(flats, dtype=np.float64).reshape(-1, len(some)).T
+    count, function = len(parameters), site.function
+    rows = np.empty((count, function.numel_out(0)))
+    if not rows.size:
+        return rows
+    # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
+    buffer, evaluate = function.map(count).buffer()
+    given = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
+    given[4] = np.array(parameters, dtype=np.float64, order="C").ravel()
+    for place, numbers in enumerate(given):
+        buffer.set_arg(place, memoryview(numbers))
+    buffer.set_res(0, memoryview(rows.reshape(-1)))
+    evaluate()
     return rows + 0.0  # −0 and 0 are one number
 
 

@@ -1,4 +1,4 @@
-"""Critical values, margins, sensitivities and sweeps as text, plain data and tables.
+"""Critical values, margins, sensitivities, sweeps and many analyses as text, plain data and tables.
 
 Takes: results of `vary` and `sweeps`. Gives: their texts, documents and tables.
 Guarantees: a number is shown to the digits that its error leaves known.
@@ -11,6 +11,8 @@ import math
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+from numpy.typing import NDArray
+
 from apc.compiler.words import counted, in_hertz, known_digits, measured, with_unit, wrapped
 from apc.optional import need
 from apc.present.forms import document, note
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
     from apc.sweeps.sweep import Sweep
     from apc.vary.critical import Critical
+    from apc.vary.many import Analyses
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities, Sensitivity
 
@@ -144,6 +147,52 @@ def sensitivities_document(found: Sensitivities) -> dict[str, Any]:
     }
 
 
+def analyses_text(found: Analyses) -> str:
+    """Return many analyses in a few lines: what varied, the verdicts."""
+    lines = [f"{found.topology}: {found.verdict.size:,} points"]
+    for text in found.left_out:
+        lines += note(text)
+    for name, values in zip(found.parameters, found.values, strict=True):
+        lines.append(f"  {name}: {values.min():g} … {values.max():g}")
+    return "\n".join([*lines, *_verdict_lines(found.verdict.ravel(), found.message.ravel())])
+
+
+def analyses_document(found: Analyses) -> dict[str, Any]:
+    """Return many analyses as plain data, a list a column."""
+    columns = {heading: column.tolist() for heading, column in _analyses_columns(found).items()}
+    return {"topology": found.topology, "left_out": list(found.left_out), **document(columns)}
+
+
+def analyses_table(found: Analyses) -> pandas.DataFrame:
+    """Return many analyses as a pandas table, a row a point."""
+    return need("pandas", "data").DataFrame(_analyses_columns(found))
+
+
+def _analyses_columns(found: Analyses) -> dict[str, NDArray[Any]]:
+    columns = {
+        "verdict": found.verdict,
+        "spectral_radius": found.spectral_radius,
+        "spectral_radius_error": found.spectral_radius_error,
+        "rigid_modes": found.rigid_modes,
+        "frequency [Hz]": found.frequency_hz,
+        "damping_ratio": found.damping_ratio,
+        "message": found.message,
+    }
+    every = {**dict(zip(found.parameters, found.values, strict=True)), **columns}
+    return {heading: column.ravel() for heading, column in every.items()}
+
+
+def _verdict_lines(verdicts: NDArray[Any], messages: NDArray[Any]) -> list[str]:
+    """Return how many points have each verdict, and what most of those at fault say."""
+    counts = sorted(Counter(verdicts.tolist()).items(), key=lambda item: (-item[1], item[0]))
+    lines = [f"  {count:>10,} × {verdict}" for verdict, count in counts]
+    said = Counter(cell for cell in messages.tolist() if cell)
+    if said:
+        text, count = said.most_common(1)[0]
+        lines += note(f"at {count:,} of them: {text}")
+    return lines
+
+
 def sweep_text(found: Sweep) -> str:
     """Return a sweep in a few lines: where the rows are, what was swept, the verdicts."""
     where = f" → {found.out}" if found.out else ""
@@ -155,11 +204,7 @@ def sweep_text(found: Sweep) -> str:
         lines.append(
             f"  {axis.free.label}: {with_unit(ends, axis.unit)}, {counted(len(axis.values), 'value')}"
         )
-    lines += [f"  {count:>10,} × {verdict}" for verdict, count in found.verdicts]
-    messages = Counter(cell for cell in found.columns[-1].tolist() if cell)
-    if messages:
-        text, count = messages.most_common(1)[0]
-        lines += note(f"at {count:,} of them: {text}")
+    lines += _verdict_lines(found.column("verdict"), found.column("message"))
     return "\n".join([*lines, *(f"  note: {one}" for one in found.notes)])
 
 

@@ -15,6 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
+import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import PEERS, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.names import Free, find, unit_of
@@ -64,6 +67,11 @@ class Grid:
             point, place = divmod(point, len(axis.values))
             found.append(axis.values[place])
         return tuple(reversed(found))
+
+    def places(self, points: Sequence[int]) -> NDArray[np.int64]:
+        """Return which of each axis's values some points have (k, axes)."""
+        sizes = [len(axis.values) for axis in self.axes]
+        return np.stack(np.unravel_index(np.asarray(points, dtype=np.int64), sizes), axis=1)
 
     def overrides(self, point: int) -> tuple[Override, ...]:
         """Return what a point sets."""

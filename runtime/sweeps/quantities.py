@@ -2,28 +2,29 @@
 
 Takes: a `CompiledSystem` and a name such as `analyze` or `critical:coordination.stiffness`.
 Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`.
-Guarantees: what all points share is prepared once; a row depends on its point's numbers alone, not on the
-points before it; a number that isn't finite is left out of a row.
+Guarantees: what all points share is prepared once; a row does not depend on the parts computed before; a
+point that can't be computed is a row that says why; a number that isn't finite is left out of a row.
 Does not: choose points, or hold results.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from apc.analysis.analysis import analyze, prepare
+import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.eigen.spectrum import finite
-from apc.frame.names import find, unit_of
+from apc.frame.names import Free, find, unit_of
+from apc.frame.overrides import apply
+from apc.sweeps.grid import Grid
 from apc.tables import Column, Row
+from apc.vary.many import FAULT, ManyAnalyses, Varied, by_matrices, many_analyses
 
 PLACE = Place("sweep")
-
-# What stands in the verdict's column of a point whose numbers can't be computed with.
-FAULT = "error: "
-
 
 VERDICT = Column("verdict", "", "text")
 MESSAGE = Column("message", "", "text")
@@ -31,13 +32,15 @@ MESSAGE = Column("message", "", "text")
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A result of one point: `evaluate` gives a row's cells, in the order of `columns`.
+    """A result of every point: `rows` gives the rows of some points of a grid, cells in order of `columns`.
 
-    The first column is the verdict, the last a message, empty but where a point is at fault.
+    The first column is the verdict, the last a message, empty but where a point is at fault. `quick` says that
+    a point takes next to no time, so that many make a part of the work.
     """
 
     columns: tuple[Column, ...]
-    evaluate: Callable[[CompiledSystem], Row]
+    rows: Callable[[Grid, Sequence[int]], list[Row]]
+    quick: bool = False
 
 
 def find_quantity(system: CompiledSystem, text: str) -> Quantity:
@@ -82,22 +85,31 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
         Column("damping_ratio", "", "number"),
         MESSAGE,
     )
-    prepared = prepare(system)
+    made: list[tuple[Grid, ManyAnalyses]] = []
 
-    def evaluate(changed: CompiledSystem) -> Row:
-        found = analyze(changed, prepared=prepared)
-        leading = found.modes[0] if found.modes else None
-        return (
-            found.verdict,
-            finite(found.spectral_radius),
-            finite(found.spectral_radius_error),
-            found.rigid_modes,
-            finite(leading.frequency_hz) if leading else None,
-            finite(leading.damping_ratio) if leading else None,
-            "",
-        )
+    def rows(grid: Grid, points: Sequence[int]) -> list[Row]:
+        if not made or made[0][0] is not grid:
+            varied = [
+                Varied(Free(axis.name, axis.group), np.array([float(value) for value in axis.values]), exact)
+                for axis in grid.axes
+                for exact in [axis.values.__getitem__]
+            ]
+            made[:] = [(grid, many_analyses(system, varied))]
+        found = made[0][1].at(grid.places(points))
+        cells = [
+            found.verdict.tolist(),
+            *map(_finite, (found.spectral_radius, found.spectral_radius_error)),
+            [None if count < 0 else count for count in found.rigid_modes.tolist()],
+            *map(_finite, (found.frequency_hz, found.damping_ratio)),
+            found.message.tolist(),
+        ]
+        return list(zip(*cells, strict=True))
 
-    return Quantity(columns, evaluate)
+    return Quantity(columns, rows, by_matrices(system))
+
+
+def _finite(numbers: NDArray[np.float64]) -> list[float | None]:
+    return [finite(number) for number in numbers.tolist()]
 
 
 def _critical(system: CompiledSystem, argument: str) -> Quantity:
@@ -126,7 +138,16 @@ def _critical(system: CompiledSystem, argument: str) -> Quantity:
         proof = next(one.proof for one in found.crossings if one.value == found.value)
         return (verdict, finite(found.value), finite(found.error), len(found.crossings), proof, "")
 
-    return Quantity(columns, evaluate)
+    def rows(grid: Grid, points: Sequence[int]) -> list[Row]:
+        found = []
+        for point in points:
+            try:
+                found.append(evaluate(apply(system, grid.overrides(point))))
+            except ApcError as error:
+                found.append(faulty(columns, error))
+        return found
+
+    return Quantity(columns, rows)
 
 
 QUANTITIES: Mapping[str, Callable[[CompiledSystem, str], Quantity]] = {

@@ -39,9 +39,10 @@ if TYPE_CHECKING:
 
 PLACE = Place("sweep")
 
-# Points of a part: a third of a second of analyses, which is what a kill can cost; and no more files in a
-# folder than one likes to list.
-PART_POINTS = 64
+# Points of a part: a third of a second of analyses, which is what a kill can cost; more where points are quick,
+# as long as there are parts for all who compute; and no more files in a folder than one likes to list.
+PART_POINTS, QUICK_POINTS = 64, 2048
+SHARES = 32
 MOST_PARTS = 10_000
 
 Progress = Callable[[int, int], None]  # points done, points in all
@@ -150,7 +151,7 @@ def sweep(
         check_table_path(out, "out=")
     if jobs is not None and jobs < 1:
         raise ApcError(Mistake("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
-    work = Work(model_bytes(system), of, grid, max(PART_POINTS, -(-grid.points // MOST_PARTS)))
+    work = Work(model_bytes(system), of, grid, _part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
     with _kept(out, made_of) as kept:
         whose = Whose(jobs or cores(), cluster, patience or Patience())
@@ -163,6 +164,12 @@ def sweep(
                 remove_parts(out)
     headings = tuple(one.heading for one in listed)
     return Sweep(system.name, of, grid, headings, columns, out, made_of, notes)
+
+
+def _part_points(points: int, *, quick: bool) -> int:
+    """Return how many points are a part."""
+    most = min(points // SHARES, QUICK_POINTS) if quick else 0
+    return max(PART_POINTS, most, -(-points // MOST_PARTS))
 
 
 def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:

@@ -16,13 +16,10 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 from apc.compiler.cache import program_digest
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
 from apc.distribution import versions
-from apc.frame.overrides import apply
 from apc.processes import model_of_bytes
 from apc.sweeps.grid import Grid
-from apc.sweeps.quantities import Quantity, faulty, find_quantity
+from apc.sweeps.quantities import Quantity, find_quantity
 from apc.tables import Row
 from apc.threads import single_threaded
 
@@ -67,13 +64,7 @@ class Computed:
 def compute_part(work: Work, part: int) -> Computed:
     """Compute one part of a sweep. A point that can't be computed becomes a row that says why."""
     with _ONE_AT_A_TIME, single_threaded():
-        system, quantity = _opened(work.model, work.of)
-        rows = []
-        for point in work.points_of(part):
-            try:
-                rows.append(quantity.evaluate(apply(system, work.grid.overrides(point))))
-            except ApcError as error:
-                rows.append(faulty(quantity.columns, error))
+        rows = _opened(work.model, work.of).rows(work.grid, work.points_of(part))
     return Computed(part, tuple(rows), program_versions())
 
 
@@ -89,6 +80,5 @@ def program_versions() -> tuple[tuple[str, str], ...]:
 
 
 @lru_cache(maxsize=1)
-def _opened(model: bytes, of: str) -> tuple[CompiledSystem, Quantity]:
-    system = model_of_bytes(model)
-    return system, find_quantity(system, of)
+def _opened(model: bytes, of: str) -> Quantity:
+    return find_quantity(model_of_bytes(model), of)

@@ -116,6 +116,20 @@ class Bounded:
     heard: tuple[Floats, ...]  # (n_r, n) or (k, n_r, n), one a site
     sites: tuple[Lift, ...]
 
+    def at(self, places: NDArray[np.intp]) -> Bounded:
+        """Return some of the points."""
+
+        def some(matrix: Matrices) -> Matrices:
+            return matrix if matrix.ndim == 2 or len(matrix) == 1 else matrix[places]
+
+        return Bounded(
+            matrix=some(self.matrix),
+            error=some(self.error),
+            whole=some(self.whole),
+            heard=tuple(map(some, self.heard)),
+            sites=tuple(replace(one, site=every_matrix(one.site, some)) for one in self.sites),
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchEvaluator:
@@ -262,7 +276,9 @@ class BatchEvaluator:
         return Lift(site, steps, frame)
 
     def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
-        site, steps, lost = self._placed(group, self.rows(group.jacobians, self.vectors(group, values)), values)
+        site, steps, lost = self._placed(
+            group, self.rows(group.jacobians, self.vectors(group, values)), values
+        )
         with np.errstate(all="ignore"):
             frame = compose(site, group.schedule, {quanta: step.matrix for quanta, step in steps.items()})
         _lose(frame, lost)
@@ -277,8 +293,8 @@ class BatchEvaluator:
         steps = self.fixed.get(site_key(group))
         if steps is None:
             site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
-            steps = self.steps(site, values)
-        return site, steps, beyond
+            return site, self.steps(site, values), beyond
+        return replace(site, a=site.a[:1], b=site.b[:1]), steps, beyond
 
     def steps(self, site: LinearSite, values: Matrices) -> dict[int, Step]:
         """Return the exponentials of every step, one for all points where A, B and the time stay."""

@@ -1,0 +1,200 @@
+"""The largest eigenvalue of a whole scene at many points, with its bound, and how its mode moves.
+
+Takes: a `BatchEvaluator`, and what its systems are at some points (`BatchEvaluator.bounded`).
+Gives: `Part`, `parts_of`; `Leading`, `leading`.
+Guarantees: what is said to be certain is proved, as in `eigen.dominant`: which eigenvalue is the largest of all
+systems, how far it may be off, on which side of 1 it is, and that no other one is 1.
+Does not: say anything of the points where that is not clear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.eigen.dominant import all_within, enclosed, largest_pairs, misses_one
+from apc.eigen.enclosure import SMALL, WIDE, components
+from apc.eigen.pseudospectrum import balance
+from apc.eigen.relative import relative_bounded
+from apc.eigen.spectrum import LEAST_SHARE, STRAIGHT
+from apc.frame.course import turns_of_many
+from apc.frame.discretize import UNIT
+from apc.vary.batch import BatchEvaluator, Bounded
+from apc.vary.wiring import Wiring
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+Places = NDArray[np.intp]
+Truths = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """States of a system that drive each other: its eigenvalues are those of its parts.
+
+    `states` are their places among the relative coordinates; `scale`, powers of two, makes them alike.
+    """
+
+    system: int
+    states: Places
+    scale: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leading:
+    """The largest eigenvalue at k points, of a pair the one above; its bound, and its mode's motion.
+
+    `certain` says where all of it is so; the rest means nothing elsewhere.
+    """
+
+    radius: Floats
+    error: Floats
+    frequency_hz: Floats
+    damping_ratio: Floats
+    certain: Truths
+
+
+def parts_of(evaluator: BatchEvaluator) -> tuple[tuple[Part, ...], tuple[Truths, ...]]:
+    """Return the parts of all systems, and which entries (n, n) of each one's matrix may be other than 0."""
+    patterns, parts, sizes = [], [], []
+    for place, wiring in enumerate(evaluator.wirings):
+        matrix, error = relative_bounded(wiring.system.matrix, wiring.system.error, wiring.relative)
+        size = np.abs(matrix) + error
+        patterns.append(size != 0)
+        whole = [np.arange(len(size))] if wiring.rigid.names else components(size != 0)
+        for states in whole:
+            block = size[np.ix_(states, states)]
+            if block.any():
+                parts.append(Part(place, states, balance(block)))
+                sizes.append(-float(np.abs(np.linalg.eigvals(matrix[np.ix_(states, states)])).max()))
+    # What leads where the scene stands first, as it often does elsewhere.
+    return tuple(parts[place] for place in np.argsort(sizes, kind="stable")), tuple(patterns)
+
+
+def leading(
+    evaluator: BatchEvaluator, parts: Sequence[Part], systems: Sequence[Bounded], count: int
+) -> Leading:
+    """Find the largest eigenvalue of the whole.
+
+    Parameters
+    ----------
+    evaluator, parts
+        Whose systems these are, and their parts.
+    systems
+        The systems at k points; what is the same at all of them may be there once.
+    count
+        k.
+    """
+    with np.errstate(all="ignore"):
+        return _leading(evaluator, parts, systems, count)
+
+
+def _leading(
+    evaluator: BatchEvaluator, parts: Sequence[Part], systems: Sequence[Bounded], count: int
+) -> Leading:
+    value = np.full(count, np.nan, dtype=np.complex128)
+    error, angle = np.full((2, count), np.nan)
+    leads, others = np.full(count, -1), np.zeros(count)
+    vectors: list[tuple[Places, Complexes, Complexes]] = []
+    blocks = []
+    bounds = np.zeros((len(parts), count))  # how large a part may be that is not yet shown to be less
+    for number, part in enumerate(parts):
+        one = systems[part.system]
+        matrix, off = (
+            np.broadcast_to(
+                _block(whole, part.states) / part.scale[:, None] * part.scale, (count, *part.scale.shape * 2)
+            )
+            for whole in (one.matrix, one.error)
+        )
+        blocks.append((matrix, off))
+        open_still = ~all_within(matrix, off, others) if number else np.ones(count, dtype=np.bool_)
+        larger = np.flatnonzero(open_still)
+        guess, right, left = largest_pairs(matrix[larger])
+        found = enclosed(matrix[larger], off[larger], guess, right, left)
+        bounds[number, larger] = np.abs(found.value) + found.error
+        wins = ~(np.abs(found.value) <= np.abs(value[larger])) & ~np.isnan(found.value)
+        ahead = larger[wins]
+        value[ahead], error[ahead], others[ahead] = found.value[wins], found.error[wins], found.others[wins]
+        leads[ahead] = number
+        vectors.append((ahead, right[wins] * part.scale, left[wins] / part.scale))
+    radius = np.abs(value)
+    # A radius that floats leave wider, or a mode that is over in a frame, is looked at as an analysis does it.
+    certain = (2 * error <= WIDE * np.maximum(radius, 1.0)) & (radius > SMALL)
+    unstable = radius - error > 1 + 4 * UNIT
+    certain &= unstable | (radius + error < 1 - 4 * UNIT)
+    for number, (matrix, off) in enumerate(blocks):
+        again = np.flatnonzero(certain & (leads != number) & ~(bounds[number] < others))
+        certain[again] = all_within(matrix[again], off[again], others[again])
+        grown = np.flatnonzero(certain & unstable)  # an eigenvalue of 1 may be another rigid motion
+        certain[grown] = misses_one(matrix[grown], off[grown])
+    frame_s = evaluator.wirings[0].system.frame_s
+    for number, (part, (ahead, right, left)) in enumerate(zip(parts, vectors, strict=True)):
+        still = certain[ahead] & (leads[ahead] == number)
+        mine = ahead[still]
+        if len(mine):
+            wiring, one = evaluator.wirings[part.system], systems[part.system].at(mine)
+            angle[mine] = _angles(wiring, one, part, value[mine], right[still], left[still])
+    rate = (np.log(radius) + 1j * np.where(np.abs(angle) > STRAIGHT, angle, 0.0)) / frame_s
+    return Leading(
+        radius=radius,
+        error=error * (1 + 4 * UNIT) + 4 * UNIT * radius,
+        frequency_hz=np.abs(rate.imag) / (2 * np.pi),
+        damping_ratio=-rate.real / np.abs(rate),
+        certain=certain & ~np.isnan(angle),
+    )
+
+
+def _block(matrix: Floats, states: Places) -> Floats:
+    """Return some rows and columns of matrices (k, n, n)."""
+    return matrix if len(states) == matrix.shape[-1] else matrix[:, states[:, None], states]
+
+
+def _angles(
+    wiring: Wiring, bounded: Bounded, part: Part, values: Complexes, right: Complexes, left: Complexes
+) -> Floats:
+    """Return by how much modes turn in a frame (k,), see `spectrum.angles_in_frame`; NaN if it isn't clear.
+
+    Parameters
+    ----------
+    wiring, bounded, part
+        A system at k points, and the part of it whose modes these are.
+    values, right, left
+        The eigenvalues (k,) and their vectors (k, m) over the part.
+    """
+    system, at = wiring.system, wiring.relative
+    count = len(values)
+    vectors, covectors = np.zeros((2, count, len(system.names)), dtype=np.complex128)
+    vectors[:, at.rest[part.states]], covectors[:, at.rest[part.states]] = right, left
+    if len(at.held):
+        whole = np.broadcast_to(bounded.whole, (count, *bounded.whole.shape[1:]))
+        coupled = whole[:, at.held[:, None], at.rest]
+        corner = whole[:, at.held[:, None], at.held] + coupled @ at.weights
+        shifted = values[:, None, None] * np.eye(len(at.held)) - corner
+        driven = coupled @ vectors[:, at.rest, None]
+        try:
+            vectors[:, at.held] = np.linalg.solve(shifted, driven)[:, :, 0]
+        except np.linalg.LinAlgError:
+            return np.full(count, np.nan)
+        vectors[:, at.rest] += vectors[:, at.held] @ at.weights.T
+        covectors[:, at.held] = -covectors[:, at.rest] @ at.weights
+    shares = np.abs(vectors * covectors)
+    motion = np.array(system.motion, dtype=np.intp)
+    found = np.full(count, np.nan)
+    if not len(motion):
+        return found
+    leads = motion[shares[:, motion].argmax(axis=1)]
+    moving = shares[np.arange(count), leads] > LEAST_SHARE * shares.sum(axis=1)
+    site_of = np.searchsorted(system.offsets, leads, side="right") - 1
+    for g, (group, offset) in enumerate(zip(system.sites, system.offsets, strict=True)):
+        own = np.flatnonzero(moving & (site_of == g))
+        if not len(own):
+            continue
+        here = bounded.at(own)
+        start = vectors[own, offset : offset + len(group.lifted.z_names)]
+        received = (here.heard[g] @ vectors[own, :, None])[:, :, 0]
+        states = leads[own] - offset
+        found[own] = turns_of_many(here.sites[g].site, group.schedule, start, received, states, values[own])
+    return found

@@ -1,0 +1,462 @@
+"""Many analyses at once: the verdict, the spectral radius with its bound, and how the leading mode moves.
+
+Takes: a `CompiledSystem`, and values of some of its parameters and times.
+Gives: `Varied`, `Rows`; `ManyAnalyses`, `many_analyses`, `by_matrices`; `Analyses`, `analyze_many`.
+Guarantees: what `analysis.analyze` gives at each point, to the bounds: what the matrices of many points
+leave open, or say of it less than an analysis would, has an analysis of its own.
+Does not: give all modes, or share out work among processes (see `sweeps`).
+
+Points whose times are the same have the same schedules, and one `BatchEvaluator`; the matrices come with
+their bounds (`BatchEvaluator.bounded`), the largest eigenvalue with its own (`eigen.dominant`), and the turns
+of its mode are counted along its own motion (`frame.course`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from fractions import Fraction
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Analysis, Prepared, analyze, prepare, timed
+from apc.analysis.plan import make_plan
+from apc.compiler.compiled import CompiledSystem, Parameter
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.rigid import what_stands
+from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, judge
+from apc.finite_equations import finite_equations
+from apc.frame.exchange import build_exchange
+from apc.frame.jacobians import jacobians
+from apc.frame.names import Free, find, unit_of
+from apc.frame.overrides import Override, apply
+from apc.frame.parameters import Numbers, resolve, scope_of
+from apc.network.nominal import left_out, refuse_channel_number
+from apc.result import Result
+from apc.threads import single_threaded
+from apc.vary.batch import BatchEvaluator, batch_evaluator
+from apc.vary.evaluator import generic, reaches_time
+from apc.vary.leading import Part, leading, parts_of
+
+if TYPE_CHECKING:
+    import pandas
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Truths = NDArray[np.bool_]
+
+PLACE = Place("analyze_many")
+
+# What stands in the verdict's place of a point whose numbers can't be computed with.
+FAULT = "error: "
+
+# Points whose matrices are made together: what they are made of then stays in the cache of a processor.
+TOGETHER, ENTRIES = 1024, 2**16
+
+# An evaluator takes as long to prepare as one analysis: for fewer points it isn't.
+FEWEST = 3
+
+# Sets of numbers kept that others follow from.
+MOST_RESOLVED = 4096
+
+# Evaluators kept for the next points of the same times, and states of a system that is worth one.
+KEPT, MOST_STATES = 64, 120
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Varied:
+    """A parameter or time that varies, and its values in SI: as floats (v,), and each exactly by its place."""
+
+    free: Free
+    numbers: Floats
+    exact: Callable[[int], Fraction]
+
+    def override(self, place: int) -> Override:
+        """Return what sets it to one of its values."""
+        return Override(self.free.name, self.free.group, self.exact(place))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """What analyses give at k points; of a point at fault the verdict is `error: ` and the message's code.
+
+    Numbers are NaN where there is none; `rigid_modes` is −1 at a point at fault.
+    """
+
+    verdict: NDArray[Any]  # str
+    spectral_radius: Floats
+    spectral_radius_error: Floats
+    rigid_modes: Integers
+    frequency_hz: Floats
+    damping_ratio: Floats
+    message: NDArray[Any]  # str
+
+    @classmethod
+    def nothing(cls, count: int) -> Rows:
+        """Return so many rows that say nothing yet."""
+        radius, error, frequency, damping = np.full((4, count), np.nan)
+        verdict, message = np.full((2, count), "", dtype=object)
+        return cls(verdict, radius, error, np.full(count, -1), frequency, damping, message)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Family:
+    """What all points of the same times share; `rigid` and `drifts` are those of the whole."""
+
+    system: CompiledSystem
+    evaluator: BatchEvaluator
+    columns: tuple[int, ...]  # which of the varied each free parameter is
+    reaching: tuple[int, ...]  # those of them from which other numbers follow
+    rigid: int
+    drifts: int
+    bounds: tuple[tuple[int, Parameter], ...]  # the parameters that a varied one sets, by its column
+    patterns: tuple[Truths, ...]  # which entries of each system's matrix may be other than 0
+    parts: tuple[Part, ...]
+    resolved: dict[tuple[int, ...], Numbers | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ManyAnalyses:
+    """The analyses of one scene at values of what varies; made ready once, asked any number of times."""
+
+    system: CompiledSystem
+    varied: tuple[Varied, ...]
+    prepared: Prepared
+    times: tuple[int, ...]
+    families: dict[tuple[int, ...], _Family | None] = field(default_factory=dict)
+
+    def at(self, places: Integers) -> Rows:
+        """Return what the analyses of points give, whose values are at these places (k, m) of the varied."""
+        found = Rows.nothing(len(places))
+        still_open = np.ones(len(places), dtype=np.bool_)
+        if len(places):
+            timings, which = np.unique(places[:, list(self.times)], axis=0, return_inverse=True)
+            for number, timing in enumerate(timings.tolist()):
+                some = np.flatnonzero(which.ravel() == number)
+                family = self._family(tuple(timing), len(some))
+                if family is not None:
+                    still_open[some] = ~_filled(family, self.varied, places, some, found)
+        for point in np.flatnonzero(still_open).tolist():
+            self._alone(places[point], point, found)
+        return found
+
+    def _family(self, timing: tuple[int, ...], count: int) -> _Family | None:
+        """Return what points of these times share, None where each of them has an analysis of its own."""
+        if timing not in self.families:
+            if count < FEWEST:
+                return None
+            while len(self.families) >= KEPT:
+                self.families.pop(next(iter(self.families)))
+            given = [
+                self.varied[column].override(place) for column, place in zip(self.times, timing, strict=True)
+            ]
+            self.families[timing] = _family(self.system, self.varied, self.times, given, self.prepared)
+        return self.families[timing]
+
+    def _alone(self, places: Integers, row: int, found: Rows) -> None:
+        """Analyse one point by itself."""
+        try:
+            overrides = [one.override(place) for one, place in zip(self.varied, places.tolist(), strict=True)]
+            one: Analysis = analyze(apply(self.system, overrides), prepared=self.prepared)
+        except ApcError as error:
+            first = error.mistakes[0]
+            found.verdict[row], found.message[row] = FAULT + first.code, first.sentence
+            return
+        found.verdict[row] = one.verdict
+        found.spectral_radius[row] = one.spectral_radius
+        found.spectral_radius_error[row] = one.spectral_radius_error
+        found.rigid_modes[row] = one.rigid_modes
+        if one.modes:
+            found.frequency_hz[row] = one.modes[0].frequency_hz
+            found.damping_ratio[row] = one.modes[0].damping_ratio
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Analyses(Result):
+    """The answers of many analyses, arrays of the shape of the values.
+
+    `parameters` names what varied, with its unit, and `values` holds its values in SI. The columns are those of
+    `Rows`; `left_out` says what of the scene the answers do not look at.
+    """
+
+    shown_by = "vary:analyses"
+
+    topology: str
+    parameters: tuple[str, ...]
+    values: tuple[Floats, ...]
+    verdict: NDArray[Any]  # str
+    spectral_radius: Floats
+    spectral_radius_error: Floats
+    rigid_modes: Integers
+    frequency_hz: Floats
+    damping_ratio: Floats
+    message: NDArray[Any]  # str
+    left_out: tuple[str, ...]
+
+    @property
+    def stable(self) -> Truths:
+        """Where it is stable, up to a common translation or without; neither drifts, nor is left open."""
+        return np.isin(self.verdict, [STABLE, STABLE_TRANSLATING])
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return a pandas table, a row a point: the values first, then the answers."""
+        table: pandas.DataFrame = self._shown("table")
+        return table
+
+
+def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
+    """Analyse a scene at many values of some parameters and times.
+
+    Parameters
+    ----------
+    system
+        The compiled scene; its numbers hold for what is not given.
+    values
+        By the name of each parameter or time its values: an array in SI, or quantities such as "8 ms".
+        Arrays of different shapes are broadcast against one another.
+
+    Raises
+    ------
+    ApcError
+        E622, E623 no such parameter; E896 a number of a network's; E881 no values, or none that can be.
+    """
+    if not values:
+        what = "nothing varies"
+        raise ApcError(Mistake("E883", PLACE, what, hint='{"contact.stiffness": [500.0, 1000.0]}'))
+    frees, listed = [], []
+    for name, given in values.items():
+        free = Free(*find(system, name.strip(), PLACE))
+        if free in frees:
+            raise ApcError(Mistake("E883", PLACE, f"{free.label} is given twice"))
+        refuse_channel_number(system, free, PLACE)
+        frees.append(free)
+        listed.append(_numbers_of(system, free, given))
+    try:
+        arrays = np.broadcast_arrays(*listed)
+    except ValueError:
+        shapes = " and ".join(str(one.shape) for one in listed)
+        what = "values of shapes that can't be broadcast"
+        raise ApcError(Mistake("E881", PLACE, what, "equal shapes", shapes)) from None
+    varied, places = [], []
+    for free, array in zip(frees, arrays, strict=True):
+        numbers, which = np.unique(array.ravel(), return_inverse=True)
+        varied.append(Varied(free, numbers, partial(_shortest, numbers)))
+        places.append(which)
+    found = many_analyses(system, varied).at(np.stack(places, axis=1))
+    shape = arrays[0].shape
+    units = [unit_of(system, one.name) for one in frees]
+    affine = all(jacobians(kind).affine for kind in system.kinds)
+    return Analyses(
+        topology=system.name,
+        parameters=tuple(
+            one.label if unit == "1" else f"{one.label} [{unit}]"
+            for one, unit in zip(frees, units, strict=True)
+        ),
+        values=tuple(arrays),
+        **{one.name: getattr(found, one.name).reshape(shape) for one in fields(found)},
+        left_out=left_out(system, linear=affine),
+    )
+
+
+def _numbers_of(system: CompiledSystem, free: Free, given: Any) -> Floats:
+    """Read the values of a parameter: numbers in SI, or quantities."""
+    unit, what = unit_of(system, free.name), f"the values of {free.label}"
+    array = np.asarray(given)
+    if array.dtype.kind in "UO" and all(isinstance(one, str) for one in array.ravel().tolist()):
+        # The language of quantities, which numbers never need.
+        from apc.compiler.language.units import quantity
+
+        read = [quantity(text, PLACE, what=free.label, unit=unit).value for text in array.ravel().tolist()]
+        array = np.array([float(one) for one in read]).reshape(array.shape)
+    if array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
+        expected = f"finite numbers, in {unit}" if unit != "1" else "finite numbers"
+        raise ApcError(Mistake("E881", PLACE, what, expected, str(given)[:40]))
+    return array.astype(np.float64)
+
+
+def _shortest(numbers: Floats, place: int) -> Fraction:
+    """Return a value as the shortest decimal that is this float: 8 ms are no 8.000000000000000167 ms."""
+    return Fraction(repr(float(numbers[place])))
+
+
+def by_matrices(system: CompiledSystem) -> bool:
+    """Say whether matrices of many points can be had at once: all follows from the parameters alone."""
+    return all(jacobians(system.kinds[group.kind]).parameters_suffice for group in system.groups)
+
+
+def many_analyses(system: CompiledSystem, varied: Sequence[Varied]) -> ManyAnalyses:
+    """Make ready the analyses of a scene at many values.
+
+    Parameters
+    ----------
+    system
+        The compiled scene; its numbers hold for what does not vary.
+    varied
+        What varies.
+    """
+    times = tuple(column for column, one in enumerate(varied) if reaches_time(system, one.free))
+    return ManyAnalyses(system, tuple(varied), prepare(system), times)
+
+
+def _family(
+    system: CompiledSystem,
+    varied: Sequence[Varied],
+    times: Sequence[int],
+    given: Sequence[Override],
+    prepared: Prepared,
+) -> _Family | None:
+    """Prepare the matrices for some times; None where an analysis of the scene is no matter of these."""
+    columns = tuple(column for column in range(len(varied)) if column not in times)
+    free = tuple(varied[column].free for column in columns)
+    try:
+        with finite_equations(system.name), np.errstate(all="ignore"):
+            timed_system = apply(system, given)
+            there = generic(timed_system, free)
+            numbers = resolve(there)
+            shared = timed(there, prepared, numbers)
+            used = {group.kind for group in system.groups}
+            if not all(shared.jacobians[kind].parameters_suffice for kind in used):
+                return None
+            exchange = build_exchange(there, numbers.timings)
+            plan = make_plan(there, shared.jacobians, shared.schedules, numbers, exchange)
+            if not plan.loops or plan.ring or plan.method == "determinant":
+                return None
+            if max(loop.states for loop in plan.loops) > MOST_STATES:
+                return None
+            evaluator = batch_evaluator(timed_system, free, plan.groups, exchange)
+    except ApcError:
+        return None  # each point tells
+    rigid = drifts = 0
+    for loop, wiring in zip(plan.loops, evaluator.wirings, strict=True):
+        if wiring.moving or (wiring.rigid.names and what_stands(loop).unfelt):
+            return None
+        rigid += loop.multiplicity * wiring.rigid.directions.shape[1]
+        drifts += loop.multiplicity * wiring.rigid.drifts
+    names = {one.name: column for column, one in zip(columns, free, strict=True)}
+    every = (*timed_system.parameters, *(one for group in timed_system.groups for one in group.values))
+    parts, patterns = parts_of(evaluator)
+    return _Family(
+        system=timed_system,
+        evaluator=evaluator,
+        columns=columns,
+        reaching=tuple(
+            column for column, one in zip(columns, free, strict=True) if _is_followed(timed_system, one)
+        ),
+        rigid=rigid,
+        drifts=drifts,
+        bounds=tuple((names[one.name], one) for one in every if one.name in names),
+        patterns=patterns,
+        parts=parts,
+    )
+
+
+def _is_followed(system: CompiledSystem, free: Free) -> bool:
+    """Say whether any number follows from a parameter by a formula."""
+    scopes = [scope_of(system), *(scope_of(system, group.values) for group in system.groups)]
+    return any(free.name in formula.names for scope in scopes for formula in scope.formulas.values())
+
+
+def _filled(
+    family: _Family, varied: Sequence[Varied], places: Integers, some: Integers, found: Rows
+) -> Truths:
+    """Fill in what the matrices of some points decide, and say of each whether they do."""
+    done = np.zeros(len(some), dtype=np.bool_)
+    states = max(len(one.layout.names) for one in family.evaluator.closed)
+    together = max(1, min(TOGETHER, ENTRIES // states**2))
+    with single_threaded(), np.errstate(all="ignore"):
+        for start in range(0, len(some), together):
+            chunk = some[start : start + together]
+            done[start : start + together] = _decided(family, varied, places[chunk], chunk, found)
+    return done
+
+
+def _decided(
+    family: _Family, varied: Sequence[Varied], places: Integers, rows: Integers, found: Rows
+) -> Truths:
+    """Do so for few points at a time."""
+    allowed, vectors = _vectors(family, varied, places)
+    systems = family.evaluator.bounded(vectors)
+    for one, pattern in zip(systems, family.patterns, strict=True):
+        # What is 0 at a value of no meaning is so at all; NaN and infinite are no matrices.
+        sound = np.isfinite(one.error).all(axis=(1, 2)) & np.isfinite(one.matrix).all(axis=(1, 2))
+        beyond = ((one.matrix != 0) | (one.error != 0)) & ~pattern
+        allowed &= sound & ~beyond.any(axis=(1, 2))
+    some = np.flatnonzero(allowed)
+    known = leading(family.evaluator, family.parts, [one.at(some) for one in systems], len(some))
+    into, some = known.certain, some[known.certain]
+    place, radius = rows[some], known.radius[into]
+    stands = judge([True], family.rigid, family.drifts)[0]
+    found.verdict[place] = np.where(radius > 1, UNSTABLE, stands)
+    found.spectral_radius[place], found.spectral_radius_error[place] = radius, known.error[into]
+    found.rigid_modes[place] = family.rigid
+    found.frequency_hz[place], found.damping_ratio[place] = (
+        known.frequency_hz[into],
+        known.damping_ratio[into],
+    )
+    done = np.zeros(len(rows), dtype=np.bool_)
+    done[some] = True
+    return done
+
+
+def _vectors(
+    family: _Family, varied: Sequence[Varied], places: Integers
+) -> tuple[Truths, Callable[[PeerGroup], Floats]]:
+    """Return which points may be, and what gives each group's parameters there (k, n_p), or (1, n_p).
+
+    A number that follows from others is worked out as for an analysis, in rationals, once for all points that
+    agree in what it follows from.
+    """
+    numbers = {column: varied[column].numbers[places[:, column]] for column in family.columns}
+    allowed = np.ones(len(places), dtype=np.bool_)
+    for column, parameter in family.bounds:
+        allowed &= _keeps_bounds(parameter, numbers[column])
+    different, which = np.unique(places[:, list(family.reaching)], axis=0, return_inverse=True)
+    settled = [_resolved(family, varied, tuple(one)) for one in different.tolist()]
+    allowed &= np.array([one is not None for one in settled])[which.ravel()]
+    plain = sorted(
+        set(family.columns) - set(family.reaching), key=lambda column: varied[column].free.group or ""
+    )
+
+    def vectors(group: PeerGroup) -> Floats:
+        place, peer = family.evaluator.first_peer(group)
+        found = group.parameters[None]
+        if family.reaching:
+            found = np.array(
+                [found[0] if one is None else one.parameters[place][one.rows[place][peer]] for one in settled]
+            )[which.ravel()]
+        names, own = group.jacobians.kind.parameters, family.system.groups[place].name
+        for column in plain:  # a group's own value after that of everybody
+            free = varied[column].free
+            if free.name in names and free.group in (None, own):
+                found = np.array(np.broadcast_to(found, (len(places), len(names))))
+                found[:, names.index(free.name)] = numbers[column]
+        return found
+
+    return allowed, vectors
+
+
+def _resolved(family: _Family, varied: Sequence[Varied], places: tuple[int, ...]) -> Numbers | None:
+    """Return the scene's numbers with what others follow from at these places; None where these may not be."""
+    if places not in family.resolved:
+        if len(family.resolved) >= MOST_RESOLVED:
+            family.resolved.clear()
+        given = [
+            varied[column].override(place) for column, place in zip(family.reaching, places, strict=True)
+        ]
+        try:
+            family.resolved[places] = resolve(apply(family.system, given))
+        except ApcError:
+            family.resolved[places] = None
+    return family.resolved[places]
+
+
+def _keeps_bounds(parameter: Parameter, values: Floats) -> Truths:
+    """Say which values a parameter may have."""
+    low = -np.inf if parameter.minimum is None else parameter.minimum
+    high = np.inf if parameter.maximum is None else parameter.maximum
+    above = values > low if parameter.open_minimum else values >= low
+    return np.asarray(above & (values <= high))
