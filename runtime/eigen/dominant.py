@@ -33,7 +33,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]
@@ -68,8 +67,8 @@ HIDDEN = 1e-150
 class Dominant:
     """The largest eigenvalue of each of k matrices, of a conjugate pair the one above; NaN where it is open.
 
-    `error` bounds |value − truth|: exactly one eigenvalue is that near. It and its conjugate are the only ones
-    of a magnitude of `others` or more.
+    `error` bounds |value − truth|: exactly one eigenvalue is that near. It and its conjugate are the only
+    ones of a magnitude of `others` or more.
     """
 
     value: Complexes  # (k,)
@@ -174,7 +173,7 @@ def enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes, 
 
 def _enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes, left: Complexes) -> Dominant:
     n = matrix.shape[-1]
-    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    charge = (n + 6) * UNIT  # of real matrices, and what is done to an entry besides
     a, b = value.real[:, None, None], value.imag[:, None, None]
     paired = value.imag != 0
     size = np.abs(value) * (1 + 4 * UNIT)
@@ -223,7 +222,7 @@ def _enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes,
 
 
 def all_within(matrix: Floats, error: Floats, radius: Floats) -> Truths:
-    """Say of matrices (k, n, n) known up to an error whether all eigenvalues are smaller than a radius (k,)."""
+    """Say whether all eigenvalues of matrices (k, n, n), known up to an error, are less than a radius (k,)."""
     with np.errstate(all="ignore"):
         shrunk = matrix / radius[:, None, None]
         away = _norms(error) / radius + 2 * UNIT * _norms(shrunk)
@@ -240,7 +239,7 @@ def misses_one(matrix: Floats, error: Floats) -> Truths:
             inverse = np.linalg.inv(away)
         except np.linalg.LinAlgError:
             return np.zeros(len(matrix), dtype=np.bool_)
-        doubt = error + PRODUCT_ROUNDINGS * (n + 3) * UNIT * (unit + np.abs(matrix))
+        doubt = error + (n + 3) * UNIT * (unit + np.abs(matrix))
         wrong = np.abs(unit - inverse @ away) + np.abs(inverse) @ doubt
         return np.asarray(wrong.sum(axis=2).max(axis=1, initial=0.0) < 0.5)
 
@@ -254,7 +253,7 @@ def _resolvent(matrix: Floats) -> Floats:
     bound on its rounding.
     """
     k, n = matrix.shape[:2]
-    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    charge = (n + 6) * UNIT  # of real matrices, and what is done to an entry besides
     found, left = np.full(k, np.inf), np.arange(k)
     power, off, product = matrix, np.zeros(k), np.ones(k)
     size = _norms(power)

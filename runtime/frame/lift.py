@@ -27,7 +27,7 @@ from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
 from apc.frame.radius import FLOATS, RADII, Arithmetic, magnitude, radius_of, value_of, with_radius
-from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
+from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
 from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
@@ -214,20 +214,88 @@ def compose(
     """
     n_z = len(site.kind.states) + len(schedule.carried)
     unit = numbers.exact(np.eye(n_z + len(schedule.heard)))
+    playing = _Playing.of(site, steps, unit.dtype, numbers.multiply)
+    at = playing.begin(schedule, unit[..., :n_z, :])
     sent: dict[int, Matrix] = {}
 
     def hear(row: int) -> Matrix:
         return unit[..., n_z + row, :]
 
-    course = follow(site, schedule, steps, unit[..., :n_z, :], hear, multiply=numbers.multiply)
+    again = schedule.repeats
+    if again is None:
+        sent.update(playing.play(schedule.events, at, hear))
+    else:
+        sent.update(playing.play(schedule.events[: again.first], at, hear))
+        _play_again(playing, schedule, again, at, numbers)
+        sent.update(playing.play(schedule.events[again.end :], at, hear))
+    z = playing.end(schedule, at)
+    s = _over(z[..., :0, :], [sent[row] for row in range(len(schedule.sent))])
+    return FrameMap(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
+
+
+def _play_again(
+    playing: _Playing, schedule: Schedule, again: Repeats, at: _Moment, numbers: Arithmetic
+) -> None:
+    """Play events that come again and again: once, over what they need, and that as often as they come.
+
+    Notes
+    -----
+    Of y, the continuous states and the values that enter, and r, what is heard, one time makes T y + R r;
+    two times (T² y + (T R + R) r), and so on, squared.
+    """
+    n_x, n_r = playing.states, len(schedule.heard)
+    n = n_x + len(again.entering)
+    before = [0] * len(again.ticks)
+    for event in schedule.events[: again.first]:
+        if isinstance(event, Tick):
+            before[event.partition] += 1
+
+    def row_of(moment: _Moment, value: Value, later: int) -> Matrix:
+        """Return a value that enters once so many times are over."""
+        if value.partition == HELD:
+            return moment.moving[..., n_x + value.output, :]
+        return moment.value.get(named_at(value, later), moment.nothing)
+
+    def named_at(value: Value, later: int) -> Value:
+        index = value.index + before[value.partition] + later * again.ticks[value.partition]
+        return replace(value, index=index)
+
+    unit = numbers.exact(np.eye(n + n_r))
+    once = playing.at_rest(unit[..., :n_x, :])
+    for place, value in enumerate(again.entering, n_x):
+        if value.partition == HELD:
+            once.moving[..., n_x + value.output, :] = unit[..., place, :]
+        else:
+            once.value[named_at(value, 0)] = unit[..., place, :]
+    body = schedule.events[again.first : again.first + again.length]
+    dict(playing.play(body, once, lambda row: unit[..., n + row, :]))
+    step = _over(once.moving[..., :n_x, :], [row_of(once, value, 1) for value in again.entering])
+
+    def after(later: Matrix, earlier: Matrix) -> Matrix:
+        """Return (T, R) of one number of times after another."""
+        found = numbers.multiply(later[..., :n], earlier)
+        found[..., n:] = numbers.add(found[..., n:], later[..., n:])
+        return found
+
+    whole, left = None, again.count
     while True:
-        try:
-            row, packet = next(course)
-        except StopIteration as end:
-            z = end.value
-            s = _over(z[..., :0, :], [sent[row] for row in range(len(schedule.sent))])
-            return FrameMap(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
-        sent[row] = packet
+        if left % 2:
+            whole = step if whole is None else after(step, whole)
+        left //= 2
+        if not left:
+            break
+        step = after(step, step)
+    assert whole is not None
+    y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in again.entering])
+    found = numbers.multiply(whole[..., :n], y)
+    heard = found.shape[-1] - n_r  # the last columns are what is heard
+    found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
+    at.moving[..., :n_x, :] = found[..., :n_x, :]
+    for place, value in enumerate(again.entering, n_x):
+        if value.partition == HELD:
+            at.moving[..., n_x + value.output, :] = found[..., place, :]
+        else:
+            at.value[named_at(value, again.count)] = found[..., place, :]
 
 
 def follow(
@@ -270,38 +338,107 @@ def follow(
     -------
     z⁺ (n_z, columns).
     """
-    n_x = len(site.kind.states)
-    nothing = np.zeros((*start.shape[:-2], start.shape[-1]), dtype=start.dtype)
-    value: dict[Value, Matrix] = {one: start[..., n_x + row, :] for row, one in enumerate(schedule.carried)}
-    sends = [np.concatenate([send.x, send.u], axis=-1) for send in site.sends]
-    ticks = [np.concatenate([tick.x, tick.u, tick.m, tick.r], axis=-1) for tick in site.ticks]
-    parts = (site.a, start, *steps.values(), *sends, *ticks)
-    many, number = np.broadcast_shapes(*(one.shape[:-2] for one in parts)), np.result_type(*parts)
-    # The continuous states above what the holds put out: a step multiplies both at once.
-    acting = [nothing if one is None else value.get(one, nothing) for one in schedule.acting]
-    x = np.broadcast_to(start[..., :n_x, :].astype(number), (*many, n_x, start.shape[-1]))
-    moving = _over(x, acting)
-    for event in schedule.events:
-        match event:
-            case Propagate(duration):
-                if watch is not None:
-                    watch(duration, moving)
-                moving[..., :n_x, :] = multiply(steps[duration][..., :n_x, :], moving)
-            case Act(hold, one):
-                moving[..., n_x + hold, :] = value.get(one, nothing)
-            case Send(partition, rows):
-                everything = multiply(sends[partition], moving)
-                for channel, row in rows:
-                    yield row, everything[..., channel, :]
-            case Tick(partition, index, rows_heard):
-                memories = site.kind.clocks[partition].memories
-                before = [value.get(Value(partition, o, index - 1), nothing) for o in memories]
-                received = yield from _received(rows_heard, hear, nothing)
-                computed = multiply(ticks[partition], _over(moving, [*before, *received]))
-                for output in range(computed.shape[-2]):
-                    value[Value(partition, output, index)] = computed[..., output, :]
-    later = [replace(one, index=one.index + schedule.ticks[one.partition]) for one in schedule.carried]
-    return _over(moving[..., :n_x, :], [value[one] for one in later])
+    playing = _Playing.of(site, steps, start.dtype, multiply, watch)
+    at = playing.begin(schedule, start)
+    yield from playing.play(schedule.events, at, hear)
+    return playing.end(schedule, at)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moment:
+    """What there is at an instant of a frame, written over as time goes on.
+
+    `moving` are the continuous states above what the holds put out; `value` is what was computed.
+    """
+
+    moving: Matrix
+    value: dict[Value, Matrix]
+    nothing: Matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Playing:
+    """A site, or many, ready to be played: `sends` and `ticks` are its matrices side by side."""
+
+    kind: Kind
+    sends: Sequence[Matrix]
+    ticks: Sequence[Matrix]
+    steps: Mapping[int, Matrix]
+    holds: int
+    many: tuple[int, ...]  # of how many sites
+    number: Any
+    multiply: Callable[[Matrix, Matrix], Matrix]
+    watch: Callable[[int, Matrix], None] | None
+
+    @classmethod
+    def of(
+        cls,
+        site: LinearSite,
+        steps: Mapping[int, Matrix],
+        number: Any,
+        multiply: Callable[[Matrix, Matrix], Matrix],
+        watch: Callable[[int, Matrix], None] | None = None,
+    ) -> _Playing:
+        sends = [np.concatenate([send.x, send.u], axis=-1) for send in site.sends]
+        ticks = [np.concatenate([tick.x, tick.u, tick.m, tick.r], axis=-1) for tick in site.ticks]
+        parts = (site.a, *steps.values(), *sends, *ticks)
+        many = np.broadcast_shapes(*(one.shape[:-2] for one in parts))
+        return cls(
+            *(site.kind, sends, ticks, steps, site.b.shape[-1], many),
+            *(np.result_type(number, *parts), multiply, watch),
+        )
+
+    @property
+    def states(self) -> int:
+        """The number of continuous states."""
+        return len(self.kind.states)
+
+    def begin(self, schedule: Schedule, start: Matrix) -> _Moment:
+        """Return the start of a frame, from z (n_z, columns)."""
+        at = self.at_rest(start[..., : self.states, :])
+        for row, one in enumerate(schedule.carried, self.states):
+            at.value[one] = start[..., row, :]
+        for hold, acting in enumerate(schedule.acting, self.states):
+            if acting is not None:
+                at.moving[..., hold, :] = at.value.get(acting, at.nothing)
+        return at
+
+    def at_rest(self, x: Matrix) -> _Moment:
+        """Return an instant at which nothing acts and nothing was computed, from states (n_x, columns)."""
+        many = np.broadcast_shapes(self.many, x.shape[:-2])
+        moving = np.zeros((*many, self.states + self.holds, x.shape[-1]), dtype=self.number)
+        moving[..., : self.states, :] = x
+        return _Moment(moving, {}, np.zeros((*x.shape[:-2], x.shape[-1]), dtype=x.dtype))
+
+    def end(self, schedule: Schedule, at: _Moment) -> Matrix:
+        """Return z⁺ (n_z, columns) at the end of a frame."""
+        later = [shifted(one, schedule.ticks) for one in schedule.carried]
+        return _over(at.moving[..., : self.states, :], [at.value[one] for one in later])
+
+    def play(
+        self, events: Sequence[Event], at: _Moment, hear: Callable[[int], Matrix | None]
+    ) -> Generator[tuple[int, Matrix], None, None]:
+        """Let events happen; yields as `follow`."""
+        n_x, moving, value = self.states, at.moving, at.value
+        for event in events:
+            match event:
+                case Propagate(duration):
+                    if self.watch is not None:
+                        self.watch(duration, moving)
+                    moving[..., :n_x, :] = self.multiply(self.steps[duration][..., :n_x, :], moving)
+                case Act(hold, one):
+                    moving[..., n_x + hold, :] = value.get(one, at.nothing)
+                case Send(partition, rows):
+                    everything = self.multiply(self.sends[partition], moving)
+                    for channel, row in rows:
+                        yield row, everything[..., channel, :]
+                case Tick(partition, index, rows_heard):
+                    memories = self.kind.clocks[partition].memories
+                    before = [value.get(Value(partition, o, index - 1), at.nothing) for o in memories]
+                    received = yield from _received(rows_heard, hear, at.nothing)
+                    computed = self.multiply(self.ticks[partition], _over(moving, [*before, *received]))
+                    for output in range(computed.shape[-2]):
+                        value[Value(partition, output, index)] = computed[..., output, :]
 
 
 def _over(block: Matrix, rows: Sequence[Matrix]) -> Matrix:

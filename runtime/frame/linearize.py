@@ -133,8 +133,8 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     given = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
     given[4] = np.array(parameters, dtype=np.float64, order="C").ravel()
     for place, numbers in enumerate(given):
-        buffer.set_arg(place, memoryview(numbers))
-    buffer.set_res(0, memoryview(rows.reshape(-1)))
+        buffer.set_arg(place, numbers.data)
+    buffer.set_res(0, rows.reshape(-1).data)
     evaluate()
     return rows + 0.0  # −0 and 0 are one number
 

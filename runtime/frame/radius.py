@@ -79,22 +79,34 @@ def _multiply(left: Matrix, right: Matrix) -> Matrix:
     terms = a.shape[-1]
     if terms > FEW:  # a term is none where its factor is exactly 0
         terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
-    product = a @ b
-    terms = 2 + (2 * terms if product.dtype.kind == "c" else terms)  # of a complex step each is a sum of two
+    number = np.result_type(a, b)
+    terms = 2 + (2 * terms if number.kind == "c" else terms)  # of a complex step each is a sum of two
     charge = terms * UNIT / (1 - terms * UNIT)
-    size_a, size_b = magnitude(a), magnitude(b)
-    # Each radius is as much larger as adding it up may have rounded it down.
-    off = size_a @ (charge * size_b + (1 + 2 * charge) * off_b)
+    many = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    found = np.empty((*many, 2, a.shape[-2], b.shape[-1]), dtype=number)
+    np.matmul(a, b, out=value_of(found))
+    # Each radius is as much larger as adding it up may have rounded it down. Of many matrices writing and
+    # fetching their numbers takes longer than computing them: nothing is written twice.
+    size = magnitude(b)
+    weight = (1 + 2 * charge) * off_b
+    weight += charge * size
+    off = np.matmul(magnitude(a), weight, out=radius_of(found))
     if off_a.any():
-        off = off + off_a @ ((1 + 2 * charge) * (size_b + off_b))
-    return with_radius(product, (1 + 2 * charge) * off)
+        size += off_b
+        size *= 1 + 2 * charge
+        off += off_a @ size
+    off *= 1 + 2 * charge
+    return found
 
 
 def _added(left: Matrix, right: Matrix, values: Callable[[Matrix, Matrix], Matrix]) -> Matrix:
     """Return the sum or difference of matrices with their radii."""
-    value = values(value_of(left), value_of(right))
-    off = radius_of(left) + radius_of(right)
-    return with_radius(value, (1 + 4 * UNIT) * (off + UNIT * magnitude(value)))
+    found = values(left, right)  # the radii are added up below
+    value, off = value_of(found), radius_of(found)
+    np.add(radius_of(left), radius_of(right), out=off)
+    off += UNIT * magnitude(value)
+    off *= 1 + 4 * UNIT
+    return found
 
 
 def _exact(value: Matrix) -> Matrix:

@@ -1,8 +1,8 @@
 """What one frame of a peer is made of: its events in their order, and what is remembered between frames.
 
 Takes: what `scheduling` found out.
-Gives: `Schedule` and its events, `Event`; the names of what is computed, sent and heard; `shifted`,
-`remembered`; `ORDER`.
+Gives: `Schedule` and its events, `Event`; `Repeats`, `HELD`; the names of what is computed, sent and heard;
+`shifted`, `remembered`; `ORDER`.
 Guarantees: exact time (integers of one quantum).
 Does not: find out what happens when (see `scheduling`).
 
@@ -131,6 +131,30 @@ class Act:
 Event = Propagate | Send | Tick | Act
 
 
+# The partition of what a hold puts out, where that is named like a value: `Value(HELD, hold, −1)`.
+HELD = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Repeats:
+    """Events that come again and again: `count` times `length` of them, from event `first` on.
+
+    `ticks` are of one time, by clock partition. `entering` is what one time needs of those before, and what
+    is needed when all are over, indices counted from its own first tick; see `HELD`.
+    """
+
+    first: int
+    length: int
+    count: int
+    ticks: tuple[int, ...]
+    entering: tuple[Value, ...]
+
+    @property
+    def end(self) -> int:
+        """The first event after them."""
+        return self.first + self.length * self.count
+
+
 @dataclass(frozen=True, slots=True)
 class Schedule:
     """One frame of the peers of one group.
@@ -139,7 +163,8 @@ class Schedule:
     values of earlier frames that this one needs, the remembered part of z after the continuous states;
     `heard` names r, and `selected` goes on where packets get lost or come late; `sent` names s and `depths`
     says how many frames each row of s must be kept; `ticks` counts a clock partition's ticks in a frame;
-    `marks` are the instants, in quanta, of the fastest clock's ticks and the end.
+    `marks` are the instants, in quanta, of the fastest clock's ticks and the end; `repeats` are events that
+    come again and again, if there are such.
     """
 
     quantum: Fraction
@@ -156,6 +181,7 @@ class Schedule:
     sent_names: tuple[str, ...]
     sent_times: tuple[int, ...]  # in quanta from the frame's start
     selected: tuple[Selected, ...] = ()
+    repeats: Repeats | None = None
 
     @property
     def frame_s(self) -> Fraction:

@@ -23,11 +23,13 @@ from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.hyperperiod import ClockGrid, Times, times_in_use
 from apc.frame.liveness import Hearing, hearing_of, live_holds, live_outputs, live_receives
 from apc.frame.schedule import (
+    HELD,
     ORDER,
     Act,
     Event,
     Heard,
     Propagate,
+    Repeats,
     Schedule,
     Selected,
     Send,
@@ -36,11 +38,17 @@ from apc.frame.schedule import (
     Value,
     Way,
     remembered,
+    shifted,
 )
 from apc.frame.site import LinearSite
 
 # Schedules of scenes that are remembered.
 KEPT = 16
+
+# Events that repeat are looked for in rows of up to so many; they are put together as one and that is squared
+# where so many times less is to be done.
+MOST_REPEATED = 64
+WORTH = 1.5
 
 MOST_PACKETS = 100_000  # of one peer: each has a name
 MOST_HELD = (
@@ -285,6 +293,7 @@ def _build(
         sent_names=tuple(f"{one.channel} sent" for one in sent),
         sent_times=tuple(_slot_time(one, grid_of) for one in sent),
         selected=selected,
+        repeats=_repeats(pattern, live, events, carried, ticks),
     )
 
 
@@ -376,6 +385,16 @@ def _carried(
     ticks: Sequence[int],
 ) -> tuple[Value, ...]:
     """Return the values of earlier frames that this frame reads, and those still to be read later."""
+    return remembered(_demanded(pattern, live, events, acting), ticks)
+
+
+def _demanded(
+    pattern: LinearSite,
+    live: frozenset[tuple[int, int]],
+    events: Sequence[Event],
+    acting: Sequence[Value | None],
+) -> set[Value]:
+    """Return the values that events read."""
     kind = pattern.kind
     now = list(acting)
     demanded: set[Value] = set()
@@ -403,7 +422,80 @@ def _carried(
                 read(computed[partition])
                 memories = kind.clocks[partition].memories
                 demanded.update(Value(partition, memories[m], index - 1) for m in recalled[partition])
-    return remembered(demanded, ticks)
+    return demanded
+
+
+def _repeats(
+    pattern: LinearSite,
+    live: frozenset[tuple[int, int]],
+    events: Sequence[Event],
+    carried: Sequence[Value],
+    ticks: Sequence[int],
+) -> Repeats | None:
+    """Return the longest row of events that come again and again, as of a clock's ticks between packets."""
+    counted = [*_counted(events, len(ticks))]
+    first, length, count = _longest_run([_moved(*one) for one in zip(events, counted, strict=False)])
+    work = sum(isinstance(event, Tick | Propagate) for event in events[first : first + length])
+    if (count - 1) * work < WORTH * (count.bit_length() + count.bit_count() - 1):
+        return None
+    begin, again, end = (counted[first + length * times] for times in (0, 1, count))
+    own = tuple(after - before for before, after in zip(begin, again, strict=True))
+    holds = [Value(HELD, hold, -1) for hold in range(pattern.b.shape[1])]
+    once = (*own, 1)  # what a hold puts out is of the time before: its partition is the last
+    body = [_moved(event, begin) for event in events[first : first + length]]
+    rest = [_moved(event, end) for event in events[first + length * count :]]
+    needed = {
+        *_demanded(pattern, live, body, holds),
+        *_demanded(pattern, live, rest, holds),
+        *(_earlier(shifted(value, ticks), end) for value in carried),
+    }
+    renewed = [value for value in needed if once[value.partition]]
+    stays = sorted(value for value in needed if not once[value.partition] and value.index < 0)
+    return Repeats(first, length, count, own, (*remembered(renewed, once), *stays))
+
+
+def _counted(events: Sequence[Event], clocks: int) -> Iterator[tuple[int, ...]]:
+    """Yield how many ticks there are before each event, by clock partition, and in all."""
+    counts = [0] * clocks
+    for event in events:
+        yield tuple(counts)
+        if isinstance(event, Tick):
+            counts[event.partition] += 1
+    yield tuple(counts)
+
+
+def _moved(event: Event, by: Sequence[int]) -> Event:
+    """Return an event with its ticks counted from later ones."""
+    match event:
+        case Tick(partition, index, heard):
+            return Tick(partition, index - by[partition], heard)
+        case Act(hold, value):
+            return Act(hold, _earlier(value, by))
+    return event
+
+
+def _earlier(value: Value, by: Sequence[int]) -> Value:
+    return Value(value.partition, value.output, value.index - by[value.partition])
+
+
+def _longest_run(forms: Sequence[Event]) -> tuple[int, int, int]:
+    """Return the first place, length and number of times of what repeats most in a sequence."""
+    numbers: dict[Event, int] = {}
+    codes = np.array(
+        [
+            -place - 1 if isinstance(form, Send) else numbers.setdefault(form, len(numbers))
+            for place, form in enumerate(forms)  # what is sent is another packet each time
+        ]
+    )
+    best, found = 0, (0, 1, 1)
+    for length in range(1, min(len(codes) // 2, MOST_REPEATED) + 1):
+        same = np.concatenate([[False], codes[length:] == codes[:-length], [False]])
+        edges = np.flatnonzero(same[1:] != same[:-1])
+        for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            count = (end - start) // length + 1
+            if (count - 1) * length > best:
+                best, found = (count - 1) * length, (start, length, count)
+    return found
 
 
 def _value_name(pattern: LinearSite, value: Value, times: Times) -> str:

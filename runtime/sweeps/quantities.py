@@ -34,8 +34,8 @@ MESSAGE = Column("message", "", "text")
 class Quantity:
     """A result of every point: `rows` gives the rows of some points of a grid, cells in order of `columns`.
 
-    The first column is the verdict, the last a message, empty but where a point is at fault. `quick` says that
-    a point takes next to no time, so that many make a part of the work.
+    The first column is the verdict, the last a message, empty but where a point is at fault. `quick` says
+    that a point takes next to no time, so that many make a part of the work.
     """
 
     columns: tuple[Column, ...]

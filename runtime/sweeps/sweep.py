@@ -10,7 +10,7 @@ Does not: start processes itself (see `processes`, `cluster`), or print.
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 
 PLACE = Place("sweep")
 
-# Points of a part: a third of a second of analyses, which is what a kill can cost; more where points are quick,
-# as long as there are parts for all who compute; and no more files in a folder than one likes to list.
+# Points of a part: a third of a second of analyses, which is what a kill can cost; more where points are
+# quick, as long as there are parts for all who compute; and no more files in a folder than one likes to list.
 PART_POINTS, QUICK_POINTS = 64, 2048
 SHARES = 32
 MOST_PARTS = 10_000
@@ -157,9 +157,15 @@ def sweep(
         whose = Whose(jobs or cores(), cluster, patience or Patience())
         notes = _compute_missing(work, kept, whose, progress)
         listed = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
-        columns = _columns(work, kept, [one.kind for one in listed])
-        if out is not None:
-            write_table(out, listed, _rows(work, kept), made_of)
+        kinds = [one.kind for one in listed]
+        columns: tuple[NDArray[Any], ...] = tuple(
+            np.empty(grid.points, dtype=np.float64 if kind == "number" else object) for kind in kinds
+        )
+        rows = _collected(work, kept, kinds, columns)
+        if out is None:
+            deque(rows, maxlen=0)
+        else:
+            write_table(out, listed, rows, made_of)
             if isinstance(kept, Parts):
                 remove_parts(out)
     headings = tuple(one.heading for one in listed)
@@ -278,25 +284,22 @@ def _other_versions(computed: Computed, cluster: str | None) -> Mistake:
     return Mistake("E888", Place(cluster or "sweep"), what)
 
 
-def _rows(work: Work, kept: _Kept) -> Iterator[Row]:
-    """Yield every row: the values of the axes, then the results."""
-    for number in range(work.parts):
-        computed = kept.read(number)
-        assert computed is not None, f"part {number} was written and is gone"
-        for point, row in zip(work.points_of(number), computed, strict=True):
-            yield (*(float(value) for value in work.grid.values(point)), *row)
-
-
-def _columns(work: Work, kept: _Kept, kinds: Sequence[str]) -> tuple[NDArray[Any], ...]:
-    """Return the columns as arrays."""
-    columns: list[NDArray[Any]] = [
-        np.empty(work.grid.points, dtype=np.float64 if kind == "number" else object) for kind in kinds
-    ]
+def _collected(
+    work: Work, kept: _Kept, kinds: Sequence[str], columns: Sequence[NDArray[Any]]
+) -> Iterator[Row]:
+    """Yield every row, the values of the axes, then the results; keep them in columns, too."""
+    values = [np.array([float(value) for value in axis.values]) for axis in work.grid.axes]
     words: dict[Cell, Cell] = {}  # a verdict that stands in a million rows is held once
-    for place, row in enumerate(_rows(work, kept)):
-        for column, cell, kind in zip(columns, row, kinds, strict=True):
-            if kind == "number":
-                column[place] = np.nan if cell is None else cell
+    for part in range(work.parts):
+        computed = kept.read(part)
+        assert computed is not None, f"part {part} was written and is gone"
+        points = work.points_of(part)
+        places = work.grid.places(points)
+        listed: list[Sequence[Cell]] = [own[places[:, axis]].tolist() for axis, own in enumerate(values)]
+        listed += list(zip(*computed, strict=True))
+        for column, cells, kind in zip(columns, listed, kinds, strict=True):
+            if kind == "number":  # None is NaN
+                column[points.start : points.stop] = np.array(cells, dtype=np.float64)
             else:
-                column[place] = words.setdefault(cell, cell)
-    return tuple(columns)
+                column[points.start : points.stop] = [words.setdefault(cell, cell) for cell in cells]
+        yield from zip(*listed, strict=True)

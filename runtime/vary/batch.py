@@ -106,8 +106,8 @@ class Lift:
 class Bounded:
     """A closed system at k points.
 
-    `matrix` is that of relative coordinates, NaN where the motions taken out are not rigid, and `error` bounds
-    what it is off by; `whole` is that of the whole state, `heard` what each site hears over it.
+    `matrix` is that of relative coordinates, NaN where the motions taken out are not rigid, and `error`
+    bounds what it is off by; `whole` is that of the whole state, `heard` what each site hears over it.
     """
 
     matrix: Floats  # (k, m, m)

@@ -2,8 +2,8 @@
 
 Takes: a `BatchEvaluator`, and what its systems are at some points (`BatchEvaluator.bounded`).
 Gives: `Part`, `parts_of`; `Leading`, `leading`.
-Guarantees: what is said to be certain is proved, as in `eigen.dominant`: which eigenvalue is the largest of all
-systems, how far it may be off, on which side of 1 it is, and that no other one is 1.
+Guarantees: what is said to be certain is proved, as in `eigen.dominant`: which eigenvalue is the largest of
+all systems, how far it may be off, on which side of 1 it is, and that no other one is 1.
 Does not: say anything of the points where that is not clear.
 """
 
@@ -121,7 +121,7 @@ def _leading(
         leads[ahead] = number
         vectors.append((ahead, right[wins] * part.scale, left[wins] / part.scale))
     radius = np.abs(value)
-    # A radius that floats leave wider, or a mode that is over in a frame, is looked at as an analysis does it.
+    # A radius that floats leave wider, or a mode that is over in a frame, is another matter.
     certain = (2 * error <= WIDE * np.maximum(radius, 1.0)) & (radius > SMALL)
     unstable = radius - error > 1 + 4 * UNIT
     certain &= unstable | (radius + error < 1 - 4 * UNIT)

@@ -69,7 +69,7 @@ KEPT, MOST_STATES = 64, 120
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Varied:
-    """A parameter or time that varies, and its values in SI: as floats (v,), and each exactly by its place."""
+    """A parameter or time that varies, and its values in SI: as floats (v,), and exactly by their places."""
 
     free: Free
     numbers: Floats
@@ -179,8 +179,8 @@ class ManyAnalyses:
 class Analyses(Result):
     """The answers of many analyses, arrays of the shape of the values.
 
-    `parameters` names what varied, with its unit, and `values` holds its values in SI. The columns are those of
-    `Rows`; `left_out` says what of the scene the answers do not look at.
+    `parameters` names what varied, with its unit, and `values` holds its values in SI. The columns are
+    those of `Rows`; `left_out` says what of the scene the answers do not look at.
     """
 
     shown_by = "vary:analyses"
@@ -440,7 +440,7 @@ def _vectors(
 
 
 def _resolved(family: _Family, varied: Sequence[Varied], places: tuple[int, ...]) -> Numbers | None:
-    """Return the scene's numbers with what others follow from at these places; None where these may not be."""
+    """Return the scene's numbers with what others follow from at these places; None if these may not be."""
     if places not in family.resolved:
         if len(family.resolved) >= MOST_RESOLVED:
             family.resolved.clear()
