@@ -1,4 +1,4 @@
-"""Claims about `apc.eigen.dominant`: its bounds hold, whatever the matrices, and what it can't tell it leaves open."""
+"""Claims about `apc.eigen.dominant`: its bounds hold, and what it can't tell it leaves open."""
 
 from __future__ import annotations
 
@@ -21,10 +21,8 @@ CERTAIN = 1e-40  # what the truth itself may be off by
 def true_values(matrix: Floats) -> list[Any]:
     """Return the eigenvalues in 75 digits, the largest first."""
     with precision(BITS):
-        found = flint.acb_mat([[flint.acb(float(one)) for one in row] for row in matrix]).eig(
-            algorithm="approx"
-        )
-        return sorted(found, key=lambda value: -float(abs(value).mid()))
+        rows = flint.acb_mat([[flint.acb(float(one)) for one in row] for row in matrix])
+        return sorted(rows.eig(algorithm="approx"), key=lambda value: -float(abs(value).mid()))
 
 
 def find(matrix: Floats, error: Floats) -> Dominant:
@@ -32,7 +30,7 @@ def find(matrix: Floats, error: Floats) -> Dominant:
 
 
 def with_spectrum(random: np.random.Generator, values: list[complex], alike: float) -> Floats:
-    """Return a real matrix of such eigenvalues (conjugates are added), its vectors nearly alike if so asked."""
+    """Return a real matrix of such eigenvalues (conjugates are added), the more `alike` its vectors."""
     blocks: list[Floats] = []
     for value in values:
         a, b = value.real, value.imag

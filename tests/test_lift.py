@@ -12,8 +12,11 @@ import pytest
 from scipy.linalg import expm
 
 from apc.analysis.analysis import lifted_groups
-from apc.frame.lift import LiftedSite
+from apc.frame.discretize import discretize
+from apc.frame.lift import LiftedSite, composed_bounded, step_durations
+from apc.frame.radius import radius_of, value_of
 from tests.sites import MS, alone, paper
+from tests.topologies import compiled
 
 
 def _lifted(**values: Any) -> LiftedSite:
@@ -118,3 +121,47 @@ def test_a_site_without_clocks_is_its_exponential() -> None:
     [group], _ = lifted_groups(alone())
     assert group.lifted.frame_s == 1.0
     np.testing.assert_allclose(group.lifted.p, [[np.exp(-1.0)]], rtol=1e-15)
+
+
+# Clocks of which one ticks often between the ticks of another, holds that act late, memories, what is heard in
+# the frame it is sent in.
+RATES = """\
+topology: rates
+clocks: {{fast: {fast}, slow: {slow}, network: {network}}}
+peers: {{user: {{count: 2}}}}
+masses:
+  device: {{mass: 0.1 kg, damping: 5 N*s/m}}
+  cube: {{mass: 0.3 kg, damping: 5 N*s/m}}
+couplers:
+  near: {{type: SampledSpringDamper, a: device, b: cube, stiffness: 800 N/m, clock: fast, delay: {late}}}
+  wall: {{type: VirtualWall, flange: cube, stiffness: 90 N/m, damping: 1 N*s/m, period: {slow}, clock: slow}}
+  far: {{type: AveragePosition, object: cube, stiffness: 300 N/m, damping: 2 N*s/m, clock: fast, link: lan}}
+links: {{lan: {{clock: network, delay: {delay}}}}}
+"""
+
+
+@pytest.mark.parametrize("late", ["0 ms", "0.3 ms", "1 ms", "2.5 ms"])
+@pytest.mark.parametrize("delay", ["0 ms", "8 ms", "11 ms"])
+@pytest.mark.parametrize(
+    "rates", [("1 ms", "16 ms", "16 ms"), ("1 ms", "4 ms", "8 ms"), ("0.5 ms", "3 ms", "2 ms")]
+)
+def test_events_that_repeat_are_squared_to_what_they_make_one_by_one(
+    late: str, delay: str, rates: tuple[str, str, str]
+) -> None:
+    fast, slow, network = rates
+    text = RATES.format(fast=fast, slow=slow, network=network, late=late, delay=delay)
+    groups, _ = lifted_groups(compiled(text))
+    squared = 0
+    for group in groups:
+        schedule = group.schedule
+        squared += schedule.repeats is not None
+        durations = step_durations(schedule)
+        found = discretize(group.exact.a, group.exact.b, [one * schedule.quantum for one in durations])
+        steps = dict(zip(durations, found, strict=True))
+        one_by_one = composed_bounded(group.site, replace(schedule, repeats=None), steps)
+        for mine, other in zip(
+            composed_bounded(group.site, schedule, steps).blocks, one_by_one.blocks, strict=True
+        ):
+            assert (np.abs(value_of(mine) - value_of(other)) <= radius_of(mine) + radius_of(other)).all()
+            assert (radius_of(mine) <= 2 * radius_of(other) + 1e-18).all()
+    assert squared or slow != "16 ms"

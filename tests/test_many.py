@@ -185,7 +185,7 @@ GROUPS = replaced(
     "name", ["one.contact.stiffness", "other.device.mass", "device.mass", "one.device.mass"]
 )
 def test_a_group_has_its_own_value_and_everybody_theirs(name: str, counted: Counted) -> None:
-    """0.1 and 0.2 kg are what the others have: then peers are alike that differ elsewhere, two modes the same."""
+    """0.1 and 0.2 kg are what the others have: peers are alike there that differ elsewhere."""
     system = compiled(GROUPS)
     values = np.array([0.1, 0.15, 0.2, 0.25]) * (5000 if "stiffness" in name else 1)
     found = analyze_many(system, {name: values})

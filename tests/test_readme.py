@@ -109,9 +109,9 @@ def test_the_topology_shown_is_a_scene_and_the_error_shown_is_its_message(
 
 def test_the_python_shown_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(ROOT)
-    code = re.search(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    code = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
     assert code
-    exec(compile(code.group(1), "README.md", "exec"), {})  # our own text
+    exec(compile("\n".join(code), "README.md", "exec"), {})  # our own text
     assert "stable" in capsys.readouterr().out
 
 

@@ -222,7 +222,7 @@ def _enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes,
 
 
 def all_within(matrix: Floats, error: Floats, radius: Floats) -> Truths:
-    """Say whether all eigenvalues of matrices (k, n, n), known up to an error, are less than a radius (k,)."""
+    """Say whether all eigenvalues of matrices (k, n, n) known up to an error are within a radius (k,)."""
     with np.errstate(all="ignore"):
         shrunk = matrix / radius[:, None, None]
         away = _norms(error) / radius + 2 * UNIT * _norms(shrunk)

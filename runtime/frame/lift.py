@@ -240,11 +240,12 @@ def _play_again(
 
     Notes
     -----
-    Of y, the continuous states and the values that enter, and r, what is heard, one time makes T y + R r;
-    two times (T² y + (T R + R) r), and so on, squared.
+    Of y, the continuous states and the values that enter, and r, the values that stay and what is heard, one
+    time makes T y + R r; two times (T² y + (T R + R) r), and so on, squared.
     """
     n_x, n_r = playing.states, len(schedule.heard)
-    n = n_x + len(again.entering)
+    needed = (*again.entering, *again.staying)
+    n, n_y = n_x + len(needed), n_x + len(again.entering)
     before = [0] * len(again.ticks)
     for event in schedule.events[: again.first]:
         if isinstance(event, Tick):
@@ -262,7 +263,7 @@ def _play_again(
 
     unit = numbers.exact(np.eye(n + n_r))
     once = playing.at_rest(unit[..., :n_x, :])
-    for place, value in enumerate(again.entering, n_x):
+    for place, value in enumerate(needed, n_x):
         if value.partition == HELD:
             once.moving[..., n_x + value.output, :] = unit[..., place, :]
         else:
@@ -273,8 +274,8 @@ def _play_again(
 
     def after(later: Matrix, earlier: Matrix) -> Matrix:
         """Return (T, R) of one number of times after another."""
-        found = numbers.multiply(later[..., :n], earlier)
-        found[..., n:] = numbers.add(found[..., n:], later[..., n:])
+        found = numbers.multiply(later[..., :n_y], earlier)
+        found[..., n_y:] = numbers.add(found[..., n_y:], later[..., n_y:])
         return found
 
     whole, left = None, again.count
@@ -286,7 +287,7 @@ def _play_again(
             break
         step = after(step, step)
     assert whole is not None
-    y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in again.entering])
+    y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in needed])
     found = numbers.multiply(whole[..., :n], y)
     heard = found.shape[-1] - n_r  # the last columns are what is heard
     found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])

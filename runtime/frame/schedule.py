@@ -139,8 +139,9 @@ HELD = -1
 class Repeats:
     """Events that come again and again: `count` times `length` of them, from event `first` on.
 
-    `ticks` are of one time, by clock partition. `entering` is what one time needs of those before, and what
-    is needed when all are over, indices counted from its own first tick; see `HELD`.
+    `ticks` are of one time, by clock partition. `entering` is what one time needs of those before, or what is
+    needed when all are over, indices counted from its own first tick; `staying` the same, of what none of them
+    changes. See `HELD`.
     """
 
     first: int
@@ -148,6 +149,7 @@ class Repeats:
     count: int
     ticks: tuple[int, ...]
     entering: tuple[Value, ...]
+    staying: tuple[Value, ...]
 
     @property
     def end(self) -> int:

@@ -449,9 +449,14 @@ def _repeats(
         *_demanded(pattern, live, rest, holds),
         *(_earlier(shifted(value, ticks), end) for value in carried),
     }
-    renewed = [value for value in needed if once[value.partition]]
-    stays = sorted(value for value in needed if not once[value.partition] and value.index < 0)
-    return Repeats(first, length, count, own, (*remembered(renewed, once), *stays))
+    switched = {event.hold for event in body if isinstance(event, Act)}
+    stays = {
+        value
+        for value in needed
+        if (value.output not in switched if value.partition == HELD else not own[value.partition])
+    }
+    staying = tuple(sorted(value for value in stays if value.index < 0))
+    return Repeats(first, length, count, own, remembered(needed - stays, once), staying)
 
 
 def _counted(events: Sequence[Event], clocks: int) -> Iterator[tuple[int, ...]]:

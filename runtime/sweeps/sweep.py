@@ -1,7 +1,7 @@
 """One result at every combination of some parameters' values, with what is finished kept as it comes.
 
 Takes: a `CompiledSystem`, the values of each swept parameter, what to compute.
-Gives: `Sweep`, `sweep`.
+Gives: `Sweep`, `sweep`; `part_points`.
 Guarantees: the same rows in the same order whoever computes them, interrupted or not; a sweep with a target
 takes up its finished parts; the target is written when all of it is there, and its parts are removed then.
 Does not: start processes itself (see `processes`, `cluster`), or print.
@@ -151,7 +151,7 @@ def sweep(
         check_table_path(out, "out=")
     if jobs is not None and jobs < 1:
         raise ApcError(Mistake("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
-    work = Work(model_bytes(system), of, grid, _part_points(grid.points, quick=quantity.quick))
+    work = Work(model_bytes(system), of, grid, part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
     with _kept(out, made_of) as kept:
         whose = Whose(jobs or cores(), cluster, patience or Patience())
@@ -172,8 +172,16 @@ def sweep(
     return Sweep(system.name, of, grid, headings, columns, out, made_of, notes)
 
 
-def _part_points(points: int, *, quick: bool) -> int:
-    """Return how many points are a part."""
+def part_points(points: int, *, quick: bool) -> int:
+    """Return how many points are a part of the work.
+
+    Parameters
+    ----------
+    points
+        Of the whole sweep.
+    quick
+        As of `quantities.Quantity`.
+    """
     most = min(points // SHARES, QUICK_POINTS) if quick else 0
     return max(PART_POINTS, most, -(-points // MOST_PARTS))
 

@@ -2,7 +2,7 @@
 """The map of the paper's scene over K_C and K_T, every verdict against 60 digits: `python -m tests.bench.map`.
 
 Four maps: P (no damping in the couplers) and PD (2 N·s/m), mean and mesh; then the points at the boundary of
-each column times 1 ± 1e-9. Wrong verdicts must be none; an error beside its bound must be below 1.
+each column times 1 ± 1e-9; before them 10,000 points at once beside a batched program by hand. Wrong verdicts must be none; an error beside its bound must be below 1.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from statistics import median
 
 import flint
 import numpy as np
@@ -22,11 +23,14 @@ from apc.eigen.balls import precision
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.threads import single_threaded
+from apc.vary.many import analyze_many
 from tests.bench.judge import Judge, parser_of
+from tests.bench.naive_region import modal_radii
 from tests.bench.paper_scene import CUBE_DAMPING, DEVICE_DAMPING, DEVICE_MASS, SHARED_MASS, TICKS, USERS
 from tests.bruteforce import Scene, frame_matrix
 from tests.topologies import AVERAGE, MESH, compiled
 
+SIDE = 100  # of the map that is made at once
 BITS = 200  # of precision: 60 decimal digits
 CERTAIN = 1e-40  # so far, and no more, the truth itself may be off (`check_truth`)
 MOST_K_C, MOST_K_T = 5000.0, 1500.0  # the limits of the scene's own study; with dampers, twice that holds
@@ -190,6 +194,35 @@ def one_map(text: str, mesh: bool, damping: float, side: int) -> tuple[Tally, Ta
     return inner, edge
 
 
+def at_once(judge: Judge, rounds: int) -> None:
+    """Compare 10,000 points at once with the batched modal program, error beside time."""
+    grid = np.linspace(10.0, 3000.0, SIDE)
+    k_c, k_t = (one.ravel() for one in np.meshgrid(grid, grid))
+    given = {"contact.stiffness": k_c, "coordination.stiffness": k_t}
+    system = compiled(AVERAGE)
+    times = []
+    for _ in range(rounds + 1):  # in turn, as the machine is not always as fast; the first is warm-up
+        ours, found = timed(lambda: analyze_many(system, given))
+        theirs, radii = timed(lambda: modal_radii(k_c, k_t))
+        times.append((ours, theirs))
+    ours, theirs = (median(one) for one in zip(*times[1:], strict=True))
+    some = np.random.default_rng(1).choice(len(k_c), 200, replace=False)
+    known = [float(truth(False, float(k_c[place]), float(k_t[place]), 0.0).radius) for place in some]
+    off, naive = (float(np.abs(one[some] - known).max()) for one in (found.spectral_radius, radii))
+    bound = float(found.spectral_radius_error.max())
+    beside = float((np.abs(found.spectral_radius[some] - known) / found.spectral_radius_error[some]).max())
+    wrong = int((found.stable != (radii < 1)).sum())
+    print(f"{len(k_c):,} points of the mean at once, K_C and K_T in 10 to 3000 N/m")
+    print(
+        f"  apc.analyze_many      {1e3 * ours:7.0f} ms   error {off:.1e}, bound {bound:.1e}, proved verdicts, modes"
+    )
+    print(
+        f"  batched modal program {1e3 * theirs:7.0f} ms   error {naive:.1e}, no bound; verdicts that differ: {wrong}"
+    )
+    print(f"  ratio {ours / theirs:.2f}: {judge.in_time('many at once / modal program', ours / theirs, 1)}")
+    judge.within("many at once: error of the radius / bound", beside, 1)
+
+
 def main() -> None:
     """Print one line a map."""
     parser = parser_of("map", __doc__)
@@ -199,6 +232,7 @@ def main() -> None:
     judge = Judge(given.strict)
     with single_threaded(), precision(BITS):
         check_truth()
+        at_once(judge, 3 if given.points < 1000 else 9)
         for text, mesh in ((AVERAGE, False), (MESH, True)):
             for damping in (0.0, 2.0):
                 name = f"{'mesh' if mesh else 'mean'} {'PD' if damping else 'P '}"
