@@ -140,9 +140,9 @@ E877 runtime/simulation: a run has no duration, or none above zero
 E878 runtime: a file's suffix is none of a command's formats
 E879 runtime/present: the file of a run can't be written, or not to its end
 E880 runtime/cli: --over is not PATH=VALUES
-E881 runtime/sweeps: values to sweep are written wrong
+E881 runtime/sweeps runtime/vary: values to sweep are written wrong
 E882 runtime/sweeps: the number of peers can't be swept
-E883 runtime/cli runtime/sweeps: a sweep has nothing, too much or the same thing twice
+E883 runtime/cli runtime/sweeps runtime/vary: a sweep has nothing, too much or the same thing twice
 E884 runtime/sweeps: a sweep can't compute what is asked of it
 E885 runtime/sweeps: other work stands where a sweep keeps its parts
 E886 runtime/regions: a published condition is written wrong

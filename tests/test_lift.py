@@ -123,8 +123,8 @@ def test_a_site_without_clocks_is_its_exponential() -> None:
     np.testing.assert_allclose(group.lifted.p, [[np.exp(-1.0)]], rtol=1e-15)
 
 
-# Clocks of which one ticks often between the ticks of another, holds that act late, memories, what is heard in
-# the frame it is sent in.
+# Clocks of which one ticks often between the ticks of another, holds that act late, memories, what is heard
+# in the frame it is sent in.
 RATES = """\
 topology: rates
 clocks: {{fast: {fast}, slow: {slow}, network: {network}}}

@@ -38,7 +38,6 @@ REFUSED = {
         "three-large-groups": "nothing is sparse",
     },
     "determinant": {
-        "high-rate-ratio": "hides the peers' own eigenvalues",
         "non-commensurate": "hides the peers' own eigenvalues",
     },
 }

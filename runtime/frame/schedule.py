@@ -140,8 +140,8 @@ class Repeats:
     """Events that come again and again: `count` times `length` of them, from event `first` on.
 
     `ticks` are of one time, by clock partition. `entering` is what one time needs of those before, or what is
-    needed when all are over, indices counted from its own first tick; `staying` the same, of what none of them
-    changes. See `HELD`.
+    needed when all are over, indices counted from its own first tick; `staying` the same, of what none of
+    them changes. See `HELD`.
     """
 
     first: int
