@@ -103,7 +103,7 @@ def _true_frame(population: Population, vector: Any) -> FrameMap:
 def test_bound_and_estimate_cover_the_error_against_eighty_digits(
     grams: str, seed: int, values: Any, estimated: bool
 ) -> None:
-    system = apply(different(6, seed=seed, **values), [Override("cube.mass", None, Fraction(grams) / 1000)])
+    system = apply(different(6, seed=seed, **values), [Override(Free("cube.mass"), Fraction(grams) / 1000)])
     [population], _ = crowded(system)
     lifted = population.lifted
     assert lifted.estimated == estimated
@@ -117,7 +117,7 @@ def test_bound_and_estimate_cover_the_error_against_eighty_digits(
 
 def test_where_the_bound_is_hopeless_the_estimate_covers_the_truth() -> None:
     """A copy of a milligram: radii grow without measure over a frame, the errors don't."""
-    system = apply(different(6, kc=3000.0), [Override("cube.mass", None, Fraction(1, 10**6))])
+    system = apply(different(6, kc=3000.0), [Override(Free("cube.mass"), Fraction(1, 10**6))])
     [population], _ = crowded(system)
     assert population.lifted.estimated
     for row, vector in enumerate(population.parameters):

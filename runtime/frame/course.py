@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import exponential
+from apc.frame.discretize import exponential, exponential_rows
 from apc.frame.lift import follow
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix

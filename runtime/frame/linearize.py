@@ -125,18 +125,21 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     """
     assert site.parameters_suffice, "the start matters"
     count, function = len(parameters), site.function
-    rows = np.empty((count, function.numel_out(0)))
-    if not rows.size:
+    rows = np.zeros((count, function.numel_out(0)))
+    places = function.sparsity_out(0).row()
+    if not (count and places):
         return rows
+    found = np.empty((count, len(places)))
     # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
     buffer, evaluate = function.map(count).buffer()
     given = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
     given[4] = np.array(parameters, dtype=np.float64, order="C").ravel()
     for place, numbers in enumerate(given):
         buffer.set_arg(place, numbers.data)
-    buffer.set_res(0, rows.reshape(-1).data)
+    buffer.set_res(0, found.reshape(-1).data)
     evaluate()
-    return rows + 0.0  # −0 and 0 are one number
+    rows[:, places] = found + 0.0  # −0 and 0 are one number
+    return rows
 
 
 def sites_of_rows(site: SiteJacobians, rows: NDArray[np.float64]) -> LinearSite:

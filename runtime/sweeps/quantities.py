@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.eigen.spectrum import finite
-from apc.frame.names import Free, find, unit_of
+from apc.frame.names import find, unit_of
 from apc.frame.overrides import apply
 from apc.sweeps.grid import Grid
 from apc.tables import Column, Row
@@ -90,7 +90,7 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
     def rows(grid: Grid, points: Sequence[int]) -> list[Row]:
         if not made or made[0][0] is not grid:
             varied = [
-                Varied(Free(axis.name, axis.group), np.array([float(value) for value in axis.values]), exact)
+                Varied(axis.free, np.array([float(value) for value in axis.values]), exact)
                 for axis in grid.axes
                 for exact in [axis.values.__getitem__]
             ]

@@ -298,10 +298,10 @@ def _collected(
     """Yield every row, the values of the axes, then the results; keep them in columns, too."""
     values = [np.array([float(value) for value in axis.values]) for axis in work.grid.axes]
     words: dict[Cell, Cell] = {}  # a verdict that stands in a million rows is held once
-    for part in range(work.parts):
-        computed = kept.read(part)
-        assert computed is not None, f"part {part} was written and is gone"
-        points = work.points_of(part)
+    for number in range(work.parts):
+        computed = kept.read(number)
+        assert computed is not None, f"part {number} was written and is gone"
+        points = work.points_of(number)
         places = work.grid.places(points)
         listed: list[Sequence[Cell]] = [own[places[:, axis]].tolist() for axis, own in enumerate(values)]
         listed += list(zip(*computed, strict=True))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.dominant import all_within, enclosed, largest_pairs, misses_one
-from apc.eigen.enclosure import SMALL, WIDE, components
+from apc.eigen.enclosure import SMALL, components
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import LEAST_SHARE, STRAIGHT
@@ -29,6 +29,10 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Places = NDArray[np.intp]
 Truths = NDArray[np.bool_]
+
+# A radius less certain than this, or than this part of it where it is above 1, an analysis often knows better:
+# its exponentials are balls.
+SHARP = 1e-11
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,8 +125,8 @@ def _leading(
         leads[ahead] = number
         vectors.append((ahead, right[wins] * part.scale, left[wins] / part.scale))
     radius = np.abs(value)
-    # A radius that floats leave wider, or a mode that is over in a frame, is another matter.
-    certain = (2 * error <= WIDE * np.maximum(radius, 1.0)) & (radius > SMALL)
+    # A mode that is over in a frame is another matter.
+    certain = (error <= SHARP * np.maximum(radius, 1.0)) & (radius > SMALL)
     unstable = radius - error > 1 + 4 * UNIT
     certain &= unstable | (radius + error < 1 - 4 * UNIT)
     for number, (matrix, off) in enumerate(blocks):

@@ -77,7 +77,7 @@ class Varied:
 
     def override(self, place: int) -> Override:
         """Return what sets it to one of its values."""
-        return Override(self.free.name, self.free.group, self.exact(place))
+        return Override(self.free, self.exact(place))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +229,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
         raise ApcError(Mistake("E883", PLACE, what, hint='{"contact.stiffness": [500.0, 1000.0]}'))
     frees, listed = [], []
     for name, given in values.items():
-        free = Free(*find(system, name.strip(), PLACE))
+        free = find(system, name.strip(), PLACE)
         if free in frees:
             raise ApcError(Mistake("E883", PLACE, f"{free.label} is given twice"))
         refuse_channel_number(system, free, PLACE)
