@@ -30,8 +30,8 @@ Complexes = NDArray[np.complex128]
 Places = NDArray[np.intp]
 Truths = NDArray[np.bool_]
 
-# A radius less certain than this, or than this part of it where it is above 1, an analysis often knows better:
-# its exponentials are balls.
+# A radius less certain than this, or than this part of it where it is above 1, an analysis often knows
+# better: its exponentials are balls.
 SHARP = 1e-11
 
 
