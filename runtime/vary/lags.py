@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop
+from apc.eigen.bordered import Bordered, Logarithm, bordered, logarithm, side_by_side, wires_of
+from apc.eigen.closing import Loop, without_packets
 from apc.eigen.modes import arrange
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.names import Free
 from apc.frame.parameters import resolve
-from apc.large.bordered import Bordered, Logarithm, bordered, logarithm, side_by_side, wires_of
-from apc.large.determinant_spectrum import without_packets
 from apc.vary.delays import INSIDE, system_with_delay, timing_slopes
 from apc.vary.plane import count_beyond
 

@@ -30,10 +30,10 @@ from apc.eigen.balls import frame_steps, site_balls, weight_balls
 from apc.eigen.closing import Coupling, Loop, bounded_weight
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
+from apc.eigen.winding import FIRST_ARCS, Ball, determinant_ball, wind
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap, compose
 from apc.frame.schedule import Way
-from apc.large.characteristic import FIRST_ARCS, Ball, determinant_ball, wind
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
