@@ -161,16 +161,18 @@ def bordered(maps: FrameMap, weights: Floats, unit: float = 1.0) -> Bordered:
     maps
         The maps (k, …) of all sites as of one, or their derivatives.
     weights
-        W_l (l, n_r, n_s).
+        W_l (l, n_r, n_s), or those of each loop (l, k, n_r, n_s).
     unit
         What stands for 1.
     """
-    count, n_s, n_z = maps.s.shape
+    weights = weights if weights.ndim > 3 else weights[:, None]
+    n_s, n_z = maps.s.shape[-2:]
+    count = max(len(maps.s), weights.shape[1])
     fixed = np.zeros((count, n_z + n_s, n_z + n_s))
     fixed[:, :n_z, :n_z], fixed[:, n_z:, :n_z] = -maps.p, -maps.s
     fixed[:, n_z:, n_z:] = unit * np.eye(n_s)
     back = np.concatenate([maps.q, maps.d], axis=-2)
-    return Bordered(fixed, -(back @ weights[:, None]), n_z)
+    return Bordered(fixed, -(back @ weights), n_z)
 
 
 @dataclass(frozen=True, slots=True)

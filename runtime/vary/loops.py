@@ -171,5 +171,7 @@ def loop_evaluator(
         family=batch_evaluator(system, free, groups, exchange, matrices=False),
         loops=tuple(loops),
         wires=tuple(wires_of(loop.sites, loop.coupling, loop.doubts) for loop in loops),
-        rigid=tuple(find_rigid_modes(without_packets(loop)).directions.shape[1] for loop in loops),
+        rigid=tuple(
+            find_rigid_modes(without_packets(loop), with_drifts=False).directions.shape[1] for loop in loops
+        ),
     )
