@@ -86,7 +86,7 @@ def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not()
     assert found.analysis.verdict == analyze(late).verdict
     text = str(found)
     assert "what moves it most: not looked for: 3 peers make one system of 2,006" in text
-    assert "margins not looked for" in text
+    assert "margins none: the scene is not stable as it is" in text
     assert all(len(line) <= 80 for line in text.splitlines())
 
 

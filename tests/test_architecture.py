@@ -56,13 +56,14 @@ HOUSE = (
         "apc.eigen",
         """
         graph_modes peer_group listening peers closing graph_loops modes
-        rigid pseudospectrum dominant relative eigenpairs enclosure balls roots certify ratios spectrum
+        rigid pseudospectrum dominant relative eigenpairs enclosure balls winding bordered roots certify
+        ratios spectrum
         """,
     ),
     (
         "apc.large",
         """
-        diagonal transfer characteristic bordered zeros populations determinant determinant_spectrum
+        diagonal transfer characteristic zeros populations determinant determinant_spectrum
         translation rings sparse_system krylov
         """,
     ),

@@ -1,4 +1,4 @@
-"""Claims about `apc.large.bordered`: it has the zeros of the closed matrix, packets and all."""
+"""Claims about `apc.eigen.bordered`: it has the zeros of the closed matrix, packets and all."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import pytest
 
 from apc.analysis.analysis import lifted_groups
 from apc.eigen.balls import precision
-from apc.eigen.closing import Loop, close_loop
-from apc.eigen.modes import arrange
-from apc.large.bordered import (
+from apc.eigen.bordered import (
     Logarithm,
     beyond_circle,
     bordered,
@@ -22,6 +20,8 @@ from apc.large.bordered import (
     wire_balls,
     wires_of,
 )
+from apc.eigen.closing import Loop, close_loop
+from apc.eigen.modes import arrange
 from tests.topologies import AVERAGE, compiled, replaced
 
 LATE = replaced(AVERAGE, ("delay: 8 ms}", "delay: 40 ms}"))

@@ -316,7 +316,6 @@ def test_many_packets_on_their_way_give_the_crossings_that_few_give(monkeypatch:
     """Without a matrix that holds the packets: the argument principle instead, from this many on."""
     system = with_values(compiled(AVERAGE), {"coordination.stiffness": "690", "contact.stiffness": "100"})
     by_matrix = critical(system, "lan.delay", upper="16 ms")
-    monkeypatch.setattr("apc.vary.delays.LONG_LINES", 0)
     monkeypatch.setattr("apc.analysis.plan.LONG_LINES", 0)
     by_count = critical(system, "lan.delay", upper="16 ms")
     assert by_matrix.crossings

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from apc.large.bordered import Logarithm
+from apc.eigen.bordered import Logarithm
 from apc.vary.plane import cross, over_all
 
 Floats = NDArray[np.float64]

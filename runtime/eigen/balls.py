@@ -126,6 +126,15 @@ def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Seque
     weights = weight_balls(system)
     sent: dict[tuple[int, int], Balls] = {}
 
+    def touched(g: int, own: range) -> NDArray[np.intp]:
+        """Return the columns that a site's rows may differ from zero in: all, if it hears of this frame."""
+        found = set(own)
+        for one in system.sites[g].schedule.heard:
+            if not one.lag:
+                return np.arange(n)
+            found |= {place_of[Packet(h, rows_of[h][one.sent], one.lag)] for h, _ in weights[one.way][g]}
+        return np.array(sorted(found), dtype=np.intp)
+
     def hearing(g: int) -> Callable[[int], Balls | None]:
         def hear(line: int) -> Balls | None:
             one = system.sites[g].schedule.heard[line]
@@ -133,20 +142,26 @@ def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Seque
             for h, weight in weights[one.way][g]:
                 row = rows_of[h][one.sent]
                 if one.lag:
-                    total = total + unit[place_of[Packet(h, row, one.lag)]] * weight
+                    total[place_of[Packet(h, row, one.lag)]] += weight
                 elif (h, row) in sent:
                     total = total + sent[h, row] * weight
                 else:
                     return None
-            return total
+            return np.asarray(total[columns[g]])
 
         return hear
 
+    def whole(g: int, rows: Balls) -> Balls:
+        found = np.zeros((*rows.shape[:-1], n), dtype=object)
+        found[..., columns[g]] = rows
+        return found
+
     matrix = np.zeros((n, n), dtype=object)
-    courses = {}
+    courses, columns = {}, list[NDArray[np.intp]]()
     for g, (group, site, own) in enumerate(zip(system.sites, sites, steps, strict=True)):
         end = system.offsets[g] + len(group.lifted.z_names)
-        start = unit[system.offsets[g] : end]
+        columns.append(touched(g, range(system.offsets[g], end)))
+        start = unit[system.offsets[g] : end, columns[g]]
         courses[g] = follow(site, group.schedule, own, start, hearing(g), multiply=_multiply)
     while courses:
         known = len(courses), len(sent)
@@ -154,10 +169,10 @@ def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Seque
             try:
                 # On until it has to wait, so that everybody is sooner or later heard.
                 while (spoken := next(course))[0] >= 0:
-                    sent[g, spoken[0]] = spoken[1]
+                    sent[g, spoken[0]] = whole(g, spoken[1])
             except StopIteration as end_of_frame:
                 state = end_of_frame.value
-                matrix[system.offsets[g] : system.offsets[g] + len(state)] = state
+                matrix[system.offsets[g] : system.offsets[g] + len(state)] = whole(g, state)
                 del courses[g]
         assert (len(courses), len(sent)) != known, "a packet is heard before it is sent"
     shift_packets(matrix, system.layout, lambda packet: sent[packet.site, packet.row])

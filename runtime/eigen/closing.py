@@ -1,8 +1,8 @@
 """Close a loop: what each site hears is what the others send, and one matrix moves them all.
 
 Takes: groups of equal peers, and what each weighs the packets of each other by.
-Gives: `Loop`, `Coupling`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`, `close_loop`; `Feedback`,
-`bounded_weight`, `feedback_of`, `close`, `shift_packets`.
+Gives: `Loop`, `Coupling`, `without_packets`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`,
+`close_loop`; `Feedback`, `bounded_weight`, `feedback_of`, `close`, `shift_packets`.
 Guarantees: the state holds, site by site, z and then the packets on their way, in order of row and age. The
 matrix of `close_loop` comes with a bound on its rounding error, entry by entry; `close` takes one system or
 many (k, …), real or complex.
@@ -91,6 +91,15 @@ class StateLayout:
     def packets(self) -> tuple[Packet, ...]:
         """The packets on their way, in order of state."""
         return tuple(self.places)
+
+
+def without_packets(loop: Loop) -> Loop:
+    """Return the loop with no packet in its state: how many motions are rigid does not depend on delays."""
+    sites = tuple(
+        replace(group, schedule=replace(group.schedule, depths=(0,) * len(group.schedule.depths)))
+        for group in loop.sites
+    )
+    return replace(loop, sites=sites)
 
 
 def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> StateLayout:

@@ -1,7 +1,7 @@
 """When what happens in one frame, in what order, and what must be remembered from frame to frame.
 
 Takes: a `CompiledSystem`, its timings as exact rationals, the structural patterns of its kinds.
-Gives: `build_schedules`.
+Gives: `build_schedules`, `newest`.
 Guarantees: the state at the start of a frame is what is demanded and nothing else: a hold that acts at once
 adds none, a link adds a sender's packets that are still to be heard.
 Does not: look at numbers other than times.
@@ -85,8 +85,9 @@ def build_schedules(
         at once misses the switch and acts a tick later; likewise "deliver" before "send" for packets, and
         "tick" before "deliver" for a packet that arrives exactly at a tick.
     kept
-        For how many frames the packets are kept of each link that loses or delays them, by name: each tick
-        selects of them, in rows of its own. None: every link is as reliable as its delay says.
+        For how many frames the packets are kept of each link of which it stays open which of them is heard,
+        by name: each tick selects of them, in rows of its own. None: every link is as reliable as its delay
+        says.
 
     Raises
     ------
@@ -221,11 +222,10 @@ def _heard_at_ticks(
     def rows(way: Way, channel: str, clock: str, index: int) -> tuple[Heard | Selected, ...]:
         if way.link not in kept:
             instant = times.clocks[clock].at(index)
-            return (_newest(way, channel, exchange.links[way.link], instant, times, rank),)
+            return (newest(way, channel, exchange.links[way.link], instant, times, rank),)
         row = Selected(way, channel, clock, index)
         law = exchange.links[way.link].channel
-        assert law is not None, f"{way.link} is reliable"
-        return (row, replace(row, gap=True)) if law.on_loss == "zero" else (row,)
+        return (row, replace(row, gap=True)) if law is not None and law.on_loss == "zero" else (row,)
 
     for p in sorted({partition for partition, _ in live}):
         clock = pattern.kind.clocks[p].clock
@@ -237,7 +237,7 @@ def _heard_at_ticks(
     return heard
 
 
-def _newest(way: Way, channel: str, link: Link, instant: int, times: Times, rank: Mapping[str, int]) -> Heard:
+def newest(way: Way, channel: str, link: Link, instant: int, times: Times, rank: Mapping[str, int]) -> Heard:
     """Return the newest packet on a way that a tick at `instant` sees."""
     delay, grid = times.delays[way.delay], times.clocks[link.clock]
     missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0

@@ -20,12 +20,12 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.eigen.bordered import wires_of
 from apc.eigen.closing import Coupling
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.lift import BoundedMap, FrameMap
 from apc.frame.schedule import Heard, Sent, Way
-from apc.large.bordered import wires_of
 from apc.large.characteristic import Characteristic
 from apc.large.populations import Population, hear_themselves, rows_of
 from apc.large.transfer import build_transfer

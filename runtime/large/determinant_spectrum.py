@@ -1,7 +1,7 @@
 """The spectrum of a population by its characteristic function: bounds, verdict, the largest modes.
 
 Takes: loops with long delays, or populations of different peers on complete graphs.
-Gives: `solve_loops`, `solve_populations`; `frequency_of`, `without_packets`.
+Gives: `solve_loops`, `solve_populations`; `frequency_of`.
 Guarantees: as `zeros`: the radius is bounded from both sides, and nothing beyond it is missed; a verdict
 nearer to the boundary than its bound says so. Rigid modes are known from the equations.
 Does not: list more than the largest modes.
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import Loop
+from apc.eigen.closing import Loop, without_packets
 from apc.eigen.eigenpairs import eigenpairs
 from apc.eigen.rigid import find_rigid_modes
 from apc.eigen.spectrum import Mode, Spectrum, judge
@@ -147,15 +147,6 @@ def frequency_of(loop: Loop, value: complex) -> float:
     """Return the frequency in Hz of the motion of an eigenvalue of a loop, whole turns in a frame counted."""
     function = of_loop(loop.sites, loop.coupling, loop.doubts)
     return _loop_mode(function, loop, Zero(value, 0.0, 1)).frequency_hz
-
-
-def without_packets(loop: Loop) -> Loop:
-    """Return the loop with no packet in its state: how many motions are rigid does not depend on delays."""
-    sites = tuple(
-        replace(group, schedule=replace(group.schedule, depths=(0,) * len(group.schedule.depths)))
-        for group in loop.sites
-    )
-    return replace(loop, sites=sites)
 
 
 def _delay_starts(function: Characteristic) -> Complexes:

@@ -22,9 +22,9 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.eigen.winding import FIRST_ARCS
 from apc.large.characteristic import (
     FARTHEST,
-    FIRST_ARCS,
     Characteristic,
     characteristic_ball,
     count_around,

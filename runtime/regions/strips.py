@@ -161,7 +161,7 @@ def _strips(
         high = min(piece.high, delay.high)
         tell(high)
         ends = [float((one - delay.low) / (delay.high - delay.low)) for one in (piece.low, high)]
-        if piece.constant:
+        if piece.evaluator is None:
             yield _standing(piece, other, ends, prepared)
         else:
             yield _moving(source, delay, other, piece, ends, cells, tolerance)

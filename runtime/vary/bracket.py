@@ -77,13 +77,12 @@ def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Br
     system = systems(root.value)[root.system][0]
     if unprovable(system) or len(system.names) > MOST_PROVED:
         return None
-    most_bits = 0
+    most_bits = PRECISIONS[0]
 
     @functools.cache
     def above(value: float) -> bool | None:
         nonlocal most_bits
-        inside, bits = _inside(*systems(value)[root.system])
-        most_bits = max(most_bits, bits)
+        inside, most_bits = _inside(*systems(value)[root.system], most_bits)
         return None if inside is None else inside == root.rising
 
     held = hold(root, above, low, high)
@@ -153,10 +152,13 @@ def hold(root: Root, above: Above, low: float, high: float, half: float = 0.0) -
     return value, max(right - value, value - left)
 
 
-def _inside(system: ClosedSystem, free: RigidModes) -> tuple[bool | None, int]:
-    """Say whether all eigenvalues but the rigid ones are proved inside the circle, or one outside."""
+def _inside(system: ClosedSystem, free: RigidModes, least: int) -> tuple[bool | None, int]:
+    """Say whether all eigenvalues but the rigid ones are proved inside the circle, or one outside.
+
+    With `least` bits or more: what one end of a bracket took, the other takes, too.
+    """
     held = independent_places(free.basis.T)
-    for bits in PRECISIONS:
+    for bits in (one for one in PRECISIONS if one >= least):
         with precision(bits):
             reduced = square(reduced_balls(frame_balls(system), free.exact, held))
             inside = schur_cohn(reduced.charpoly().coeffs())

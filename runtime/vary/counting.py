@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from apc.eigen.balls import precision, unprovable
-from apc.eigen.closing import Loop
-from apc.large.bordered import (
+from apc.eigen.bordered import (
     beyond_circle,
     map_balls,
     proved_zero,
@@ -25,6 +24,7 @@ from apc.large.bordered import (
     wire_balls,
     wires_of,
 )
+from apc.eigen.closing import Loop
 from apc.vary.bracket import PRECISIONS, Bracket, hold
 from apc.vary.crossings import Root
 

@@ -1,13 +1,14 @@
 """A system's frame matrices as a delay varies: piece by piece, as far as the order of events stays the same.
 
 Takes: a `CompiledSystem` and a parameter or timing that reaches its delays.
-Gives: `Piece`, `delay_pieces`, `most_packets`, `pace`, `borders`, `timing_slopes`; `system_with_delay`,
+Gives: `Piece`, `delay_pieces`, `pace`, `borders`, `timing_slopes`; `reaches_parameters`,
+`system_with_delay`,
 `delay_now`.
 Guarantees: pieces join on without a gap; events coincide at the values between them and nowhere else.
 Does not: vary periods or phases: another period is another frame.
 
-Within a piece the schedule stays and its steps' durations are linear in the delay; a packet is read at ticks
-only, so that over a link nothing changes within a piece at all.
+Within a piece the schedule stays and its steps' durations are linear in the delay. (Over a link nothing
+changes within a piece at all, as a packet is read at ticks only: see `lags`.)
 """
 
 from __future__ import annotations
@@ -22,15 +23,14 @@ from fractions import Fraction
 import numpy as np
 
 from apc.analysis.analysis import Prepared, lifted_groups
-from apc.analysis.plan import LONG_LINES
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import time_left
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
-from apc.frame.schedule import Propagate, Schedule
+from apc.frame.schedule import Act, Propagate, Schedule
 from apc.frame.scheduling import build_schedules
 from apc.vary.batch import BatchEvaluator, batch_evaluator
 
@@ -39,28 +39,23 @@ MOST_PIECES = 10_000
 
 # Where in a piece its schedule is looked at: anywhere inside will do, but no two of its steps should be equal
 # there by accident. No time of a scene is a multiple of one part in this prime number.
-INSIDE = (Fraction(28_571, 104_729), Fraction(56_393, 104_729))
+INSIDE = Fraction(28_571, 104_729)
 
 # How far apart two values of a parameter are at which timings tell how fast they follow it.
 STEP = Fraction(1, 1009)
-
-# A schedule as it is up to the length of its steps.
-_Form = tuple[object, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
     """Delays between `low` and `high` seconds; the ends are limits from within.
 
-    `constant` says that nothing depends on the delay within the piece: `inside`, the scene at one of its
-    delays, stands for all. With that many packets on their way it has no `evaluator`, whose matrices would
-    hold them all.
+    Where nothing depends on the delay within the piece it has no `evaluator`: `inside`, the scene at one of
+    its delays, stands for all.
     """
 
     low: Fraction
     high: Fraction
     evaluator: BatchEvaluator | None
-    constant: bool
     inside: CompiledSystem
 
 
@@ -111,19 +106,11 @@ def delay_pieces(
     following = borders(system, free, place=place)
     if high is not None:
         _count(free, low, high, following, place)
-    known: dict[tuple[object, ...], BatchEvaluator] = {}
+    slopes, follows = timing_slopes(system, free), reaches_parameters(system, free)
     while high is None or low < high:
         end = following(low)
-        yield _piece(system, free, low, end, prepared, known)
+        yield _piece(system, free, low, end, prepared, slopes, follows=follows)
         low = end
-
-
-def most_packets(system: CompiledSystem, free: Free, value: Fraction, prepared: Prepared) -> int:
-    """Return how many packets of one peer are on their way at most, at a value."""
-    timings = resolve(system_with_delay(system, free, value)).timings
-    patterns = [site.pattern for site in prepared.jacobians]
-    schedules = build_schedules(system, timings, patterns, order=prepared.order)
-    return max(sum(one.depths) for one in schedules)
 
 
 def pace(
@@ -240,6 +227,14 @@ def timing_slopes(system: CompiledSystem, free: Free) -> dict[str, Fraction]:
     return {name: (there[name] - here[name]) / STEP for name in here}
 
 
+def reaches_parameters(system: CompiledSystem, free: Free) -> bool:
+    """Say whether what reaches the delays is, or changes, a parameter of the equations as well."""
+    here, there = (
+        resolve(system_with_delay(system, free, value)).parameters for value in (Fraction(1), Fraction(2))
+    )
+    return not all(np.array_equal(*pair) for pair in zip(here, there, strict=True))
+
+
 def _rhythm(free: Free, place: Place) -> ApcError:
     what = f"{free.name} sets the rhythm of a clock, and with it the frame: it can't be varied continuously"
     return ApcError(Mistake("E844", place, what, hint="apc analyze with --set, one value at a time"))
@@ -251,55 +246,38 @@ def _piece(
     low: Fraction,
     high: Fraction,
     prepared: Prepared,
-    known: dict[tuple[object, ...], BatchEvaluator],
+    slopes: Mapping[str, Fraction],
+    *,
+    follows: bool,
 ) -> Piece:
-    """Build the evaluator of one piece from its schedules at two values inside."""
-    values = [low + share * (high - low) for share in INSIDE]
-    systems = [system_with_delay(system, free, value) for value in values]
-    numbers = [resolve(one) for one in systems]
-    schedules = [
-        build_schedules(
-            system, one.timings, [site.pattern for site in prepared.jacobians], order=prepared.order
-        )
-        for one in numbers
-    ]
+    """Build the evaluator of one piece from its schedules at a value inside."""
+    value = low + INSIDE * (high - low)
+    inside = system_with_delay(system, free, value)
+    timings = resolve(inside).timings
+    patterns = [site.pattern for site in prepared.jacobians]
+    schedules = build_schedules(system, timings, patterns, order=prepared.order)
     durations: dict[int, tuple[float, float]] = {}
-    follows = any(
-        not np.array_equal(here, there)
-        for here, there in zip(numbers[0].parameters, numbers[1].parameters, strict=True)
-    )
-    constant = not follows
-    for here, there in zip(*schedules, strict=True):
-        assert _form(here) == _form(there), "the order of events changes within a piece"
-        for quanta, (first, second) in _steps(here, there).items():
-            slope = (second - first) / (values[1] - values[0])
-            constant = constant and not slope
-            durations[quanta] = (float(first - slope * values[0]), float(slope))
-    key = tuple((_form(one), tuple(sorted(_steps(one, one).values()))) for one in schedules[0])
-    if constant and key in known:
-        return Piece(low, high, known[key], constant, systems[0])
-    if constant and max(sum(one.depths) for one in schedules[0]) > LONG_LINES:
-        return Piece(low, high, None, constant, systems[0])
-    shared = Prepared(prepared.jacobians, schedules[0], numbers[0].timings, prepared.order)
-    groups, exchange = lifted_groups(systems[0], prepared=shared)
-    found = batch_evaluator(systems[0], (free,), groups, exchange, durations=durations, follows=follows)
-    if constant:
-        known[key] = found
-    return Piece(low, high, found, constant, systems[0])
+    for schedule, group in zip(schedules, system.groups, strict=True):
+        for quanta, slope in _steps(schedule, system.kinds[group.kind], slopes).items():
+            durations[quanta] = (float(quanta * schedule.quantum - slope * value), float(slope))
+    if not follows and not any(slope for _, slope in durations.values()):
+        return Piece(low, high, None, inside)
+    shared = Prepared(prepared.jacobians, schedules, timings, prepared.order)
+    groups, exchange = lifted_groups(inside, prepared=shared)
+    found = batch_evaluator(inside, (free,), groups, exchange, durations=durations, follows=follows)
+    return Piece(low, high, found, inside)
 
 
-def _form(schedule: Schedule) -> _Form:
-    """Return all of a schedule but its times."""
-    events = tuple(Propagate(0) if isinstance(one, Propagate) else one for one in schedule.events)
-    heard = tuple((one.way.operator, one.way.link, one.sent, one.lag) for one in schedule.heard)
-    return (events, schedule.acting, schedule.carried, heard, schedule.sent, schedule.depths)
-
-
-def _steps(here: Schedule, there: Schedule) -> Mapping[int, tuple[Fraction, Fraction]]:
-    """Return the seconds of each step in both schedules, by its quanta in the first."""
-    found: dict[int, tuple[Fraction, Fraction]] = {}
-    for one, other in zip(here.events, there.events, strict=True):
-        if isinstance(one, Propagate) and isinstance(other, Propagate):
-            pair = (one.duration * here.quantum, other.duration * there.quantum)
-            assert found.setdefault(one.duration, pair) == pair, "two steps are equal by accident"
+def _steps(schedule: Schedule, kind: Kind, slopes: Mapping[str, Fraction]) -> Mapping[int, Fraction]:
+    """Return how fast each step grows, by its quanta: only what is held moves, all else is at its ticks."""
+    found: dict[int, Fraction] = {}
+    step, start, moving = 0, Fraction(0), set[Fraction]()
+    for event in (*schedule.events, Propagate(0)):
+        if not isinstance(event, Propagate):
+            moving.add(slopes[kind.holds[event.hold].delay] if isinstance(event, Act) else Fraction(0))
+            continue
+        (end,) = moving or {Fraction(0)}
+        if step:
+            assert found.setdefault(step, end - start) == end - start, "two steps are equal by accident"
+        step, start, moving = event.duration, end, set()
     return found

@@ -1,19 +1,20 @@
-"""Whether a scene is stable for every delay of its links in a range: all whole numbers of frames at once.
+"""Whether a scene is stable for every delay of its links in a range: all of them at once.
 
 Takes: a `CompiledSystem` and a parameter or timing that reaches nothing but how late packets are.
 Gives: `LateStretch`, `late_stretches`.
 Guarantees: stretches join on without a gap; within one, nothing depends on the delay.
 Does not: vary what is held late, or what a force depends on (see `delays`).
 
-Packets that are a frame later are heard as those were, a frame of theirs older: the sites' frames are the
-same, and only the exponents of ζ differ. One lifting serves for all delays that differ by whole frames.
+A site's frame doesn't know which packet each of its ticks hears: with a row of r for each tick, one lifting
+serves for all delays. What they tell is which packet stands in which row, how many frames of age (ζ to the
+minus that); packets a whole frame later are the same ones, a frame older.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -21,21 +22,27 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop
+from apc.compiler.multiples import common_divisor
+from apc.eigen.bordered import Bordered, Logarithm, bordered, logarithm, side_by_side
+from apc.eigen.closing import Loop, without_packets
 from apc.eigen.modes import arrange
 from apc.eigen.rigid import find_rigid_modes
+from apc.frame.hyperperiod import ClockGrid, Times
 from apc.frame.names import Free
 from apc.frame.parameters import resolve
-from apc.large.bordered import Bordered, Logarithm, bordered, logarithm, side_by_side, wires_of
-from apc.large.determinant_spectrum import without_packets
-from apc.vary.delays import INSIDE, system_with_delay, timing_slopes
+from apc.frame.schedule import Heard, Schedule, Selected, Sent
+from apc.frame.scheduling import build_schedules, newest
+from apc.vary.delays import INSIDE, reaches_parameters, system_with_delay, timing_slopes
 from apc.vary.plane import count_beyond
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Integers = NDArray[np.intp]
 
-# Delays of one lifting that are looked at together: the longest at most so many times the shortest.
+# What a row of r hears at one delay: the slot it was sent at, and how many frames ago.
+_Packet = tuple[int, int]
+
+# Delays that are looked at together: the oldest packet of any at most so many times as old as that of each.
 OCTAVE = 2
 
 
@@ -50,60 +57,59 @@ class LateStretch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LateSheet:
-    """A loop whose packets are some frames later, the values: a `plane.Sheet`.
+    """A loop at some delays, whose numbers are the values: a `plane.Sheet`.
 
-    `lags` (l,) are those of the packets when they are not, `late` (l,) says which of them are.
+    `loops` are those of all delays that are alike but for the age of packets; `alike` (k,) says which of them
+    a delay's is, and `lags` (k, l) the ages there.
     """
 
-    loop: Bordered
+    loops: Bordered
+    alike: Integers
     lags: Integers
-    late: Integers
     rigid: int
     longest: int
 
     @property
     def states(self) -> int:
         """How many zeros it has, less what its packets make of them."""
-        return self.loop.states
+        return self.loops.states
 
     def at(self, values: Floats, rows: Integers, points: Complexes) -> Logarithm:
-        """Return the logarithm of F at points (z,), each so many frames late as the value (k,) of its row."""
-        lags = self.lags + values[rows, None].astype(np.int64) * self.late
-        return logarithm(self.loop, None, lags, np.zeros(len(rows), dtype=np.intp), points, self.rigid)
+        """Return the logarithm of F at points (z,), each at the delay with the number of its row."""
+        number = values.astype(np.intp)[rows]
+        return logarithm(self.loops, None, self.lags[number], self.alike[number], points, self.rigid)
 
     def over(self, values: Floats, points: Complexes) -> Logarithm:
         """Return the logarithm of F (k, z) at all values (k,) and points (z,).
 
-        M = A + ζ^(−m) [0 B] when packets are m frames late: det M = det A det(1 + ζ^(−m) K), K the rows of
-        A⁻¹ B over what is sent.
+        M = A + Σ_l ζ^(−l) [0 B_l], A the matrix of all delays while nobody hears anything: det M is
+        det A det(1 + Σ_l ζ^(−l) K_l), K_l the rows of A⁻¹ B_l over what is sent.
         """
-        loop, n_z = self.loop, self.loop.states
-        n, n_s = loop.fixed.shape[-1], loop.fixed.shape[-1] - n_z
+        n_z = self.loops.states
+        matrix = np.repeat(self.loops.fixed[:1].astype(np.complex128), len(points), axis=0)
         place = np.arange(n_z)
-        prompt, turned = np.zeros((2, len(points), n, n), np.complex128)
-        late, late_turned = np.zeros((2, len(points), n, n_s), np.complex128)
-        prompt += loop.fixed[0]
-        prompt[:, place, place] += points[:, None]
-        turned[:, place, place] = 1j * points[:, None]
-        for lag, is_late, heard in zip(self.lags.tolist(), self.late.tolist(), loop.heard[:, 0], strict=True):
-            part = points[:, None, None] ** -lag * heard
-            (late if is_late else prompt[:, :, n_z:])[...] += part
-            (late_turned if is_late else turned[:, :, n_z:])[...] -= 1j * lag * part
-        sign, size = np.linalg.slogdet(prompt)
-        inverse = np.linalg.inv(prompt)
-        sent = inverse @ late
-        back = sent[:, n_z:]
-        back_turned = inverse[:, n_z:] @ (late_turned - turned @ sent)
+        matrix[:, place, place] += points[:, None]
+        sign, size = np.linalg.slogdet(matrix)
+        inverse = np.linalg.inv(matrix)
+        turn = 1j * points[:, None, None]
         base = size + 1j * np.angle(sign) - self.rigid * np.log(1 - 1 / points)
-        slope = np.einsum("zij,zji->z", inverse, turned) - self.rigid * 1j / (points - 1)
+        slope = turn[:, 0, 0] * inverse[:, place, place].sum(axis=1) - self.rigid * 1j / (points - 1)
+        sent = inverse[:, n_z:]
+        turned = -turn * (sent[:, :, :n_z] @ inverse[:, :n_z])
+        number, unit = values.astype(np.intp), np.eye(sent.shape[1])
         value, turning = np.zeros((2, len(values), len(points)), np.complex128)
-        for row, frames in enumerate(values.tolist()):
-            power = points[:, None, None] ** -int(frames)
-            matrix = np.eye(n_s) + power * back
-            moved = power * (back_turned - 1j * frames * back)
-            sign, size = np.linalg.slogdet(matrix)
-            value[row] = base + size + 1j * np.angle(sign)
-            turning[row] = slope + np.trace(np.linalg.solve(matrix, moved), axis1=1, axis2=2)
+        for which in np.unique(self.alike[number]).tolist():
+            heard = self.loops.heard[:, which, None]
+            back, back_turned = sent @ heard, turned @ heard
+            for row in np.flatnonzero(self.alike[number] == which).tolist():
+                lags = self.lags[number[row], :, None]
+                power = points**-lags
+                whole = unit + np.einsum("lz,lzij->zij", power, back)
+                moved = np.einsum("lz,lzij->zij", power, back_turned)
+                moved -= np.einsum("lz,lzij->zij", 1j * lags * power, back)
+                sign, size = np.linalg.slogdet(whole)
+                value[row] = base + size + 1j * np.angle(sign)
+                turning[row] = slope + np.trace(np.linalg.solve(whole, moved), axis1=1, axis2=2)
         return Logarithm(value, turning, np.zeros_like(value))
 
 
@@ -128,68 +134,140 @@ def late_stretches(
     following
         From `delays.borders`.
     """
-    step = _whole_frame(system, free, prepared)
-    if step is None:
+    slopes = timing_slopes(system, free)
+    if not _only_late(system, free, prepared, {name for name, slope in slopes.items() if slope}):
         return None
     borders = [low]
     while borders[-1] < high:
         borders.append(following(borders[-1]))
     pieces = list(itertools.pairwise(borders))
-    alike: dict[tuple[Fraction, Fraction], list[int]] = {}
-    for place, (start, end) in enumerate(pieces):
-        alike.setdefault((start % step, end - start), []).append(place)
-    stable: dict[int, bool | None] = {}
-    for (start, width), places in alike.items():
-        inside = system_with_delay(system, free, start + INSIDE[0] * width)
-        loops = arrange(*lifted_groups(inside, prepared=prepared)).loops
-        frames = np.array([int(pieces[place][0] // step) for place in places], dtype=np.float64)
-        beyond = sum(_beyond(loop, _moving(system, free), frames) for loop in loops)
-        for place, count in zip(places, np.broadcast_to(beyond, frames.shape).tolist(), strict=True):
-            stable[place] = None if np.isnan(count) else count == 0
-    return [LateStretch(*piece, stable[place]) for place, piece in enumerate(pieces)]
-
-
-def _moving(system: CompiledSystem, free: Free) -> frozenset[str]:
-    """Return the timings that follow what varies."""
-    return frozenset(name for name, slope in timing_slopes(system, free).items() if slope)
-
-
-def _whole_frame(system: CompiledSystem, free: Free, prepared: Prepared) -> Fraction | None:
-    """Return by how much a value makes packets a frame later, None where it does more than that, or less."""
-    slopes = timing_slopes(system, free)
-    moving = {name for name, slope in slopes.items() if slope}
-    held = {hold.delay for kind in system.kinds for hold in kind.holds}
-    if moving & held or len({slopes[name] for name in moving}) != 1:
+    values = [start + INSIDE * (end - start) for start, end in pieces]
+    inside = system_with_delay(system, free, values[0])
+    timings = resolve(inside).timings
+    patterns = [site.pattern for site in prepared.jacobians]
+    kept = {link.name: 0 for link in system.links}
+    schedules = build_schedules(inside, timings, patterns, order=prepared.order, kept=kept)
+    delays = {
+        name: [timings[name] + slopes[name] * (value - values[0]) for value in values]
+        for name in {row.way.delay for one in schedules for row in one.selected}
+    }
+    packets = _packets(inside, schedules, delays, prepared.order)
+    apart = {id(one): _by_tick(one) for one in schedules}
+    by_tick = replace(prepared, schedules=tuple(apart[id(one)] for one in schedules), timings=timings)
+    selected = {id(apart[id(one)]): one.selected for one in schedules}
+    found = np.zeros(len(pieces))
+    for loop in arrange(*lifted_groups(inside, prepared=by_tick)).loops:
+        rows = [
+            [None if row.gap else packets[row] for row in selected[id(group.schedule)]]
+            for group in loop.sites
+        ]
+        found += _beyond(loop, rows, len(pieces))
+    if np.isnan(found).all():  # a drift, say, which keeps two eigenvalues at 1
         return None
-    (slope,) = {slopes[name] for name in moving}
-    if slope < 0:
-        return None
-    here, there = (
-        resolve(system_with_delay(system, free, value)).parameters for value in (Fraction(1), Fraction(2))
+    stable = [None if np.isnan(count) else count == 0 for count in found.tolist()]
+    return [LateStretch(*piece, one) for piece, one in zip(pieces, stable, strict=True)]
+
+
+def _only_late(system: CompiledSystem, free: Free, prepared: Prepared, moving: set[str]) -> bool:
+    """Say whether a value makes packets late, and nothing else that matters."""
+    held = {
+        hold.delay
+        for group, schedule in zip(system.groups, prepared.schedules, strict=True)
+        for hold, acting in zip(system.kinds[group.kind].holds, schedule.acting, strict=True)
+        if acting is not None
+    }
+    return not moving & held and not reaches_parameters(system, free)
+
+
+def _by_tick(schedule: Schedule) -> Schedule:
+    """Return a schedule that hears what is selected, as if that were the first packet of a frame."""
+    heard = tuple(Heard(row.way, Sent(row.way.link, row.channel, 0), 0) for row in schedule.selected)
+    return replace(schedule, heard=heard, selected=())
+
+
+def _packets(
+    system: CompiledSystem,
+    schedules: Sequence[Schedule],
+    delays: dict[str, list[Fraction]],
+    order: Sequence[str],
+) -> dict[Selected, list[_Packet]]:
+    """Return what each row of r hears at each of some delays, these by their name."""
+    timings = resolve(system).timings
+    clocks = {one.name: (timings[one.phase], timings[one.period]) for one in system.clocks}
+    frame = schedules[0].frame_s
+    apart = [value for late in delays.values() for value in late]
+    quantum = common_divisor([frame, *(time for one in clocks.values() for time in one), *apart])
+    times = Times(
+        quantum=quantum,
+        frame=int(frame / quantum),
+        clocks={
+            name: ClockGrid(int(phase % period / quantum), int(period / quantum))
+            for name, (phase, period) in clocks.items()
+        },
+        delays={},
     )
-    if not all(np.array_equal(*pair) for pair in zip(here, there, strict=True)):
-        return None
-    return prepared.schedules[0].frame_s / slope
+    rank = {name: place for place, name in enumerate(order)}
+    links = {link.name: link for link in system.links}
+    rows = dict.fromkeys(row for one in schedules for row in one.selected)
+    found: dict[Selected, list[_Packet]] = {row: [] for row in rows}
+    for place in range(len(apart) // max(len(delays), 1)):
+        here = replace(times, delays={name: int(late[place] / quantum) for name, late in delays.items()})
+        for row, listed in found.items():
+            at = here.clocks[row.clock].at(row.tick)
+            one = newest(row.way, row.channel, links[row.way.link], at, here, rank)
+            listed.append((one.sent.slot, one.lag))
+    return found
 
 
-def _beyond(loop: Loop, moving: frozenset[str], frames: Floats) -> Floats:
-    """Return how many eigenvalues of a loop are beyond the circle when packets are some frames later (k,)."""
-    kept = [
-        frozenset(way for way in loop.coupling if (way.delay in moving) == late) for late in (False, True)
+def _beyond(loop: Loop, rows: Sequence[Sequence[Sequence[_Packet] | None]], count: int) -> Floats:
+    """Return how many eigenvalues of a loop are beyond the circle at each delay (k,).
+
+    Parameters
+    ----------
+    loop
+        The loop, its sites hearing each tick by itself.
+    rows
+        What each row of r of each site hears at each delay; None for nothing.
+    count
+        How many delays there are.
+    """
+    heard = [(g, row, packets) for g, listed in enumerate(rows) for row, packets in enumerate(listed)]
+    lags = [
+        sorted({packets[place][1] for *_, packets in heard if packets is not None} or {0})
+        for place in range(count)
     ]
-    parts = [wires_of(loop.sites, loop.coupling, loop.doubts, only=ways.__contains__) for ways in kept]
-    lags = np.array([lag for part in parts for lag in part.lags], dtype=np.intp)
-    late = np.repeat([0, 1], [len(part.lags) for part in parts])
+    most = max(map(len, lags))
+    kinds: dict[tuple[tuple[int, int], ...], int] = {}
+    alike = [
+        kinds.setdefault(
+            tuple(
+                (-1, 0) if packets is None else (packets[place][0], own.index(packets[place][1]))
+                for *_, packets in heard
+            ),
+            len(kinds),
+        )
+        for place, own in enumerate(lags)
+    ]
+    sent = [group.schedule.sent for group in loop.sites]
+    starts = np.cumsum([0, *map(len, sent)])
+    weights = np.zeros((most, len(kinds), len(heard), int(starts[-1])))
+    for kind, packets in enumerate(kinds):
+        for line, ((g, row, _), (slot, layer)) in enumerate(zip(heard, packets, strict=True)):
+            one = loop.sites[g].schedule.heard[row]
+            packet = replace(one.sent, slot=slot)
+            for h, weight in enumerate(loop.coupling[one.way][g]):
+                if weight and slot >= 0:
+                    weights[layer, kind, line, starts[h] + sent[h].index(packet)] = float(weight)
     maps = side_by_side([group.lifted for group in loop.sites]).mapped(lambda one: one[None])
-    matrix = bordered(maps, np.concatenate([part.weights for part in parts]))
-    rigid = find_rigid_modes(without_packets(loop)).directions.shape[1]
-    found = np.zeros(len(frames))
-    left = np.ones(len(frames), dtype=bool)
+    loops = bordered(maps, weights)
+    rigid = find_rigid_modes(without_packets(loop), with_drifts=False).directions.shape[1]
+    ages = np.array([one + [0] * (most - len(one)) for one in lags])
+    oldest, found = ages.max(axis=1), np.zeros(count)
+    left = np.ones(count, dtype=bool)
     while left.any():
-        most = float(frames[left].max())
-        some = left & (frames * OCTAVE >= most)
-        longest = int(max((lags + late * int(most)).max(initial=0), 0))
-        sheet = _LateSheet(matrix, lags, late, rigid, longest)
-        found[some] = count_beyond(sheet, frames[some])
+        longest = int(oldest[left].max())
+        some = left & (oldest * OCTAVE >= longest)
+        sheet = _LateSheet(loops, np.array(alike), ages, rigid, longest)
+        found[some] = count_beyond(sheet, np.flatnonzero(some).astype(np.float64))
         left &= ~some
     return found

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop
+from apc.eigen.bordered import Logarithm, Wires, bordered, logarithm, side_by_side, wires_of
+from apc.eigen.closing import Loop, without_packets
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
 from apc.frame.lift import FrameMap
 from apc.frame.names import Free
-from apc.large.bordered import Logarithm, Wires, bordered, logarithm, side_by_side, wires_of
-from apc.large.determinant_spectrum import frequency_of, without_packets
+from apc.large.determinant_spectrum import frequency_of
 from apc.vary.batch import STEP, BatchEvaluator, batch_evaluator
 from apc.vary.bracket import Bracket
 from apc.vary.counting import bracket_of_loop
@@ -171,5 +171,7 @@ def loop_evaluator(
         family=batch_evaluator(system, free, groups, exchange, matrices=False),
         loops=tuple(loops),
         wires=tuple(wires_of(loop.sites, loop.coupling, loop.doubts) for loop in loops),
-        rigid=tuple(find_rigid_modes(without_packets(loop)).directions.shape[1] for loop in loops),
+        rigid=tuple(
+            find_rigid_modes(without_packets(loop), with_drifts=False).directions.shape[1] for loop in loops
+        ),
     )

@@ -99,11 +99,10 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Marg
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
-        free = coupler_parameters(system)
-        found = _parameter_margins(system, free, prepared)
+        start = prepare_at_start(system, prepared)
+        found = _parameter_margins(system, coupler_parameters(system), start or prepared)
         if isinstance(found, str):
             return Margins((), found)
-        start = prepare_at_start(system, prepared)
         if start is None:
             why = "how the scene moves hangs on what is heard at the start"
             return Margins(tuple(found), f"delays were not varied: {why}")

@@ -22,7 +22,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.large.bordered import Logarithm
+from apc.eigen.bordered import Logarithm
 from apc.vary.crossings import CELL, SHARE, Root, Scan, extremes
 
 Floats = NDArray[np.float64]

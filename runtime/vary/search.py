@@ -40,15 +40,14 @@ from apc.vary.delays import (
     borders,
     delay_now,
     delay_pieces,
-    most_packets,
     pace,
     system_with_delay,
 )
-from apc.vary.evaluator import MANY_PACKETS, PointEvaluator, evaluator_of_many, long_loops
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many, long_loops
+from apc.vary.lags import LateStretch, late_stretches
 from apc.vary.marginal import marginal_motion, with_rigid
 
 if TYPE_CHECKING:  # only scenes with long delays load it
-    from apc.vary.lags import LateStretch
     from apc.vary.loops import LoopEvaluator
 
 Floats = NDArray[np.float64]
@@ -401,12 +400,10 @@ def search_delay(
     before: Piece | None = None
     at, whole, known, looked = low, True, True, 0
     tell = pace(system, free, low, end, place=_PLACE, told=told)
-    if most_packets(system, free, end, prepared) > MANY_PACKETS:
-        from apc.vary.lags import late_stretches  # most scenes have short delays, and need not load it
-
-        late = late_stretches(system, free, low, end, prepared, borders(system, free, place=_PLACE))
-        if late is not None:
-            return _late_search(system, free, late, end, prepared, from_stable=from_stable)
+    late = late_stretches(system, free, low, end, prepared, borders(system, free, place=_PLACE))
+    if late is not None:
+        tell(end)
+        return _late_search(system, free, late, end, prepared, from_stable=from_stable)
     for piece in delay_pieces(system, free, low, prepared, place=_PLACE, high=end):
         at = min(piece.high, end)
         tell(at)
@@ -416,7 +413,9 @@ def search_delay(
             continue
         first = bool(found.stable[0])
         if stable and stable[-1] != first:
-            edges.append(_jump(system, free, before, piece, prepared, stable_below=stable[-1]))
+            side, way = (piece, 1) if stable[-1] or before is None else (before, -1)
+            grows = system_with_delay(system, free, piece.low + way * BESIDE * (side.high - side.low))
+            edges.append(_jump(piece.low, grows, prepared, stable_below=stable[-1]))
         if not stable or stable[-1] != first:
             stable.append(first)
         for root in found.roots:
@@ -447,11 +446,16 @@ def _late_search(
     whole, before = True, None
     for one in known:
         if one.stable != stable[-1]:
-            pair = [None if some is None else _late_piece(system, free, some) for some in (before, one)]
-            assert pair[1] is not None
-            edges.append(_jump(system, free, pair[0], pair[1], prepared, stable_below=stable[-1]))
-            sides = [analyze(some.inside, prepared=prepared).stable for some in pair if some is not None]
-            whole &= sides[-1] == one.stable and sides[0] == (one if before is None else before).stable
+            pair = [one] if before is None else [before, one]
+            inside = [
+                system_with_delay(system, free, some.low + INSIDE * (some.high - some.low)) for some in pair
+            ]
+            whole &= all(
+                analyze(scene, prepared=prepared).stable == some.stable
+                for scene, some in zip(inside, pair, strict=True)
+            )
+            grows = inside[-1 if stable[-1] else 0]
+            edges.append(_jump(one.low, grows, prepared, stable_below=stable[-1]))
             stable.append(bool(one.stable))
             if from_stable:
                 break
@@ -459,12 +463,6 @@ def _late_search(
     return Search(
         tuple(edges), tuple(stable), (float(late[0].low), float(end)), whole, True, len(known), enters=True
     )
-
-
-def _late_piece(system: CompiledSystem, free: Free, one: LateStretch) -> Piece:
-    """Return a stretch as a piece, nothing in which depends on the delay."""
-    inside = system_with_delay(system, free, one.low + INSIDE[0] * (one.high - one.low))
-    return Piece(one.low, one.high, None, constant=True, inside=inside)
 
 
 def delay_reach(
@@ -499,39 +497,21 @@ def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> tu
         return Scan(np.array([low]), np.array([found.spectral_radius < 1]), (), whole=True), True
 
     def course(points: Floats) -> Sequence[tuple[Floats, Floats]]:
-        if not piece.constant:
-            return family.slopes(points[:, None], np.ones((len(points), 1)))
-        matrices = family.matrices(points[:, None])
-        return [(matrix, np.zeros_like(matrix)) for matrix in matrices]
+        return family.slopes(points[:, None], np.ones((len(points), 1)))
 
-    points, known = np.array([low]), True
-    if not piece.constant:
-        points = np.linspace(low, high, PIECE_SAMPLES)
+    points, known = np.linspace(low, high, PIECE_SAMPLES), True
     if family.tangents:
         points, known = Line(family, np.array([low]), 0).with_bends(points, high - low)
     return scan(course, points, least=high - low), known
 
 
-def _jump(
-    system: CompiledSystem,
-    free: Free,
-    before: Piece | None,
-    after: Piece,
-    prepared: Prepared,
-    *,
-    stable_below: bool,
-) -> Crossing:
-    """Describe a change of side between two pieces: the delay at which events coincide, exactly."""
-    # The motion that grows is on the unstable side.
-    piece, way = (after, 1) if stable_below or before is None else (before, -1)
-    beside = after.low + way * BESIDE * (piece.high - piece.low)
-    grows = piece.inside if piece.constant else system_with_delay(system, free, beside)
-    modes = analyze(grows, prepared=prepared).modes
+def _jump(at: Fraction, grows: CompiledSystem, prepared: Prepared, *, stable_below: bool) -> Crossing:
+    """Describe a change of side where events coincide, exactly; `grows` is the scene on the unstable side."""
     return Crossing(
-        value=float(after.low),
+        value=float(at),
         error=0.0,
         stable_side="below" if stable_below else "above",
-        frequency_hz=modes[0].frequency_hz,
+        frequency_hz=analyze(grows, prepared=prepared).modes[0].frequency_hz,
         kind="jump",
         proof="events coincide there",
     )

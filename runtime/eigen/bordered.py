@@ -30,10 +30,10 @@ from apc.eigen.balls import frame_steps, site_balls, weight_balls
 from apc.eigen.closing import Coupling, Loop, bounded_weight
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
+from apc.eigen.winding import FIRST_ARCS, Ball, determinant_ball, wind
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap, compose
 from apc.frame.schedule import Way
-from apc.large.characteristic import FIRST_ARCS, Ball, determinant_ball, wind
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -161,16 +161,18 @@ def bordered(maps: FrameMap, weights: Floats, unit: float = 1.0) -> Bordered:
     maps
         The maps (k, …) of all sites as of one, or their derivatives.
     weights
-        W_l (l, n_r, n_s).
+        W_l (l, n_r, n_s), or those of each loop (l, k, n_r, n_s).
     unit
         What stands for 1.
     """
-    count, n_s, n_z = maps.s.shape
+    weights = weights if weights.ndim > 3 else weights[:, None]
+    n_s, n_z = maps.s.shape[-2:]
+    count = max(len(maps.s), weights.shape[1])
     fixed = np.zeros((count, n_z + n_s, n_z + n_s))
     fixed[:, :n_z, :n_z], fixed[:, n_z:, :n_z] = -maps.p, -maps.s
     fixed[:, n_z:, n_z:] = unit * np.eye(n_s)
     back = np.concatenate([maps.q, maps.d], axis=-2)
-    return Bordered(fixed, -(back @ weights[:, None]), n_z)
+    return Bordered(fixed, -(back @ weights), n_z)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Claims about `apc.large.characteristic`: a count of zeros that misses none, or none at all."""
+"""Claims about `apc.eigen.winding`: a count of zeros that misses none, or none at all."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from apc.large.characteristic import Ball, Bounded, wind
+from apc.eigen.winding import Ball, Bounded, wind
 
 
 def _polynomial(zeros: Sequence[complex]) -> Bounded:
