@@ -76,7 +76,7 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch crossings plane bracket counting loops evaluator bends marginal delays lags search
+        wiring batch slopes crossings plane bracket counting loops evaluator bends marginal delays lags search
         critical margins sensitivity
         """,
     ),
