@@ -77,8 +77,8 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch crossings plane bracket counting loops evaluator leading many bends marginal delays lags
-        search critical margins sensitivity
+        wiring batch slopes crossings plane bracket counting loops evaluator leading many bends marginal
+        delays lags search critical margins sensitivity
         """,
     ),
     ("apc", "answer"),

@@ -238,7 +238,19 @@ def _heard_at_ticks(
 
 
 def newest(way: Way, channel: str, link: Link, instant: int, times: Times, rank: Mapping[str, int]) -> Heard:
-    """Return the newest packet on a way that a tick at `instant` sees."""
+    """Return the newest packet on a way that a tick at an instant sees.
+
+    Parameters
+    ----------
+    way, channel, link
+        The way, what of the link's is heard on it, and the link.
+    instant
+        When the tick is, in quanta.
+    times
+        The scene's times in quanta.
+    rank
+        The place of each kind of event among those that coincide.
+    """
     delay, grid = times.delays[way.delay], times.clocks[link.clock]
     missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0
     number = grid.newest(instant - delay, strictly=rank["tick"] < rank["deliver"]) - missed

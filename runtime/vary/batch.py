@@ -1,7 +1,8 @@
 """The frame matrices of a system for many values of its parameters at once, with their derivatives.
 
 Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
-Gives: `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`, `slope_errors`.
+Gives: `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`; `relative_here`,
+`inverse_size`, `is_beyond`.
 Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
 derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
 its neighbours, comes out as NaN, never as a wrong number.
@@ -27,21 +28,16 @@ from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.batch_lift import (
-    HOPELESS,
-    PERTURBED_FRAMES,
-    SAFE,
-    lift_rows,
-)
+from apc.frame.batch_lift import lift_rows
 from apc.frame.discretize import UNIT, Step, exponential_rows
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import FrameMap, compose, composed_bounded, lift, roundings_of, with_roundings
+from apc.frame.lift import FrameMap, compose, composed_bounded, lift
 from apc.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
 from apc.frame.parameters import free_rows
-from apc.frame.radius import RADII, radius_of, value_of, with_radius
-from apc.frame.schedule import Propagate, Schedule
+from apc.frame.radius import RADII, radius_of, value_of
+from apc.frame.schedule import Propagate
 from apc.frame.site import LinearSite, every_matrix
 from apc.vary.wiring import (
     Wiring,
@@ -289,7 +285,7 @@ class BatchEvaluator:
     ) -> tuple[LinearSite, Mapping[int, Step], NDArray[np.bool_]]:
         """Return a group's sites with their exponentials, and which of them are beyond any."""
         site = sites_of_rows(group.jacobians, rows)
-        beyond = _beyond(site.a, site.b)
+        beyond = is_beyond(site.a, site.b)
         steps = self.fixed.get(site_key(group))
         if steps is None:
             site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
@@ -431,7 +427,7 @@ def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ..
     for wiring in evaluator.wirings:
         closed = _closed_bounded(wiring, bounded).matrix
         matrix, error = value_of(closed), radius_of(closed)
-        _, own = relative_bounded(matrix, error, _relative_here(wiring, matrix, error))
+        _, own = relative_bounded(matrix, error, relative_here(wiring, matrix, error))
         found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
     return tuple(found)
 
@@ -443,104 +439,7 @@ def _closed_bounded(wiring: Wiring, maps: Mapping[tuple[int, int], FrameMap]) ->
     return close(sites, wiring.feedback, system.layout, numbers=RADII)
 
 
-def slope_errors(evaluator: BatchEvaluator, values: Floats, along: Floats) -> tuple[Floats, ...]:
-    """Return bounds (k, n, n), to first order, on the rounding errors of each system's reduced slopes.
-
-    Parameters
-    ----------
-    evaluator
-        The evaluator; no time varies in it.
-    values, along
-        The points and directions (k, m), as for `BatchEvaluator.slopes`.
-
-    Notes
-    -----
-    A number with a complex step has a radius with one: what its value and what its slope is off by. Where the
-    slope's says nothing, it is estimated as in `batch_lift`.
-    """
-    assert not evaluator.timed, "the errors of a step belong to its time"
-    complex_values = values + (STEP * 1j) * along
-    bounded: dict[tuple[int, int], FrameMap] = {}
-    for group in evaluator.groups:
-        built, schedule = group.jacobians, group.schedule
-        rows = evaluator.rows(built, evaluator.vectors(group, complex_values))
-        here = lift_rows(built, schedule, rows.real[:1])
-        frame, doubt = _moved_blocks(sites_of_rows(built, rows), schedule, evaluator.durations)
-        both = here.error.mapped(lambda a, b: a + (STEP * 1j) * b, doubt)
-        bounded[site_key(group)] = frame.mapped(with_radius, both)
-    found = []
-    for wiring, error in zip(evaluator.wirings, matrix_errors(evaluator, values), strict=True):
-        closed = _closed_bounded(wiring, bounded).matrix
-        matrix, off = value_of(closed), radius_of(closed).imag / STEP
-        at = relative_at(wiring, matrix)[0]
-        turned = np.abs(at.weights.imag / STEP)
-        nothing = np.zeros((len(at.rest), len(at.held)))
-        steady = replace(at, weights=at.weights.real, doubt=nothing) if wiring.moving else at
-        _, own = relative_bounded(matrix.imag / STEP, off, steady)
-        if wiring.moving:
-            rest, held = at.rest, at.held
-            heavy, moved = np.abs(at.weights.real), np.abs(matrix.imag / STEP)
-            inverse = _inverse_size(np.eye(len(rest)) - matrix.real[:, rest[:, None], rest])
-            late = off[:, rest[:, None], held] + off[:, rest[:, None], rest] @ heavy + error @ turned
-            late = late + 8 * (len(rest) + 2) * UNIT * (turned + moved[:, rest[:, None], rest] @ heavy)
-            own = own + (inverse @ late) @ np.abs(matrix.real[:, held[:, None], rest])
-        found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
-    return tuple(found)
-
-
-def _moved_blocks(
-    site: LinearSite, schedule: Schedule, durations: Mapping[int, tuple[float, float]]
-) -> tuple[FrameMap, FrameMap]:
-    """Return a frame with its slopes as a complex step, and the errors of the slopes."""
-    plain, steps = {}, {}
-    for quanta, (seconds, _) in durations.items():
-        plain[quanta] = exponential_rows(site.a * seconds, site.b * seconds, 1.0).matrix
-        steps[quanta] = _large_step(site, seconds)
-    off = {
-        quanta: with_radius(plain[quanta], 2 * step.roundings * UNIT * step.matrix)
-        for quanta, step in steps.items()
-    }
-    bounds = compose(with_roundings(site), schedule, off, numbers=RADII)
-    frame = bounds.mapped(value_of)
-    error = bounds.mapped(lambda one: radius_of(one).imag / STEP)
-    slope = frame.mapped(lambda one: np.abs(one.imag) / STEP)
-    roundings = roundings_of(site, schedule, steps)
-    if not (error.largest <= HOPELESS * slope.largest).all():
-        random = np.random.default_rng(len(schedule.events))
-
-        def moved(matrix: Matrices) -> Matrices:
-            by = roundings * UNIT * random.uniform(-1, 1, (2, *matrix.shape))
-            return np.asarray(matrix.real * (1 + by[0]) + 1j * (matrix.imag * (1 + by[1])))
-
-        error = slope.mapped(lambda one: roundings * UNIT * one)
-        for _ in range(PERTURBED_FRAMES):
-            other = compose(
-                every_matrix(site, moved), schedule, {quanta: moved(step) for quanta, step in plain.items()}
-            )
-            error = error.mapped(
-                lambda e, a, b: np.maximum(e, SAFE * np.abs(a.imag - b.imag) / STEP), frame, other
-            )
-    return frame, error
-
-
-def _large_step(site: LinearSite, seconds: float) -> Step:
-    """Return the magnitudes of a step and of its slope, with its roundings.
-
-    [F G]′ is the integral of F(T − s) [A′ B′] [F(s) G(s); 0 1] over s from 0 to T; what F reaches in between
-    is taken from both ends and the middle.
-    """
-    a, b = np.abs(site.a.imag), np.abs(site.b.imag)
-    step = exponential_rows(site.a.real, site.b.real, seconds)
-    half = exponential_rows(site.a.real, site.b.real, seconds / 2).matrix
-    n_x, n_u = b.shape[-2:]
-    whole = np.maximum(np.maximum(step.size, np.abs(half)), np.eye(n_x, n_x + n_u))
-    below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (*whole.shape[:-2], n_u, n_x + n_u))
-    slope = whole[..., :n_x] @ np.concatenate([a, b], axis=-1) @ np.concatenate([whole, below], axis=-2)
-    large = np.maximum(np.abs(step.matrix), step.size)
-    return Step(large + 1j * seconds * slope, large, step.roundings)
-
-
-def _inverse_size(matrices: Floats) -> Floats:
+def inverse_size(matrices: Floats) -> Floats:
     """Return |M⁻¹| of matrices (k, n, n); `NO_USE` where one has none, as more is free at these values."""
     try:
         return np.asarray(np.abs(np.linalg.inv(matrices)))
@@ -548,7 +447,7 @@ def _inverse_size(matrices: Floats) -> Floats:
         return np.full(matrices.shape, NO_USE)
 
 
-def _relative_here(wiring: Wiring, matrix: Floats, error: Floats) -> Relative:
+def relative_here(wiring: Wiring, matrix: Floats, error: Floats) -> Relative:
     """Return the relative coordinates at each point, with a bound on W to first order where it follows.
 
     (1 − M_rr) W = M_rp: W is off by (1 − M_rr)⁻¹ times what the errors of M leave, and the solution's own.
@@ -560,7 +459,7 @@ def _relative_here(wiring: Wiring, matrix: Floats, error: Floats) -> Relative:
     system = np.eye(len(rest)) - matrix[:, rest[:, None], rest]
     left = error[:, rest[:, None], held] + error[:, rest[:, None], rest] @ size
     left = left + 8 * (len(rest) + 2) * UNIT * (np.abs(system) @ size)
-    return replace(at, doubt=_inverse_size(system) @ left)
+    return replace(at, doubt=inverse_size(system) @ left)
 
 
 def _moved(group: PeerGroup, vector: Floats) -> PeerGroup:
@@ -572,7 +471,7 @@ def _moved(group: PeerGroup, vector: Floats) -> PeerGroup:
     return replace(group, parameters=vector, site=site, exact=exact, lifted=lifted)
 
 
-def _beyond(a: Matrices, b: Matrices) -> NDArray[np.bool_]:
+def is_beyond(a: Matrices, b: Matrices) -> NDArray[np.bool_]:
     """Say of each A and B whether they are too large, or not finite, for an exponential in floats."""
     size = np.abs(a).sum(axis=(1, 2)) + np.abs(b).sum(axis=(1, 2))
     beyond: NDArray[np.bool_] = ~(size < LARGEST)

@@ -23,20 +23,16 @@ from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
 from apc.eigen.relative import relative_bounded, relative_coordinates
-from apc.eigen.rigid import find_rigid_modes
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.vary.batch import BatchEvaluator, matrix_errors
-from apc.vary.batch import slope_errors as slope_errors_of
 from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters
-from apc.vary.wiring import NEAR_ONE, Wiring, relative_at
+from apc.vary.slopes import Moved, Slopes, Through, moved_systems
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -47,9 +43,6 @@ SHARED = 1e-10
 
 # Eigenvalues nearer to one another than this are one cluster, whose vectors are hardly several.
 CLOSE = 1e-7
-
-# Entries of matrices that are differentiated at once: some hundred megabytes with all that is made of them.
-AT_ONCE = 500_000
 
 # A cluster of vectors worse conditioned than this has no derivative worth the name.
 WORST = 1e8
@@ -111,7 +104,9 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
         free = varied(system)
         family = evaluator(system, free, prepared=prepared or prepare(system))
         here = np.array([parameter_of(system, one).value for one in free])
-        moved = _by_points(family, here) if isinstance(family, PointEvaluator) else _by_batch(family, here)
+        moved = (
+            _by_points(family, here) if isinstance(family, PointEvaluator) else moved_systems(family, here)
+        )
         return _differentiate(system, free, moved)
 
 
@@ -123,76 +118,17 @@ def varied(system: CompiledSystem) -> list[Free]:
     return [one for one in free_parameters(system) if one.name not in kept_out]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Moved:
-    """A closed system's matrix M (n, n) and its derivatives by m parameters (m, n, n), each with its error.
-
-    `rigid` (n, k) are motions that nothing holds back at these values, though something might at others:
-    M V spans what V does. All other eigenvalues are those to differentiate.
-    """
-
-    name: str
-    matrix: Floats
-    error: Floats
-    slopes: Floats
-    slope_errors: Floats
-    rigid: Floats
-
-
-def _by_points(family: PointEvaluator, here: Floats) -> list[_Moved]:
+def _by_points(family: PointEvaluator, here: Floats) -> list[Moved]:
     """Return what moves how in a scene that is linearized anew at every point: all systems as one."""
     matrix, error, slopes, slope_errors = family.differences(here)
     names = [one.name for one in family.closed_at(here.tolist())]
     name = names[0] if len(names) == 1 else "all systems"
-    return [_Moved(name, matrix, error, slopes, slope_errors, np.zeros((len(matrix), 0)))]
+    unit, exact = np.eye(len(matrix)), np.zeros(matrix.shape)
+    whole = Through(Slopes(np.arange(len(here)), slopes, slope_errors), unit, exact, unit, exact)
+    return [Moved(name, matrix, error, (whole,), np.zeros((len(matrix), 0)))]
 
 
-def _by_batch(family: BatchEvaluator, here: Floats) -> list[_Moved]:
-    """Return what moves how in a scene whose matrices follow from its parameters."""
-    count = len(here)
-    along = np.eye(count) if count else np.zeros((1, 0))
-    errors = matrix_errors(family, here[None])
-    closed = family.closed_at(here.tolist())
-    # Of large systems few parameters at once: what is made on the way takes many times what is kept.
-    some = max(1, AT_ONCE // max(len(one.matrix) ** 2 for one in closed))
-    pairs, slope_errors = [], []
-    for first in range(0, len(along), some):
-        ways = along[first : first + some]
-        points = np.repeat(here[None], len(ways), axis=0)
-        pairs.append(family.slopes(points, ways))
-        slope_errors.append(slope_errors_of(family, points, ways))
-    return [
-        _Moved(
-            one.name,
-            pairs[0][place][0][0],
-            errors[place][0],
-            np.concatenate([listed[place][1] for listed in pairs])[:count],
-            np.concatenate([listed[place] for listed in slope_errors])[:count],
-            _rigid_here(wiring, one, pairs[0][place][0][0]),
-        )
-        for place, (one, wiring) in enumerate(zip(closed, family.wirings, strict=True))
-    ]
-
-
-def _rigid_here(wiring: Wiring, system: ClosedSystem, matrix: Floats) -> Floats:
-    """Return what is rigid at these values beyond what is so at all, in relative coordinates (n, k)."""
-    free = find_rigid_modes(system, with_drifts=False)
-    values = np.linalg.eigvals(matrix) if np.isfinite(matrix).all() else np.zeros(0)
-    at_one = int(np.sum(np.abs(values - 1) < NEAR_ONE))
-    if at_one > free.directions.shape[1] - wiring.rigid.directions.shape[1]:
-        free = find_rigid_modes(system)
-    more = free.basis.shape[1] - len(wiring.relative.held)
-    if more <= 0:
-        return np.zeros((len(matrix), 0))
-    at, _ = relative_at(wiring, system.matrix[None])
-    weights = at.weights if at.weights.ndim == 2 else at.weights[0]
-    if not np.isfinite(weights).all():  # nor is the matrix: what follows the parameters has no one direction
-        return np.zeros((len(matrix), 0))
-    relative = free.basis[at.rest] - weights @ free.basis[at.held]
-    return np.linalg.svd(relative, full_matrices=False)[0][:, :more]
-
-
-def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequence[_Moved]) -> Sensitivities:
+def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequence[Moved]) -> Sensitivities:
     if not all(np.isfinite(one.matrix).all() for one in listed):
         return Sensitivities(0.0, (), (), NO_MATRIX)
     clusters = [cluster for one in listed for cluster in _clusters(one)]
@@ -212,7 +148,7 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
     notes, untied = [], dict[str, None]()
     for one in leading:
         try:
-            rates = list(_rates(one)) if one.condition < WORST else None
+            rates = list(_rates(one, len(free))) if one.condition < WORST else None
         except np.linalg.LinAlgError:  # nothing tells it from another eigenvalue
             rates = None
         if rates is None:
@@ -265,14 +201,14 @@ class _Cluster:
     multiples of V, left ones with W V = 0. `condition` is theirs.
     """
 
-    moved: _Moved
+    moved: Moved
     values: Complexes
     right: Complexes
     left: Complexes
     condition: float
 
 
-def _clusters(moved: _Moved) -> list[_Cluster]:
+def _clusters(moved: Moved) -> list[_Cluster]:
     """Return the largest eigenvalues, of each pair one, those that are one within rounding together."""
     at = relative_coordinates(moved.rigid)
     held, rest, weights = at.held, at.rest, at.weights
@@ -312,8 +248,8 @@ def _resolved(near: Eigenpairs, size: Floats) -> bool:
     return bool((apart > 4 * (off[:, None] + off)).all())
 
 
-def _rates(one: _Cluster) -> Iterator[tuple[Floats | None, float]]:
-    """Yield for each parameter how fast the magnitudes (c,) grow with it, and their error.
+def _rates(one: _Cluster, count: int) -> Iterator[tuple[Floats | None, float]]:
+    """Yield for each of so many parameters how fast the magnitudes (c,) grow with it, and their error.
 
     None for a parameter that moves a rigid motion: what was left out would be a motion like any other then.
 
@@ -324,12 +260,7 @@ def _rates(one: _Cluster) -> Iterator[tuple[Floats | None, float]]:
     """
     moved, w, x = one.moved, one.left, one.right
     n, c = x.shape
-    if not len(moved.slopes):
-        return
-    known = np.array([bool(np.isfinite(slope).all()) for slope in moved.slopes])
-    slopes = np.where(known[:, None, None], moved.slopes, 0.0)
-    off = np.where(known[:, None, None], moved.slope_errors, 0.0)
-    rates = w @ slopes @ x  # (m, c, c)
+    slopes = _slopes(one, count)
     middle = complex(one.values.mean())
     # The rigid motions are left out as the cluster is: W V = 0.
     span, dual = np.hstack([x, moved.rigid]), np.vstack([w, moved.rigid.T])
@@ -338,28 +269,75 @@ def _rates(one: _Cluster) -> Iterator[tuple[Floats | None, float]]:
     whole = moved.error + (8 * n * UNIT) * np.abs(moved.matrix)
     right_off = whole @ np.abs(x) + np.abs(_without(moved.matrix @ x - x @ own, moved.rigid))
     left_off = np.abs(w) @ whole + np.abs(w @ moved.matrix - own @ w)
-    pushed = np.moveaxis(slopes @ x, 0, 1).reshape(n, -1)
-    pulled = np.moveaxis(w @ slopes, 2, 0).reshape(n, -1)
-    size = len(bordered)
-    nothing = np.zeros((size - n, pushed.shape[1]))
+    pushed, pulled = slopes.pushed.reshape(n, -1), np.moveaxis(slopes.pulled, 2, 0).reshape(n, -1)
+    nothing = np.zeros((len(bordered) - n, pushed.shape[1]))
     turned = np.linalg.solve(bordered, np.vstack([pushed, nothing]))[:n].reshape(n, -1, c)
     weighed = np.linalg.solve(bordered.T, np.vstack([pulled, nothing]))[:n].reshape(n, -1, c)
-    doubt = np.abs(w) @ (off + (8 * n * UNIT) * np.abs(slopes)) @ np.abs(x)
-    doubt += np.abs(np.moveaxis(weighed, 0, 2)) @ right_off
+    doubt = slopes.doubt + np.abs(np.moveaxis(weighed, 0, 2)) @ right_off
     doubt += left_off @ np.abs(np.moveaxis(turned, 0, 1))
     shift = float((np.abs(w) @ whole @ np.abs(x)).max())
     scale = float(np.abs(one.values).max())
-    for place, rate in enumerate(rates):
-        if not known[place]:
+    for place, rate in enumerate(slopes.rates):
+        if not slopes.known[place]:
             yield np.full(c, np.nan), np.nan
             continue
-        still = np.abs(slopes[place] @ moved.rigid) <= off[place] @ np.abs(moved.rigid)
-        if not still.all():
+        if not slopes.still[place]:
             yield None, np.nan
             continue
         moves = np.linalg.eigvals(rate) if c > 1 else rate[0]
         growth = (one.values.conj() * moves).real / np.abs(one.values)
         yield growth, 2 * float(doubt[place].sum()) + 2 * float(np.abs(rate).sum()) * shift / scale
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ClusterSlopes:
+    """What m parameters do to a cluster: W dM X (m, c, c) and its rounding, dM X (n, m, c), W dM (m, c, n).
+
+    `known` says which derivatives there are, `still` which of them leave the rigid motions alone.
+    """
+
+    rates: Complexes
+    doubt: Floats
+    pushed: Complexes
+    pulled: Complexes
+    known: NDArray[np.bool_]
+    still: NDArray[np.bool_]
+
+
+def _slopes(one: _Cluster, count: int) -> _ClusterSlopes:
+    """Return what each of so many parameters does to a cluster, through the sites it stands in."""
+    moved, w, x, rigid = one.moved, one.left, one.right, one.moved.rigid
+    n, c = x.shape
+    rates, doubt = np.zeros((count, c, c), np.complex128), np.zeros((count, c, c))
+    pushed, pulled = np.zeros((n, count, c), np.complex128), np.zeros((count, c, n), np.complex128)
+    known = np.ones(count, dtype=np.bool_)
+    drift, drift_off = np.zeros((2, count, n, rigid.shape[1]))
+    heavy, large, still = np.abs(w), np.abs(x), np.abs(rigid)
+    for way in moved.through:
+        places, within = way.slopes.places, way.slopes.matrices
+        finite = np.asarray(np.isfinite(within).all(axis=(1, 2)))
+        known[places] &= finite
+        within = np.where(finite[:, None, None], within, 0.0)
+        size = np.abs(within)
+        off = np.where(finite[:, None, None], way.slopes.errors, 0.0)
+        off = off + 4 * (sum(within.shape[1:]) + 2) * UNIT * size
+        out, into = np.abs(way.outward), np.abs(way.inward)
+        out_off = way.outward_error + 4 * (n + 2) * UNIT * out
+        into_off = way.inward_error + 4 * (n + 2) * UNIT * into
+        heard, felt = way.inward @ x, w @ way.outward
+        ahead, behind = within @ heard, felt @ within
+        rates[places] += felt @ ahead
+        pushed[:, places] += np.moveaxis(way.outward @ ahead, 0, 1)
+        pulled[places] += behind @ way.inward
+        felt_size, heard_size = np.abs(felt), np.abs(heard)
+        doubt[places] += felt_size @ (off @ heard_size + size @ (into_off @ large))
+        doubt[places] += (heavy @ out_off) @ (size @ heard_size)
+        if rigid.shape[1]:
+            along = into @ still
+            drift[places] += way.outward @ (within @ (way.inward @ rigid))
+            drift_off[places] += out @ (off @ along + size @ (into_off @ still)) + out_off @ (size @ along)
+    stays = np.asarray((np.abs(drift) <= drift_off).all(axis=(1, 2)))
+    return _ClusterSlopes(rates, doubt, pushed, pulled, known, stays)
 
 
 def _without(vectors: Complexes, rigid: Floats) -> Complexes:
