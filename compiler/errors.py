@@ -8,7 +8,6 @@ Does not: print, or decide exit codes.
 
 from __future__ import annotations
 
-import difflib
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -150,5 +149,7 @@ class Mistakes:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return the known name closest to a misspelt one, or an empty string when none is close."""
+    import difflib  # for a mistake only
+
     close = difflib.get_close_matches(name[:200], list(known), n=1, cutoff=0.6)
     return close[0] if close else ""

@@ -16,7 +16,6 @@ import os
 import shutil
 import stat
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -229,6 +228,8 @@ def begin_file(path: Path) -> Path:
     if target.is_dir():
         raise IsADirectoryError(None, "it is a folder")
     folder = None if is_special(path) else target.parent
+    import tempfile  # where nothing is written it is not needed
+
     # The name of the target need not fit: a temporary's is longer.
     handle, name = tempfile.mkstemp(prefix=f".{target.name[:64]}.", dir=folder)
     os.close(handle)

@@ -10,9 +10,6 @@ import gc
 import io
 import os
 import sys
-import tempfile
-import traceback
-from pathlib import Path
 
 # Every file a command reads or writes has its own message; these can only come from the terminal or a pipe.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG)
@@ -87,6 +84,10 @@ def _bug(arguments: list[str]) -> int:
 
 
 def _report(arguments: list[str]) -> str:
+    import tempfile
+    import traceback
+    from pathlib import Path
+
     from apc.distribution import program_version
 
     text = (

@@ -242,7 +242,9 @@ def _together(sites: Sequence[PeerGroup], exchange: Exchange) -> PeerGroup:
     """Return equal sites as one group."""
     peers = np.sort(np.concatenate([np.array(list(site.peers)) for site in sites]))
     groups = np.searchsorted(exchange.starts, peers, side="right") - 1
-    parts = [(int(group), peers[groups == group] - exchange.starts[group]) for group in np.unique(groups)]
+    parts = [
+        (group, peers[groups == group] - exchange.starts[group]) for group in sorted(set(groups.tolist()))
+    ]
     return replace(sites[0], name=group_name(parts, exchange), count=len(peers), peers=peers)
 
 

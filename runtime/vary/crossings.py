@@ -280,7 +280,7 @@ def _wide(
     low, high = samples.points[cells], samples.points[cells + 1]
     lines = samples.lines[cells]
     found = np.zeros(len(cells), dtype=bool)
-    for line in np.unique(lines):
+    for line in set(lines.tolist()):
         own = lines == line
         first = np.searchsorted(points[line], low[own], side="right") - 1
         found[own] = high[own] - low[own] > narrow[line][np.clip(first, 0, len(narrow[line]) - 1)]

@@ -189,7 +189,9 @@ def cross(sheets: Sequence[LineSheet], points: Floats, least: float, *, first: b
     cells = np.flatnonzero(~unstable[: len(points) - 1])
     if not len(cells):
         return Scan(points, np.zeros(len(points), dtype=bool), (), whole=True)
-    rows = np.unique(np.concatenate([cells, cells + 1]))
+    ends = np.zeros(len(points), dtype=bool)
+    ends[cells] = ends[cells + 1] = True
+    rows = np.flatnonzero(ends)
     asked, points, total = points, points.copy(), np.full(len(points), np.inf)
     grids = [_grid(one, points, rows) for one in sheets]
     counts = np.array([_counted(*pair) for pair in zip(sheets, grids, strict=True)])
