@@ -7,16 +7,22 @@ import math
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from apc.__main__ import run
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.simulation.blocks import pushes
 from apc.simulation.ensemble import PART, Ensemble, Run, play_many, share_interval
+from apc.simulation.native import compiler
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import play
-from tests.test_selection import apart
-from tests.topologies import AVERAGE, compiled
+from tests.test_pairs import FORCES, scene
+from tests.test_selection import LINK, ODD, apart
+from tests.topologies import AVERAGE, compiled, replaced
 
 SHAKY = apart(AVERAGE, "loss: {p: 10 %, r: 20 %}, jitter: 8 ms")
 
@@ -49,6 +55,61 @@ def test_run_0_is_the_run_that_is_played_alone() -> None:
         summary.settled,
         summary.largest_force[1],
     )
+
+
+def rows_of_runs(system: CompiledSystem, runs: int, first: int) -> NDArray[np.float64]:
+    """Return the rows of some runs that machine code plays side by side (rows, width, runs)."""
+    simulation = prepare(system, Settings(Fraction(1, 10), seed=3), runs=runs)
+    player = simulation.player(runs)
+    player.begin(first)
+    played = player.play(0, simulation.length, pushes(simulation, 0))
+    return played.rows.reshape(-1, simulation.population.width, runs).copy()
+
+
+SIDE = 13  # more runs than are added up at once, and no multiple of it
+ALONE = (2, 9, 14)
+
+
+@pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("more", ["", *ODD])
+@pytest.mark.parametrize("peers", [3, 7])
+def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: str) -> None:
+    starts = ", ".join(f"{place} mm" for place in range(peers))
+    link = f"{LINK[:-1]}, {more}}}" if more else LINK
+    many = f"{{set: {{cube.x: [{starts}], device.x: [{starts}]}}}}"
+    system = compiled(replaced(AVERAGE, ("{count: 3}", many), (LINK, link)))
+    together = rows_of_runs(system, SIDE, 2)
+    for number in ALONE:
+        np.testing.assert_array_equal(together[:, :, number - 2], rows_of_runs(system, 1, number)[:, :, 0])
+
+
+@pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("name", FORCES)
+@pytest.mark.parametrize("link", ["delay: 8 ms", "delay: 8 ms, jitter: 9 ms, loss: 20 %, on_loss: zero"])
+def test_so_are_those_that_look_at_each_pair(tmp_path: Path, name: str, link: str) -> None:
+    system = scene(tmp_path, FORCES[name][0], link)
+    together = rows_of_runs(system, SIDE, 2)
+    for number in ALONE:
+        np.testing.assert_array_equal(together[:, :, number - 2], rows_of_runs(system, 1, number)[:, :, 0])
+
+
+@pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
+def test_machine_code_judges_the_runs_as_the_virtual_machine_does() -> None:
+    system = compiled(SHAKY)
+    many, alone = (
+        play_many(system, Settings(Fraction(1, 2), seed=3, jit=jit), runs=20).runs for jit in (True, False)
+    )
+    for one, other in zip(many, alone, strict=True):
+        assert (one.number, one.verdict, one.settled) == (other.number, other.verdict, other.settled)
+        assert one.largest_force == pytest.approx(other.largest_force, rel=1e-12)
+        assert one.copies_apart == pytest.approx(other.copies_apart, abs=1e-15)
+
+
+def test_runs_that_diverge_are_told_from_those_beside_them() -> None:
+    """So stiff a coupling grows until the numbers end, however the packets come."""
+    stiff = replaced(SHAKY, ("stiffness: 500 N/m", "stiffness: 500 kN/m"))
+    found = play_many(compiled(stiff), Settings(Fraction(20), seed=3), runs=3).runs
+    assert [one.verdict for one in found] == ["diverges"] * 3
 
 
 def test_the_seed_is_the_experiments_if_none_is_given() -> None:

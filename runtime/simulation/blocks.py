@@ -116,7 +116,7 @@ class _Runner:
         if stop < len(rows):
             name = simulation.signals[int(np.argmin(finite[stop]))].name
             return Block(time[:stop], values[:stop], self.done, name, float(time[stop]))
-        if self.failed is None and instants[-1] <= last and not self.player.in_range():
+        if self.failed is None and instants[-1] <= last and not self.player.in_range().all():
             return Block(time, values, self.done, "what is not recorded", float(time[-1]))
         return Block(time, values, self.done)
 
@@ -143,6 +143,6 @@ def instants_of(simulation: Simulation, first: int, last: int) -> tuple[Integers
     """Return every row's instant in quanta, and which rows are kept: those until the quantum `last`."""
     marks = np.array(simulation.marks, dtype=np.int64)
     is_tick = np.array([mark in simulation.ticks for mark in simulation.marks])
-    instants = ((first + np.arange(simulation.length))[:, None] * simulation.frame + marks).reshape(-1)
-    kept = (np.tile(is_tick, simulation.length) | (instants == 0)) & (instants <= last)
-    return instants, kept
+    instants = (first + np.arange(simulation.length))[:, None] * simulation.frame + marks
+    kept = (is_tick | (instants == 0)) & (instants <= last)
+    return instants.reshape(-1), kept.reshape(-1)

@@ -2,25 +2,26 @@
 
 The kernels stand before this text (see `machine`), which also says what every field is. All fields have 8
 bytes; addresses are those of NumPy's arrays, which outlive a call. A row of a packet, a carry or what is
-heard is contiguous: a number a peer.
+heard is contiguous: a number a peer, or of several runs side by side `runs` numbers a peer, one each; what is
+in effect on a way is so too. Counts, columns and widths are of these numbers.
 */
 
 enum { TOTAL, COMPLETE, WEIGHED, DELIVER, ON_WAYS, COPY, COPY_WAYS, LOOK, MOVE, WORK };
 enum { UNIFORM, NORMAL, PARETO };
 
 typedef struct {
-  whole ways, slots, ticks, phase, period, first_tick, tick_period, kept, buckets, newest, zero, channels;
+  whole ways, runs, slots, ticks, phase, period, first_tick, tick_period, kept, buckets, newest, zero, channels;
   whole distribution, traced;
   double p, r, one_minus_h, one_minus_k, bad_share, jitter, quantum;
   const double *trace, *delays;                   /* (traced,); of each way, in seconds */
   const whole *nominal, *senders, *receivers;     /* of each way: quanta, peers of the scene */
-  const whole *columns, *keys;                    /* of each way's sender; (channels, slots) */
-  double *held;                                   /* (channels, ways): what is in effect */
-  whole *effective, *gap, *arrived;               /* (ways,): numbers, and when the first arrived */
-  int8_t *bad;                                    /* (ways,) */
-  int32_t *heads, *next;                          /* (buckets,), (2, kept, ways): packets by their tick */
-  whole *when;                                    /* (kept, ways), where the order of arrival matters */
-  uint64_t key[2];
+  const whole *columns, *keys;                    /* of each way's sender and run; (channels, slots) */
+  double *held;                                   /* (channels, ways · runs): what is in effect */
+  whole *effective, *gap, *arrived;               /* (ways · runs,): numbers, and when the first arrived */
+  int8_t *bad;                                    /* (ways · runs,) */
+  int32_t *heads, *next;                          /* (buckets,), (kept, ways · runs): packets by their tick */
+  whole *when;                                    /* (kept, ways · runs), where the order of arrival matters */
+  uint64_t key[2];                                /* of the first run */
   whole heard;                                    /* ticks so far */
 } Route;
 
@@ -41,7 +42,7 @@ typedef struct {
 } Operation;
 
 typedef struct {
-  whole frames_kept, keys, peers, operations, routes, marks, width, parts, frame;
+  whole runs, frames_kept, keys, peers, operations, routes, marks, width, parts, frame;
   double *packets, *totals;
   Operation *operation;
   Route *route;
@@ -91,15 +92,20 @@ static inline double deviate(whole distribution, double one, double two) {
   return late < 4 ? late : 4;
 }
 
-static inline whole quotient_up(whole a, whole b) { /* b > 0 */
-  return a / b + (a % b > 0);
+/* Quotients of what mostly fits 32 bits, in which dividing takes a fraction of the time; none is negative. */
+static inline whole quotient(whole a, whole b) {
+  return (a | b) >> 32 ? a / b : (whole)((uint32_t)a / (uint32_t)b);
 }
 
 /* Send packet `number` of every way: draw its luck and put it where the tick that first sees it will look. */
 static int draw(Route *r, whole number) {
-  whole slot = number % r->kept, sent = r->phase + r->period * number;
+  whole slot = number % r->kept, sent = r->phase + r->period * number, all = r->ways * r->runs;
+  whole base = sent - r->first_tick - r->heard * r->tick_period, most = r->buckets * r->tick_period;
+  whole bucket = r->heard % r->buckets;
+  int32_t *next = r->next + slot * all;
   int chance = !r->traced && (r->jitter > 0 || r->bad_share > 0 || r->one_minus_k > 0 || r->p > 0);
-  for (whole w = 0; w < r->ways; w++) {
+  for (whole w = 0, way = 0, run = 0; w < all; w++, way += ++run == r->runs, run %= r->runs) {
+    const uint64_t key[2] = {r->key[0], r->key[1] + ((uint64_t)run << 32)}; /* as `network.channel.luck_key` */
     double late;
     int lost;
     if (r->traced) {
@@ -109,14 +115,14 @@ static int draw(Route *r, whole number) {
       double u[4] = {1, 1, 0, 0};
       if (number == 0) {
         double first[4];
-        chances(r->key, 1, r->senders[w], r->receivers[w], first);
+        chances(key, 1, r->senders[way], r->receivers[way], first);
         r->bad[w] = first[0] < r->bad_share;
       }
-      if (chance) chances(r->key, number + 2, r->senders[w], r->receivers[w], u);
+      if (chance) chances(key, number + 2, r->senders[way], r->receivers[way], u);
       int bad = r->bad[w];
       lost = u[1] < (bad ? r->one_minus_h : r->one_minus_k);
       r->bad[w] = bad ? u[0] < 1 - r->r : u[0] < r->p;
-      late = r->delays[w];
+      late = r->delays[way];
       if (r->jitter > 0) {
         late += r->jitter * deviate(r->distribution, u[2], u[3]);
         if (late < 0) late = 0;
@@ -125,40 +131,43 @@ static int draw(Route *r, whole number) {
     late /= r->quantum;
     lost |= !(late < LONGEST);
     if (lost && !r->zero) continue;
-    whole fine = lost ? r->nominal[w] * ONE : (whole)rint(late * ONE), at = sent * ONE + fine;
-    whole tick = quotient_up(quotient_up(at, ONE) - r->first_tick, r->tick_period);
-    if (tick < r->heard) tick = r->heard;
-    if (tick - r->heard >= r->buckets) return 1;
-    int32_t *head = r->heads + tick % r->buckets, id = (int32_t)(2 * (slot * r->ways + w) + lost);
-    r->next[slot * r->ways + w] = *head;
+    whole fine = lost ? r->nominal[way] * ONE : (whole)rint(late * ONE);
+    whole since = base + (fine + ONE - 1) / ONE; /* since the tick that is heard next */
+    whole ticks = since > 0 ? quotient(since + r->tick_period - 1, r->tick_period) : 0;
+    if (since > most || ticks >= r->buckets) return 1;
+    int32_t *head = r->heads + (bucket + ticks < r->buckets ? bucket + ticks : bucket + ticks - r->buckets), id = (int32_t)(2 * (slot * all + w) + lost);
+    next[w] = *head;
     *head = id;
-    if (r->when && !lost) r->when[slot * r->ways + w] = at;
+    if (r->when && !lost) r->when[slot * all + w] = sent * ONE + fine;
   }
   return 0;
 }
 
 /* Bring in effect what a tick is the first to see. `newest` is the number of the packet sent last. */
 static void deliver(const Plan *plan, Route *r, whole tick, whole newest) {
+  whole all = r->ways * r->runs, newest_slot = newest % r->kept, frame = newest / r->slots % plan->frames_kept;
   for (; r->heard <= tick; r->heard++) {
     int32_t *head = r->heads + r->heard % r->buckets, id = *head;
     *head = -1;
     for (; id >= 0; id = r->next[id >> 1]) {
-      whole slot = (id >> 1) / r->ways, w = (id >> 1) % r->ways;
-      whole number = newest - ((newest - slot) % r->kept + r->kept) % r->kept;
+      whole slot = quotient(id >> 1, all), w = (id >> 1) - slot * all;
+      whole ago = newest_slot - slot + (slot > newest_slot ? r->kept : 0), number = newest - ago;
       if (id & 1) {
         if (number > r->gap[w]) r->gap[w] = number;
         continue;
       }
       if (r->newest ? number < r->effective[w]
-                    : r->when[slot * r->ways + w] < r->arrived[w] ||
-                        (r->when[slot * r->ways + w] == r->arrived[w] && number < r->effective[w]))
+                    : r->when[slot * all + w] < r->arrived[w] ||
+                        (r->when[slot * all + w] == r->arrived[w] && number < r->effective[w]))
         continue;
       r->effective[w] = number;
-      if (!r->newest) r->arrived[w] = r->when[slot * r->ways + w];
-      whole kept = (number / r->slots) % plan->frames_kept;
+      if (!r->newest) r->arrived[w] = r->when[slot * all + w];
+      whole frames_ago = quotient(ago, r->slots), kept = frame - frames_ago;
+      const whole *keys = r->keys + r->slots - 1 - (ago - frames_ago * r->slots);
+      if (kept < 0) kept += plan->frames_kept;
       for (whole c = 0; c < r->channels; c++)
-        r->held[c * r->ways + w] =
-          plan->packets[(kept * plan->keys + r->keys[c * r->slots + number % r->slots]) * plan->peers + r->columns[w]];
+        r->held[c * all + w] =
+          plan->packets[(kept * plan->keys + keys[c * r->slots]) * plan->peers + r->columns[w]];
     }
   }
 }
@@ -179,25 +188,69 @@ static double sum(const double *values, whole count) {
   return (lanes[0] + lanes[1]) + (lanes[2] + lanes[3]);
 }
 
+#define SIDE 8 /* runs that are added up at once */
+
+/* Adds the sums of all runs to what is there. */
+static void add_sums(const double *values, whole count, whole runs, double *to) {
+  if (runs == 1) *to += sum(values, count);
+  else if (count < 4)
+    LANES for (whole run = 0; run < runs; run++) {
+      double total = values[run];
+      if (count > 1) total += values[runs + run];
+      if (count > 2) total += values[2 * runs + run];
+      to[run] += total;
+    }
+  else
+    for (whole run = 0; run < runs; run += SIDE) {
+      double lanes[4][SIDE] = {{0}};
+      whole some = runs - run < SIDE ? runs - run : SIDE;
+      for (whole i = 0; i < count; i++) {
+        const double *from = values + i * runs + run;
+        if (some == SIDE)
+          for (int k = 0; k < SIDE; k++) lanes[i % 4][k] += from[k];
+        else
+          for (int k = 0; k < some; k++) lanes[i % 4][k] += from[k];
+      }
+      for (int k = 0; k < some; k++) to[run + k] += (lanes[0][k] + lanes[1][k]) + (lanes[2][k] + lanes[3][k]);
+    }
+}
+
+INSIDE void complete(whole count, whole runs, const double *total, const double *own, double divisor, double *heard) {
+  for (whole i = 0; i < count; i += runs)
+    LANES for (whole run = 0; run < runs; run++)
+      heard[i + run] = (total[run] - (own ? own[i + run] : 0)) / divisor;
+}
+
+INSIDE void weighed(const Operation *o, whole count, whole runs, const double *row) {
+  for (whole i = 0; i * runs < count; i++)
+    for (whole run = 0; run < runs; run++) {
+      double total = 0;
+      for (whole k = o->p[i]; k < o->p[i + 1]; k++) total += o->u[k] * row[o->q[k] * runs + run];
+      o->v[i * runs + run] = total;
+    }
+}
+
 static void on_ways(const Operation *o, const Route *r, double *heard, whole count) {
-  const double *held = r->held + o->d * r->ways;
-  for (whole i = 0; i < count; i++) {
+  const double *held = r->held + o->d * r->ways * r->runs;
+  memset(heard, 0, (size_t)count * sizeof(double));
+  for (whole i = 0; i * r->runs < count; i++, heard += r->runs) {
     whole begin = o->p[i], end = o->p[i + 1];
-    double total = 0;
     if (!o->e && !r->zero && o->f) { /* equal weights of ways that stand side by side */
-      heard[i] = end > begin ? o->x * sum(held + o->q[begin], end - begin) : 0;
+      if (end > begin) add_sums(held + o->q[begin] * r->runs, end - begin, r->runs, heard);
+      for (whole run = 0; run < r->runs; run++) heard[run] *= o->x;
       continue;
     }
-    for (whole k = begin; k < end; k++) {
-      whole w = o->q[k];
-      int gone = missing(r, w);
-      total += o->u[k] * (o->e ? (double)gone : gone ? 0.0 : held[w]);
-    }
-    heard[i] = total;
+    for (whole k = begin; k < end; k++)
+      for (whole run = 0; run < r->runs; run++) {
+        whole w = o->q[k] * r->runs + run;
+        int gone = missing(r, w);
+        heard[run] += o->u[k] * (o->e ? (double)gone : gone ? 0.0 : held[w]);
+      }
   }
 }
 
 LIBRARY int play(Plan *plan, whole first, whole count, double *rows, double *work) {
+  const whole runs = plan->runs;
   for (whole n = 0; n < count; n++) {
     whole frame = first + n;
     double *own = rows + n * plan->marks * plan->width;
@@ -208,28 +261,23 @@ LIBRARY int play(Plan *plan, whole first, whole count, double *rows, double *wor
       switch (o->kind) {
         case TOTAL: { /* a: place, b: key, c: lag, d: how many ranges p */
           const double *row = packet(plan, frame, o->b, o->c);
-          double total = 0;
-          for (whole i = 0; i < o->d; i++) total += sum(row + o->p[2 * i], o->p[2 * i + 1] - o->p[2 * i]);
-          plan->totals[o->a] = total;
+          double *total = plan->totals + o->a * runs;
+          memset(total, 0, (size_t)runs * sizeof(double));
+          for (whole i = 0; i < o->d; i++) add_sums(row + o->p[2 * i] * runs, o->p[2 * i + 1] - o->p[2 * i], runs, total);
           break;
         }
         case COMPLETE: { /* a: member, b: total, c: key or -1, d: lag, x: divisor, v: to */
           const Member *m = plan->member + o->a;
-          double total = plan->totals[o->b], *heard = o->v;
-          const double *row = o->c < 0 ? 0 : packet(plan, frame, o->c, o->d) + m->column;
-          if (!row)
-            for (whole i = 0; i < m->count; i++) heard[i] = total / o->x;
-          else
-            LANES for (whole i = 0; i < m->count; i++) heard[i] = (total - row[i]) / o->x;
+          const double *total = plan->totals + o->b * runs;
+          const double *own = o->c < 0 ? 0 : packet(plan, frame, o->c, o->d) + m->column;
+          if (runs == 1) complete(m->count, 1, total, own, o->x, o->v);
+          else complete(m->count, runs, total, own, o->x, o->v);
           break;
         }
         case WEIGHED: { /* a: member, b: key, c: lag, p: starts, q: columns, u: weights, v: to */
           const double *row = packet(plan, frame, o->b, o->c);
-          for (whole i = 0; i < plan->member[o->a].count; i++) {
-            double total = 0;
-            for (whole k = o->p[i]; k < o->p[i + 1]; k++) total += o->u[k] * row[o->q[k]];
-            o->v[i] = total;
-          }
+          if (runs == 1) weighed(o, plan->member[o->a].count, 1, row);
+          else weighed(o, plan->member[o->a].count, runs, row);
           break;
         }
         case DELIVER: { /* a: route, b: tick */
@@ -246,9 +294,9 @@ LIBRARY int play(Plan *plan, whole first, whole count, double *rows, double *wor
         }
         case COPY_WAYS: { /* a: route, b: channel, or -1 for what is missing, v: to */
           const Route *r = plan->route + o->a;
-          for (whole w = 0; w < r->ways; w++) {
+          for (whole w = 0; w < r->ways * runs; w++) {
             int gone = missing(r, w);
-            o->v[w] = o->b < 0 ? (double)gone : gone ? 0.0 : r->held[o->b * r->ways + w];
+            o->v[w] = o->b < 0 ? (double)gone : gone ? 0.0 : r->held[o->b * r->ways * runs + w];
           }
           break;
         }

@@ -40,12 +40,11 @@ from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.summary import Watch, is_position
 
 Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 QUANTILES = (0.05, 0.5, 0.95)
 SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
 PART = 100  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
-TOGETHER = 2**19  # numbers of the rows of runs that are looked at side by side
+TOGETHER = 2**18  # numbers that runs side by side keep, and that rows of them are played at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +150,7 @@ def play_many(
     done: list[Run] = []
     interrupted = False
     try:
-        with _workers(system, settings, min(jobs, len(parts)), place) as workers:
+        with _workers(system, settings, min(runs, PART), min(jobs, len(parts)), place) as workers:
             for found in results(workers, parts, Patience(), place):
                 done += found
                 if progress is not None:
@@ -165,25 +164,48 @@ def play_many(
 
 
 def _workers(
-    system: CompiledSystem, settings: Settings, jobs: int, place: Place
+    system: CompiledSystem, settings: Settings, runs: int, jobs: int, place: Place
 ) -> AbstractContextManager[Workers[range, list[Run]]]:
     """Return who plays: this process, or some that are started afresh."""
     if jobs == 1:
-        return nullcontext(this_process(_runs, prepare(system, settings)))
+        return nullcontext(this_process(_runs, _side(prepare(system, settings, runs=runs), runs)))
     what = "a process that played runs ended without a word: stopped from outside, or out of memory"
     lost = Mistake("E895", place, what, hint="--jobs 1")
     return local_processes(_part, (model_bytes(system), settings), jobs, lost)
 
 
-def _runs(simulation: Simulation, part: range) -> list[Run]:
-    """Play some runs, as many side by side as their rows stay in the caches."""
-    player, last = simulation.player(), int(simulation.settings.duration / simulation.quantum)
-    if last // simulation.frame >= simulation.length:  # of a long run the rows pass, and are gone
-        return [_alone(simulation, player, number) for number in part]
-    numbers = simulation.length * len(simulation.marks) * max(simulation.population.width, 1)
-    side = max(1, TOGETHER // numbers)
-    parts = (part[first : first + side] for first in range(0, len(part), side))
-    return [run for some in parts for run in _together(simulation, player, some, last)]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Side:
+    """What plays some runs side by side, and what looks at them: `positions` and `forces` among the signals.
+
+    The signals are counted as a player gives them.
+    """
+
+    simulation: Simulation
+    player: Player
+    watch: Watch
+    positions: tuple[int, ...]
+    forces: tuple[int, ...]
+
+
+def _side(simulation: Simulation, runs: int) -> _Side:
+    """Return what plays runs, as many side by side as stay in the caches with a frame of their rows."""
+    hearing, frame = simulation.population.hearing, len(simulation.marks) * max(len(simulation.signals), 1)
+    ways = zip(simulation.lucks, hearing.routes, strict=True)
+    kept = hearing.start.size * hearing.ring + sum(luck.kept(one) * len(one.pairs) for luck, one in ways)
+    player = simulation.player(min(runs, max(1, TOGETHER // (frame + kept))))
+    length = min(simulation.length, max(1, TOGETHER // (frame * player.runs)))
+    signals = [simulation.signals[i] for i in np.argsort(simulation.order)]
+    positions = tuple(i for i, one in enumerate(signals) if is_position(one))
+    forces = tuple(i for i, one in enumerate(signals) if one.unit == "N")
+    watch = Watch(simulation, [signals[i] for i in positions], player.runs)
+    return _Side(replace(simulation, length=length), player, watch, positions, forces)
+
+
+def _runs(side: _Side, part: range) -> list[Run]:
+    """Play some runs."""
+    parts = (part[first : first + side.player.runs] for first in range(0, len(part), side.player.runs))
+    return [run for some in parts for run in _together(side, some)]
 
 
 def _part(shared: tuple[bytes, Settings], part: range) -> list[Run]:
@@ -191,44 +213,40 @@ def _part(shared: tuple[bytes, Settings], part: range) -> list[Run]:
 
 
 @lru_cache(maxsize=1)
-def _opened(model: bytes, settings: Settings) -> Simulation:
-    return prepare(model_of_bytes(model), settings)
+def _opened(model: bytes, settings: Settings) -> _Side:
+    return _side(prepare(model_of_bytes(model), settings, runs=PART), PART)
 
 
-def _together(simulation: Simulation, player: Player, runs: range, last: int) -> list[Run]:
-    """Play runs whose frames are one call of a player each; what leaves the range of floats goes alone."""
-    signals = [simulation.signals[i] for i in np.argsort(simulation.order)]
-    instants, kept = instants_of(simulation, 0, last)
-    time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
-    some: slice | Flags = slice(len(time)) if kept[: len(time)].all() else kept
-    places = [i for i, one in enumerate(signals) if is_position(one)]
-    forces = [i for i, one in enumerate(signals) if one.unit == "N"]
-    positions = np.empty((len(time), len(runs), len(places)))
-    largest, most = np.zeros((2, len(runs)))
-    push, whole = pushes(simulation, 0), np.ones(len(runs), np.bool_)
-    for place, number in enumerate(runs):
-        player.begin(number)
-        played = player.play(0, simulation.length, push)
-        rows = played.rows[some]
-        whole[place] = played.frames == simulation.length
-        positions[:, place] = rows[:, places]
-        size = np.abs(rows)
-        most[place] = size.max(initial=0.0)
-        largest[place] = size[:, forces].max(initial=0.0)
-    watch = Watch(simulation, [signals[i] for i in places], len(runs))
+def _together(side: _Side, runs: range) -> list[Run]:
+    """Play runs side by side; what leaves the range of floats is played again, alone."""
+    simulation, player, watch = side.simulation, side.player, side.watch
+    last = int(simulation.settings.duration / simulation.quantum)
+    largest, finite = np.zeros(player.runs), np.ones(player.runs, np.bool_)
+    player.begin(runs.start)
+    watch.begin()
     with np.errstate(all="ignore"):  # of what has diverged
-        watch.take(time, positions.reshape(len(time), -1))
-        found = _amounts(watch, runs, largest if forces else None)
-    whole &= np.isfinite(most)
-    for place in np.flatnonzero(~whole).tolist():
-        found[place] = _alone(simulation, player, runs[place])
-    return found
+        for first in range(0, last // simulation.frame + 1, simulation.length):
+            played = player.play(first, simulation.length, pushes(simulation, first))
+            if played.frames < simulation.length:
+                return [_alone(simulation, number) for number in runs]
+            instants, kept = instants_of(simulation, first, last)
+            time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
+            rows = played.rows if kept.all() else played.rows[kept]
+            rows = rows.reshape(len(time), len(simulation.signals), player.runs)
+            watch.take(time, rows[:, list(side.positions)].reshape(len(time), -1))
+            low, high = rows.min(axis=0, initial=0.0), rows.max(axis=0, initial=0.0)
+            finite &= (np.isfinite(low) & np.isfinite(high)).all(axis=0)
+            size = np.maximum(high, -low)[list(side.forces)].max(axis=0, initial=0.0)
+            largest = np.maximum(largest, size)
+        finite &= player.in_range()
+        found = _amounts(watch, runs, largest if side.forces else None)
+    return [found[i] if finite[i] else _alone(simulation, number) for i, number in enumerate(runs)]
 
 
-def _alone(simulation: Simulation, player: Player, number: int) -> Run:
+def _alone(simulation: Simulation, number: int) -> Run:
     """Play one run block by block."""
     watch, block = Watch(simulation), None
-    for block in blocks(simulation, run=number, player=player):
+    for block in blocks(simulation, run=number):
         watch.take(block.time, block.values)
     largest = watch.peak[watch.forces].max(keepdims=True) if watch.forces else None
     with np.errstate(all="ignore"):
@@ -239,8 +257,9 @@ def _amounts(watch: Watch, runs: range, forces: Floats | None, *, stopped: bool 
     """Return what runs side by side amount to; `forces` (runs,) are the largest of each."""
     judged = watch.judged(stopped=stopped)
     apart = [distance for _, unit, distance in watch.copies() if unit == "m"]
-    none = [None] * len(runs)
+    none = [None] * watch.runs
     settled = [None if math.isnan(one) else one for one in judged.settled_at.tolist()]
     largest = none if forces is None else forces.tolist()
     copies = np.max(apart, axis=0).tolist() if apart else none
-    return [Run(*one) for one in zip(runs, judged.verdict.tolist(), settled, largest, copies, strict=True)]
+    # Those beyond the last run that was wanted are left out.
+    return [Run(*one) for one in zip(runs, judged.verdict.tolist(), settled, largest, copies, strict=False)]

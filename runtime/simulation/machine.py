@@ -30,6 +30,7 @@ from apc.simulation.population import Played, Population
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 # More operations than this in one kernel: optimizing straight code costs more than linear time.
 MOST_OPERATIONS = 20_000
@@ -108,7 +109,7 @@ def _fields(*columns: tuple[str, str]) -> np.dtype[Any]:
 
 WHOLE, NUMBER, ADDRESS = "i8", "f8", "u8"
 ROUTE = _fields(
-    ("ways slots ticks phase period first_tick tick_period kept buckets newest zero channels", WHOLE),
+    ("ways runs slots ticks phase period first_tick tick_period kept buckets newest zero channels", WHOLE),
     ("distribution traced", WHOLE),
     ("p r one_minus_h one_minus_k bad_share jitter quantum", NUMBER),
     ("trace delays nominal senders receivers columns keys held effective gap arrived bad", ADDRESS),
@@ -120,7 +121,7 @@ MEMBER = _fields(
 )
 OPERATION = _fields(("kind a b c d e f g", WHOLE), ("x y z", NUMBER), ("p q u v w", ADDRESS))
 PLAN = _fields(
-    ("frames_kept keys peers operations routes marks width parts frame", WHOLE),
+    ("runs frames_kept keys peers operations routes marks width parts frame", WHOLE),
     ("packets totals operation route member", ADDRESS),
 )
 
@@ -254,13 +255,15 @@ class Library:
     kernels: Mapping[int, int]
 
 
-def library_of(population: Population) -> Library | None:
+def library_of(population: Population, runs: int = 1) -> Library | None:
     """Return what plays a population in machine code, None where that can't be had.
 
     Parameters
     ----------
     population
         All peers.
+    runs
+        How many runs stand side by side.
     """
     segments = {id(one): (one, m.program) for m in population.members for one in m.program.segments}
     functions = [one.kernel for one, _ in segments.values()]
@@ -268,7 +271,7 @@ def library_of(population: Population) -> Library | None:
     if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(_is_worth_it(one) for one in (*functions, *looks)):
         return None
     kernels = [Kernel(straight(one.kernel), len(own.recorded)) for one, own in segments.values()]
-    many = max(member.count for member in population.members) >= MANY
+    many = runs * max(member.count for member in population.members) >= MANY
     loaded = native(program_text(kernels, [straight(one) for one in looks]), many=many)
     if loaded is None:
         return None
@@ -280,14 +283,10 @@ def _is_worth_it(function: Any) -> bool:
 
 
 class Machine:
-    """The memory of all peers, and the library that plays them in it."""
+    """The memory of all peers, once for each of the runs side by side, and the library that plays them."""
 
     def __init__(
-        self,
-        library: Library,
-        population: Population,
-        lucks: Sequence[Luck],
-        seed: int,
+        self, library: Library, population: Population, lucks: Sequence[Luck], seed: int, runs: int
     ) -> None:
         """Lay out the memory.
 
@@ -301,7 +300,10 @@ class Machine:
             What chance does on each of its routes.
         seed
             The experiment's.
+        runs
+            How many runs stand side by side.
         """
+        self.runs = runs
         self.population, self.lucks, self.seed, self.kernels = population, lucks, seed, library.kernels
         self._play = library.loaded.play
         self._play.argtypes = [
@@ -314,29 +316,31 @@ class Machine:
         self._kept: list[NDArray[Any]] = []  # arrays whose addresses the library knows
         self._start: list[tuple[NDArray[Any], NDArray[Any] | float]] = []  # what changes, and its beginning
         hearing = population.hearing
-        self.packets = self._changing(np.broadcast_to(hearing.start, (hearing.ring, *hearing.start.shape)))
+        start = np.repeat(hearing.start, runs, axis=1)
+        self.packets = self._changing(np.broadcast_to(start, (hearing.ring, *start.shape)))
         self.carries = [self._changing(self._carry(g)) for g in range(len(population.members))]
         self.heard = [
             self._own(
-                np.zeros((max(one.kernel.numel_in("heard") for one in member.program.segments), member.count))
+                np.zeros((max(s.kernel.numel_in("heard") for s in one.program.segments), one.count * runs))
             )
-            for member in population.members
+            for one in population.members
         ]
         self.members = self._own(np.array([self._member(g) for g in range(len(population.members))], MEMBER))
         self.routes = self._own(np.array([self._route(i) for i in range(len(lucks))], ROUTE))
         listed = [one for index, some in enumerate(hearing.segments) for one in self._segment(index, some)]
         operations = self._own(np.array([*self._work(), *listed], OPERATION))
         self.plan = self._own(np.zeros(1, PLAN))
-        totals = self._own(np.zeros(max(hearing.totals, 1)))
+        totals = self._own(np.zeros(max(hearing.totals, 1) * runs))
         self._set(
             self.plan[0],
+            runs=runs,
             frames_kept=hearing.ring,
             keys=len(hearing.keys),
-            peers=hearing.start.shape[1],
+            peers=start.shape[1],
             operations=len(operations),
             routes=len(lucks),
             marks=population.marks,
-            width=population.width,
+            width=population.width * runs,
             parts=len(population.parts),
             frame=population.frame,
             packets=self.packets,
@@ -350,7 +354,7 @@ class Machine:
         self.begin(0)
 
     def begin(self, run: int) -> None:
-        """Go back to time 0; `run` is which of many runs of one seed."""
+        """Go back to time 0 (see `Player`)."""
         for array, value in self._start:
             array[...] = value
         for place, route in enumerate(self.population.hearing.routes):
@@ -364,20 +368,22 @@ class Machine:
             if one is not None:
                 self.members["impulses"][g] = one.ctypes.data
         if len(self.work) != count:
-            self.rows = np.empty((count * population.marks, population.width))
+            self.rows = np.empty((count * population.marks, population.width * self.runs))
             self.work = np.empty((count, len(population.parts)))
         self.work[:] = 0.0
         failed = self._play(self.address, first, count, self.rows.ctypes.data, self.work.ctypes.data)
         assert not failed, "a packet is later than the latest can be"
         return Played(self.rows, self.work, count)
 
-    def in_range(self) -> bool:
-        """Say whether all that moves, recorded or not, is still a number; the work done may not be."""
+    def in_range(self) -> Flags:
+        """Say of each run whether all that moves is still a number (see `Player`)."""
         moving = (
             carry[: member.program.layout.work.start]
             for carry, member in zip(self.carries, self.population.members, strict=True)
         )
-        return all(bool(np.isfinite(one).all()) for one in (self.packets, *moving))
+        columns = [one.reshape(-1, self.runs) for one in (self.packets, *moving)]
+        found: Flags = np.logical_and.reduce([np.isfinite(one).all(axis=0) for one in columns])
+        return found
 
     # ---- the layout
 
@@ -410,7 +416,11 @@ class Machine:
         )
         start = np.zeros((height, member.count))
         start[: member.carry.shape[1]] = member.each(member.carry).T
-        return start
+        return self._side_by_side(start)
+
+    def _side_by_side(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values (…, peers), or of ways, for every run: (…, peers · runs)."""
+        return np.repeat(values, self.runs, axis=-1)
 
     def _member(self, g: int) -> Any:
         member = self.population.members[g]
@@ -418,30 +428,30 @@ class Machine:
         record = np.zeros(1, MEMBER)[0]
         self._set(
             record,
-            count=member.count,
-            column=int(self.population.hearing.first[g]),
+            count=member.count * self.runs,
+            column=int(self.population.hearing.first[g]) * self.runs,
             recorded=len(member.program.recorded),
             sites=sites,
             own=int(sites > 1),
             impulse_rows=member.program.impulse_rows,
             carry=self.carries[g],
             heard=self.heard[g],
-            constants=self._own(member.each(constants).T if sites > 1 else constants[0]),
-            site=self._own(member.rows),
+            constants=self._own(self._side_by_side(member.each(constants).T) if sites > 1 else constants[0]),
+            site=self._own(self._side_by_side(member.rows)),
         )
         return record
 
     def _route(self, place: int) -> Any:
         hearing, luck = self.population.hearing, self.lucks[place]
         route, law = hearing.routes[place], luck.law
-        ways = len(route.pairs)
+        ways = len(route.pairs) * self.runs
         kept, buckets = luck.kept(route), luck.buckets(route)
         trace = np.zeros(0) if law.trace is None else law.trace
-        late = (luck.kept(route), ways) if not luck.newest else (0,)
         record = np.zeros(1, ROUTE)[0]
         self._set(
             record,
-            ways=ways,
+            ways=len(route.pairs),
+            runs=self.runs,
             slots=route.slots,
             ticks=route.ticks,
             phase=luck.phase,
@@ -467,9 +477,9 @@ class Machine:
             nominal=self._own(luck.nominal),
             senders=self._own(route.pairs[:, 0]),
             receivers=self._own(route.pairs[:, 1]),
-            columns=self._own(hearing.column_of[route.pairs[:, 0]]),
+            columns=self._own(self._columns(hearing.column_of[route.pairs[:, 0]])),
             keys=self._own(hearing.channels[place]),
-            held=self._changing(hearing.held[place]),
+            held=self._changing(self._side_by_side(hearing.held[place])),
             effective=self._changing(((ways,), np.int64, START)),
             gap=self._changing(((ways,), np.int64, START)),
             arrived=self._changing(((ways,), np.int64, -1)),
@@ -478,8 +488,12 @@ class Machine:
             next=self._own(np.empty((kept, ways), np.int32)),
         )
         if not luck.newest:
-            record["when"] = self._own(np.empty(late, np.int64)).ctypes.data
+            record["when"] = self._own(np.empty((kept, ways), np.int64)).ctypes.data
         return record
+
+    def _columns(self, places: Integers) -> Integers:
+        """Return where the numbers of some peers or ways stand, run by run."""
+        return (places[:, None] * self.runs + np.arange(self.runs)).reshape(-1)
 
     def _operation(self, kind: str, *whole: int, **fields: Any) -> Any:
         record = np.zeros(1, OPERATION)[0]
@@ -510,7 +524,7 @@ class Machine:
                 [population.hearing.sent[g][row] for row in program.segments[index].sent], np.int64
             )
             kernel = self.kernels[id(program.segments[index])]
-            where = (g, kernel, marks, population.columns[g], pushed)
+            where = (g, kernel, marks, population.columns[g] * self.runs, pushed)
             found.append(self._operation("move", *where, p=self._own(keys)))
         return found
 
@@ -545,16 +559,19 @@ class Machine:
 
     def _look(self, one: Look) -> list[Any]:
         """Return what copies the packets that are looked at side by side, and looks at them."""
-        member, count = self.population.members[one.member], self.population.members[one.member].count
+        member, runs = self.population.members[one.member], self.runs
+        count = member.count * runs
         height = len(one.channels) if one.route >= 0 else len(one.sources)
-        inside = self._own(np.zeros((height + 1, one.width)))  # what is heard, then what is missing
+        width = one.width * runs
+        inside = self._own(np.zeros((height + 1, width)))  # what is heard, then what is missing
         found = []
         for row, source in zip(inside, one.sources, strict=False):
             to = 0
             for key, lag, ranges in source:
                 for begin, end in ranges:
-                    found.append(self._operation("copy", key, lag, begin, end - begin, v=row[to:]))
-                    to += end - begin
+                    size = (end - begin) * runs
+                    found.append(self._operation("copy", key, lag, begin * runs, size, v=row[to:]))
+                    to += size
         if one.route >= 0:
             every = [*one.channels, -1] if one.gap else one.channels
             for row, channel in zip((*inside[: len(one.channels)], inside[-1]), every, strict=False):
@@ -563,9 +580,10 @@ class Machine:
         own = len(member.parameters) > 1
         rows = [(carry[row].ctypes.data, 1) for row in one.pairwise.carry]
         rows += [(constants + 8 * row * (count if own else 1), int(own)) for row in one.pairwise.constants]
-        listed = np.concatenate([one.receivers, np.array(rows, np.int64).reshape(-1)])
+        listed = np.concatenate([self._columns(one.receivers), np.array(rows, np.int64).reshape(-1)])
         schedule = member.program.schedule
-        where = (one.member, one.function, len(one.senders), OPERATORS[one.operator], one.width, height)
+        arcs = len(one.senders) * runs
+        where = (one.member, one.function, arcs, OPERATORS[one.operator], width, height)
         found.append(
             self._operation(
                 "look",
@@ -573,9 +591,9 @@ class Machine:
                 one.pairwise.now,
                 y=float(schedule.quantum.numerator),
                 z=float(schedule.quantum.denominator),
-                p=self._own(one.senders),
+                p=self._own(self._columns(one.senders)),
                 q=self._own(listed),
-                u=self._own(one.weights),
+                u=self._own(self._side_by_side(one.weights)),
                 v=inside,
                 w=self.heard[one.member][one.row],
             )

@@ -27,6 +27,7 @@ from apc.simulation.hearing import Hearing, hearing_of
 from apc.simulation.program import Member
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,9 +50,10 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """Some frames: `rows` (frames · marks, width), `work` (frames, parts) in J until each of them begins.
+    """Some frames: `rows` (frames · marks, width · runs), `work` (frames, parts) in J until each begins.
 
-    Only the first `frames` of them could be played.
+    Each number of a row stands there once a run, side by side; the work is that of all runs. Only the first
+    `frames` could be played.
     """
 
     rows: Floats
@@ -60,10 +62,12 @@ class Played:
 
 
 class Player(Protocol):
-    """Plays a population, frame after frame."""
+    """Plays a population, frame after frame: `runs` runs of one seed, which differ in their packets."""
+
+    runs: int
 
     def begin(self, run: int) -> None:
-        """Go back to time 0; `run` is which of many runs of one seed."""
+        """Go back to time 0; `run` is the number of the first run, the others follow it."""
 
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on; of the members with impulses `pushes` are these.
@@ -71,8 +75,8 @@ class Player(Protocol):
         They are (frames, rows, sites). What is returned may be written over by the next call.
         """
 
-    def in_range(self) -> bool:
-        """Say whether all that moves, recorded or not, is still a number; the work done may not be."""
+    def in_range(self) -> Flags:
+        """Say of each run whether all that moves, recorded or not, is still a number; its work may not be."""
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:

@@ -124,10 +124,10 @@ class Simulation:
         """The parts whose work is added up."""
         return self.population.parts
 
-    def player(self) -> Player:
-        """Return what plays it, with memory of its own."""
+    def player(self, runs: int = 1) -> Player:
+        """Return what plays it, with memory of its own, in machine code as many runs side by side."""
         if self.library is not None:
-            return Machine(self.library, self.population, self.lucks, self.seed)
+            return Machine(self.library, self.population, self.lucks, self.seed, runs)
         return Stepwise(self.population, self._timetable if self.lucks else None)
 
     def _timetable(self, run: int) -> Timetable:
@@ -135,7 +135,9 @@ class Simulation:
 
 
 @part("prepare")
-def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str] = ()) -> Simulation:
+def prepare(
+    system: CompiledSystem, settings: Settings, *, signals: Sequence[str] = (), runs: int = 1
+) -> Simulation:
     """Do what comes before the first instant.
 
     Parameters
@@ -146,6 +148,8 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
         How it is played.
     signals
         Patterns of the signals to record, all if there is none; see `signals.choose`.
+    runs
+        How many runs will stand side by side; it decides how machine code is made, not what comes out.
 
     Raises
     ------
@@ -179,7 +183,7 @@ def prepare(system: CompiledSystem, settings: Settings, *, signals: Sequence[str
         frame=schedule.frame,
         marks=marks,
         ticks=frozenset(marks if _ticks_at_zero(system, plan.numbers) else marks[1:]),
-        library=library_of(population) if settings.jit else None,
+        library=library_of(population, runs) if settings.jit else None,
         length=_chunk_length(population, settings.duration),
     )
 

@@ -23,13 +23,16 @@ from apc.simulation.program import Member, Segment, seconds_at
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 MOST_SEEN = 2**20  # packets that ticks see, drawn at once
 JOINS = {"max": np.fmax, "min": np.fmin}
 
 
 class Stepwise:
-    """The memory of all peers, and what moves them in it."""
+    """The memory of all peers, and what moves them in it, one run at a time."""
+
+    runs = 1
 
     def __init__(self, population: Population, timetable: Callable[[int], Timetable] | None) -> None:
         """Make the memory.
@@ -47,7 +50,7 @@ class Stepwise:
         self.begin(0)
 
     def begin(self, run: int) -> None:
-        """Go back to time 0; `run` is which of many runs of one seed."""
+        """Go back to time 0 (see `Player`)."""
         hearing = self.population.hearing
         self.table = None if self.timetable is None else self.timetable(run)
         self.packets = np.repeat(hearing.start[None], hearing.ring, axis=0)
@@ -78,13 +81,13 @@ class Stepwise:
                     return Played(rows, work, n)
         return Played(rows, work, count)
 
-    def in_range(self) -> bool:
-        """Say whether all that moves, recorded or not, is still a number; the work done may not be."""
+    def in_range(self) -> Flags:
+        """Say whether all that moves is still a number (see `Player`)."""
         moving = (
             carry[: member.program.layout.work.start]
             for carry, member in zip(self.carries, self.population.members, strict=True)
         )
-        return all(bool(np.isfinite(one).all()) for one in (self.packets, *moving))
+        return np.array([all(bool(np.isfinite(one).all()) for one in (self.packets, *moving))])
 
     def _seen(self, first: int, count: int) -> Iterator[tuple[Seen, ...]]:
         """Yield what the ticks of each frame see on every route."""

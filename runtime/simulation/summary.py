@@ -35,6 +35,7 @@ LEAST_WAY = 0.2  # of the range: a shorter way from first to last has no oversho
 FEWEST_TURNS = 4  # within the tail: two periods
 SMALLER = 0.9  # a swing of less than this part of that in the time before is dying away
 BUCKETS = 512  # times that extremes are kept for
+PASSED = 32  # of them looked at at once, which stay in the caches
 MOST_EXTREMES = 2**22  # numbers kept for each of three tables: 32 MiB
 
 
@@ -79,8 +80,8 @@ class Summary:
 class Judged:
     """What several runs of one scene amount to, side by side.
 
-    `verdict` (runs,) are words; `settled` (runs, signals) seconds, NaN where a signal does not settle, and of
-    all positions together (runs,), NaN but for runs that settle; `swing` (runs, signals) is the way to and
+    `verdict` (runs,) are words; `settled` (signals, runs) seconds, NaN where a signal does not settle, and of
+    all positions together (runs,), NaN but for runs that settle; `swing` (signals, runs) is the way to and
     fro at the end, `rate` how often a second, `restless` (runs,) the signal that swings most, −1 if none
     does.
     """
@@ -96,7 +97,9 @@ class Judged:
 class Watch:
     """Looks at some runs of a simulation as they pass and keeps extremes, bucket by bucket of rows."""
 
-    def __init__(self, simulation: Simulation, signals: Sequence[Signal] = (), runs: int = 1) -> None:
+    def __init__(
+        self, simulation: Simulation, signals: Sequence[Signal] | None = None, runs: int = 1
+    ) -> None:
         """Begin before the first row.
 
         Parameters
@@ -104,33 +107,38 @@ class Watch:
         simulation
             What is played.
         signals
-            What to look at, all signals of the simulation if there is none.
+            What to look at, all signals of the simulation if not given.
         runs
-            How many runs stand side by side: the signals of the first are followed by those of the next.
+            How many runs stand side by side: the first signal of all is followed by the next of all.
         """
         self.simulation, self.runs = simulation, runs
-        self.listed = tuple(signals) or simulation.signals
+        self.listed = simulation.signals if signals is None else tuple(signals)
         self.signals = len(self.listed)
+        self.positions = [i for i, one in enumerate(self.listed) if is_position(one)]
+        self.forces = [i for i, one in enumerate(self.listed) if one.unit == "N"]
         n = self.signals * runs
         rows = int(simulation.settings.duration / (simulation.frame * simulation.quantum)) + 1
         rows *= len(simulation.marks)
         most = max(16, min(BUCKETS, MOST_EXTREMES // max(len(simulation.signals), 1)))
         self.width = -(-rows // most)
+        buckets = -(-rows // self.width)
+        self.low, self.high = np.empty((buckets, n)), np.empty((buckets, n))
+        self.turns = np.empty((buckets, len(self.positions) * runs), np.min_scalar_type(self.width))
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin again before the first row: memory that was used once is at hand."""
+        n = self.signals * self.runs
         self.ends: list[float] = []
-        self.low, self.high = np.empty((0, n)), np.empty((0, n))
-        self.positions = [i for i, one in enumerate(self.listed) if is_position(one)]
-        self.forces = [i for i, one in enumerate(self.listed) if one.unit == "N"]
-        self.turning = _of_every_run(self.positions, self.signals, runs)
-        self.turns = np.empty((0, len(self.turning)), dtype=np.int64)
         self.pending, self.times = np.empty((0, n)), np.empty(0)
-        self.before: Floats = np.empty((0, len(self.turning)))  # the last two rows already in a bucket
+        self.before: Floats = np.empty((0, self.turns.shape[1]))  # the last two rows already in a bucket
         self.first: Floats = np.zeros(n)
         self.last: Floats = np.zeros(n)
         self.peak, self.peak_at = np.zeros(n), np.zeros(n)
         self.rows = 0
 
     def take(self, time: Floats, values: Floats) -> None:
-        """Look at some rows: `time` (rows,), `values` (rows, runs · signals)."""
+        """Look at some rows: `time` (rows,), `values` (rows, signals · runs)."""
         if not len(time):
             return
         if not self.rows:
@@ -158,25 +166,28 @@ class Watch:
 
     def _bucket(self, times: Floats, values: Floats, number: int) -> None:
         shaped = values.reshape(number, len(values) // number, values.shape[1])
-        self.low = np.concatenate([self.low, shaped.min(axis=1)])
-        self.high = np.concatenate([self.high, shaped.max(axis=1)])
+        here = slice(len(self.ends), len(self.ends) + number)
+        shaped.min(axis=1, out=self.low[here])
+        shaped.max(axis=1, out=self.high[here])
         self.ends += times.reshape(number, -1)[:, -1].tolist()
-        moving = np.concatenate([self.before, values[:, self.turning]])
+        positions = values
+        if len(self.positions) < self.signals:
+            positions = values.reshape(len(values), -1, self.runs)[:, self.positions].reshape(len(values), -1)
+        moving = np.concatenate([self.before, positions])
         up, down = moving[1:] > moving[:-1], moving[1:] < moving[:-1]
         found = (up[1:] & down[:-1]) | (down[1:] & up[:-1])
-        turned = np.zeros((len(values), len(self.turning)), dtype=np.bool_)
+        turned = np.zeros((len(values), moving.shape[1]), dtype=np.bool_)
         if len(found):
             turned[-len(found) :] = found
-        self.turns = np.concatenate(
-            [self.turns, turned.reshape(*shaped.shape[:2], len(self.turning)).sum(axis=1)]
-        )
+        each = turned.view(np.uint8).reshape(*shaped.shape[:2], moving.shape[1])
+        each.sum(axis=1, dtype=self.turns.dtype, out=self.turns[here])
         self.before = moving[-2:].copy()
 
     def judged(self, *, stopped: bool = False) -> Judged:
         """Return what has been seen of every run; `stopped` says that something left the range of floats."""
         self._fill(self.times, self.pending, all_of_it=True)
         assert self.rows, "a simulation has a row at time 0"
-        low, high = self._of_runs(self.low), self._of_runs(self.high)
+        low, high = self._tables()
         settled = self._settled(low, high)
         number = len(self.ends)
         tail = max(1, round(TAIL * number))
@@ -184,31 +195,31 @@ class Watch:
         swing = high[now].max(axis=0) - low[now].min(axis=0)
         span = np.maximum(high.max(axis=0) - low.min(axis=0), np.finfo(float).tiny)
         turns = np.zeros(swing.shape, np.int64)
-        turns[:, self.positions] = self.turns[now].sum(axis=0).reshape(self.runs, -1)
+        turns[self.positions] = self.turns[now].sum(axis=0, dtype=np.int64).reshape(-1, self.runs)
         # Of the positions that turn and don't settle, the one that swings most.
-        restless = np.isnan(settled[:, self.positions]) & (turns[:, self.positions] >= FEWEST_TURNS)
+        restless = np.isnan(settled[self.positions]) & (turns[self.positions] >= FEWEST_TURNS)
         restless &= number >= 2 * tail
-        share = np.where(restless, (swing / span)[:, self.positions], -1.0)
+        share = np.where(restless, (swing / span)[self.positions], -1.0)
         which = np.full(self.runs, -1, np.int64)
         if self.positions:
-            which = np.where(restless.any(axis=1), np.array(self.positions)[share.argmax(axis=1)], -1)
+            which = np.where(restless.any(axis=0), np.array(self.positions)[share.argmax(axis=0)], -1)
         earlier = np.zeros(swing.shape)
         if then.stop > then.start:
             earlier = high[then].max(axis=0) - low[then].min(axis=0)
         smaller = swing < SMALLER * earlier
-        dying = smaller[np.arange(self.runs), which] if self.positions else np.zeros(self.runs, np.bool_)
+        dying = smaller[which, np.arange(self.runs)] if self.positions else np.zeros(self.runs, np.bool_)
         verdict = np.where(which < 0, "moves on", np.where(dying, "dies away", "shakes"))
-        times = settled[:, self.positions]
-        calm = ~np.isnan(times).any(axis=1)
-        whole = (high.max(axis=0) - low.min(axis=0))[:, self.positions]
-        still = calm & ~whole.any(axis=1) & bool(self.positions)
+        times = settled[self.positions]
+        calm = ~np.isnan(times).any(axis=0)
+        whole = (high.max(axis=0) - low.min(axis=0))[self.positions]
+        still = calm & ~whole.any(axis=0) & bool(self.positions)
         verdict = np.where(still, "rests", np.where(calm, "settles", verdict))
         verdict = np.where(stopped, "diverges", verdict)
         seconds = self.ends[-1] - (self.ends[number - tail - 1] if number > tail else 0.0)
         return Judged(
             verdict=verdict,
             settled=settled,
-            settled_at=np.where(verdict == "settles", times.max(axis=1, initial=0.0), np.nan),
+            settled_at=np.where(verdict == "settles", times.max(axis=0, initial=0.0), np.nan),
             swing=swing,
             rate=turns / 2 / seconds if seconds > 0 else np.zeros(turns.shape),
             restless=np.where(calm | stopped, -1, which),
@@ -218,23 +229,23 @@ class Watch:
         """Return what has been seen of the only run; `block` is its last."""
         with np.errstate(over="ignore", invalid="ignore"):  # of what has diverged
             judged = self.judged(stopped=bool(block.stopped))
-        signals = self.listed
-        listed = [None if np.isnan(one) else float(one) for one in judged.settled[0]]
+        signals, (low, high) = self.listed, self._tables()
+        listed = [None if np.isnan(one) else float(one) for one in judged.settled[:, 0]]
         extents = tuple(
             Extent(one.name, one.unit, float(first), float(last), float(least), float(most), since)
             for one, first, last, least, most, since in zip(
                 signals,
                 self.first,
                 self.last,
-                self.low.min(axis=0),
-                self.high.max(axis=0),
+                low[:, :, 0].min(axis=0),
+                high[:, :, 0].max(axis=0),
                 listed,
                 strict=True,
             )
         )
         verdict, restless = str(judged.verdict[0]), int(judged.restless[0])
         swing = (
-            (signals[restless].name, float(judged.swing[0, restless]), float(judged.rate[0, restless]))
+            (signals[restless].name, float(judged.swing[restless, 0]), float(judged.rate[restless, 0]))
             if restless >= 0
             else None
         )
@@ -264,16 +275,18 @@ class Watch:
         Name, unit, and distances (runs,).
         """
         signals = self.listed
-        last = self.last.reshape(self.runs, -1)
+        last = self.last.reshape(-1, self.runs)
         found = []
         for name in self.simulation.sent:
             here = [i for i, one in enumerate(signals) if one.local == name and one.unit in ("m", "rad")]
             if len(here) > 1:
-                found.append((name, signals[here[0]].unit, np.ptp(last[:, here], axis=1)))
+                found.append((name, signals[here[0]].unit, np.ptp(last[here], axis=0)))
         return found
 
-    def _of_runs(self, table: Floats) -> Floats:
-        return table.reshape(len(table), self.runs, self.signals)
+    def _tables(self) -> tuple[Floats, Floats]:
+        """Return the least and the largest values of every bucket (buckets, signals, runs)."""
+        shape = (len(self.ends), self.signals, self.runs)
+        return self.low[: len(self.ends)].reshape(shape), self.high[: len(self.ends)].reshape(shape)
 
     def _settled(self, low: Floats, high: Floats) -> Floats:
         """Return when each signal is within its band for good; NaN if that is not well before the end."""
@@ -282,22 +295,22 @@ class Watch:
         span, names = np.empty(own.shape), [one.local for one in self.listed]
         for name in dict.fromkeys(names):  # the largest range among the peers
             here = [i for i, one in enumerate(names) if one == name]
-            span[:, here] = own[:, here].max(axis=1, keepdims=True)
-        last, end = self.last.reshape(self.runs, self.signals), self.ends[-1]
-        outside = (high - last > BAND * span) | (last - low > BAND * span)
+            span[here] = own[here].max(axis=0)
+        last, end = self.last.reshape(self.signals, self.runs), self.ends[-1]
         ends = np.concatenate([[0.0], self.ends])  # of the last bucket outside the band, 0 if there is none
-        after = np.where(outside.any(axis=0), len(outside) - np.argmax(outside[::-1], axis=0), 0)
+        after, band = np.zeros(own.shape, np.int64), BAND * span
+        for begin in range(0, len(low), PASSED):
+            some = slice(begin, begin + PASSED)
+            outside = (high[some] - last > band) | (last - low[some] > band)
+            places = np.arange(1, len(outside) + 1, dtype=np.uint8)[:, None, None]
+            latest = (outside.view(np.uint8) * places).max(axis=0)
+            after = np.where(latest, begin + latest.astype(np.int64), after)
         return np.where(ends[after] <= LATE * end, ends[after], np.nan)
 
 
 def is_position(signal: Signal) -> bool:
     """Say whether a signal is a place, which decides whether a motion settles."""
     return signal.role == "state" and signal.unit in ("m", "rad")
-
-
-def _of_every_run(places: Sequence[int], signals: int, runs: int) -> NDArray[np.int64]:
-    """Return the columns of some signals of every run."""
-    return (np.arange(runs)[:, None] * signals + np.array(places, np.int64)).reshape(-1)
 
 
 def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
