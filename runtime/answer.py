@@ -35,7 +35,7 @@ FEW_PEERS = 100
 
 # What is varied is composed hundreds of times, tick by tick: with more ticks in a frame for over ten seconds.
 # Each number costs products of matrices of all states: with more of these together, for as long.
-MOST_TICKS, MOST_PRODUCTS = 500, 250_000_000
+MOST_TICKS, MOST_PRODUCTS = 500, 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)

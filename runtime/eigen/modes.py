@@ -124,10 +124,12 @@ def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loo
         groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
     )
     loops = [Loop("single" if peers == 1 else "common", 1, tuple(groups), weights)]
+    if all(group.count < 2 for group in groups):
+        return tuple(loops)
+    apart = couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
     for place, group in enumerate(groups):
         if group.count < 2:
             continue
-        apart = couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
         own = {key: ((rows[place][place],),) for key, rows in apart.items()}
         name = "difference" if len(groups) == 1 else f"difference {group.name}"
         loops.append(Loop(name, group.count - 1, (group,), own))

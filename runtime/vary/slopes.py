@@ -25,10 +25,10 @@ from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.batch_lift import HOPELESS, PERTURBED_FRAMES, SAFE, lift_rows
-from apc.frame.discretize import UNIT, Step, exponential_rows
+from apc.frame.discretize import FEW_TOGETHER, UNIT, Step, exponential_rows
 from apc.frame.lift import FrameMap, compose, roundings_of, with_roundings
-from apc.frame.linearize import sites_of_rows
-from apc.frame.radius import RADII, radius_of, value_of, with_radius
+from apc.frame.linearize import linearize_rows, sites_of_rows
+from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite, every_matrix
 from apc.vary.batch import STEP, BatchEvaluator, inverse_size, is_beyond, relative_here
@@ -221,25 +221,25 @@ def _site(family: BatchEvaluator, group: PeerGroup, here: Floats) -> _Site:
     built, schedule = group.jacobians, group.schedule
     along = np.eye(len(here)) if len(here) else np.zeros((1, 0))
     vectors = family.vectors(group, here + (STEP * 1j) * along)
-    places = np.flatnonzero(vectors.imag.any(axis=1))
-    rows = family.rows(built, vectors[places] if len(places) else vectors[:1].real)
-    bounded = lift_rows(built, schedule, np.ascontiguousarray(rows.real[:1])).bounded
-    if not len(places):
-        return _Site(bounded, ())
-    moving = rows.imag != 0  # NaN is
-    places, rows = places[moving.any(axis=1)], rows[moving.any(axis=1)]
-    site = sites_of_rows(built, rows)
-    if is_beyond(site.a[:1].real, site.b[:1].real).any():
+    value = linearize_rows(built, np.ascontiguousarray(vectors[:1].real))
+    bounded = lift_rows(built, schedule, value).bounded
+    site = sites_of_rows(built, value)
+    if is_beyond(site.a, site.b).any():
         lost = bounded.mapped(lambda block: block * np.nan)
         return _Site(replace(bounded, p=lost.p, q=lost.q), ())
-    inside = site.a.imag.any(axis=(1, 2)) | site.b.imag.any(axis=(1, 2))
+    places = np.flatnonzero(vectors.imag.any(axis=1))
+    if not len(places):
+        return _Site(bounded, ())
+    rows = family.rows(built, vectors[places]).imag / STEP
+    moving = (rows != 0).any(axis=1)  # NaN is
+    places, rows = places[moving], rows[moving]
     some = max(1, AT_ONCE // bounded.p.shape[-1] ** 2)
     found = []
-    for ones in (np.flatnonzero(inside), np.flatnonzero(~inside)):
-        for first in range(0, len(ones), some):
-            chosen = ones[first : first + some]
-            frame, error = _moved_blocks(sites_of_rows(built, rows[chosen]), schedule, family.durations)
-            found.append(Slopes(places[chosen], _as_one(frame).imag / STEP, _as_one(error)))
+    for first in range(0, len(places), some):
+        chosen = slice(first, first + some)
+        stack = sites_of_rows(built, np.concatenate([value, rows[chosen]]))
+        slopes, errors = _slopes(stack, schedule, family.durations)
+        found.append(Slopes(places[chosen], _as_one(slopes), _as_one(errors)))
     return _Site(bounded, tuple(found))
 
 
@@ -249,60 +249,84 @@ def _as_one(frame: FrameMap) -> Matrices:
     return np.concatenate([above, below], axis=-2)
 
 
-def _moved_blocks(
+def _slopes(
     site: LinearSite, schedule: Schedule, durations: Mapping[int, tuple[float, float]]
 ) -> tuple[FrameMap, FrameMap]:
-    """Return a frame with its slopes as a complex step, and the errors of the slopes.
+    """Return the derivatives of a frame (k, …), and their errors.
 
-    A number with a complex step has a radius with one: what its value and what its slope is off by. Where the
-    slope's says nothing, it is estimated as in `batch_lift`.
+    Where the bound on these says nothing, they are estimated as in `batch_lift`.
+
+    Parameters
+    ----------
+    site
+        The matrices of one point, and below them their derivatives by k parameters, (1 + k, …).
+    schedule, durations
+        What happens in a frame, and the seconds of its steps by quanta.
     """
-    plain, steps = {}, {}
-    a, b = site.a, site.b
-    if not (a.imag.any() or b.imag.any()):
-        a, b = np.ascontiguousarray(a.real[:1]), np.ascontiguousarray(b.real[:1])
-    for quanta, (seconds, _) in durations.items():
-        plain[quanta] = exponential_rows(a * seconds, b * seconds, 1.0).matrix
-        steps[quanta] = _large_step(a, b, seconds)
+    steps = {quanta: _step(site, seconds) for quanta, (seconds, _) in durations.items()}
     off = {
-        quanta: with_radius(plain[quanta].astype(np.complex128), 2 * step.roundings * UNIT * step.matrix)
+        quanta: with_radius(step.matrix, 2 * step.roundings * UNIT * step.size)
         for quanta, step in steps.items()
     }
-    bounds = compose(with_roundings(site), schedule, off, numbers=RADII)
-    frame = bounds.mapped(value_of)
-    error = bounds.mapped(lambda one: radius_of(one).imag / STEP)
-    slope = frame.mapped(lambda one: np.abs(one.imag) / STEP)
-    roundings = roundings_of(site, schedule, steps)
-    if not (error.largest <= HOPELESS * slope.largest).all():
+    count = len(site.a) - 1
+    bounds = compose(with_roundings(site), schedule, off, numbers=_with_slopes(RADII, count))
+    slopes = bounds.mapped(lambda one: value_of(one)[1:])
+    error = bounds.mapped(lambda one: radius_of(one)[1:])
+    size = slopes.mapped(np.abs)
+    if not (error.largest <= HOPELESS * size.largest).all():
+        roundings = roundings_of(site, schedule, steps)
         random = np.random.default_rng(len(schedule.events))
 
-        def moved(matrix: Matrices) -> Matrices:
-            by = roundings * UNIT * random.uniform(-1, 1, (2, *matrix.shape))
-            return np.asarray(matrix.real * (1 + by[0]) + 1j * (matrix.imag * (1 + by[1])))
+        def moved(matrix: Floats) -> Floats:
+            return np.asarray(matrix * (1 + roundings * UNIT * random.uniform(-1, 1, matrix.shape)))
 
-        error = slope.mapped(lambda one: roundings * UNIT * one)
+        error = size.mapped(lambda one: roundings * UNIT * one)
         for _ in range(PERTURBED_FRAMES):
             other = compose(
-                every_matrix(site, moved), schedule, {quanta: moved(step) for quanta, step in plain.items()}
+                every_matrix(site, moved),
+                schedule,
+                {quanta: moved(step.matrix) for quanta, step in steps.items()},
+                numbers=_with_slopes(FLOATS, count),
             )
-            error = error.mapped(
-                lambda e, a, b: np.maximum(e, SAFE * np.abs(a.imag - b.imag) / STEP), frame, other
-            )
-    return frame, error
+            error = error.mapped(lambda e, a, b: np.maximum(e, SAFE * np.abs(a - b[1:])), slopes, other)
+    return slopes, error
 
 
-def _large_step(a: Matrices, b: Matrices, seconds: float) -> Step:
-    """Return the magnitudes of a step and of its slope, with its roundings.
+def _with_slopes(numbers: Arithmetic, count: int) -> Arithmetic:
+    """Return the arithmetic of values, so many slopes below each (1 + count, …): (l r)′ = l r′ + l′ r."""
+
+    def multiply(left: Matrices, right: Matrices) -> Matrices:
+        found = numbers.multiply(left[:1], right)
+        moved = 1 + np.flatnonzero(left[1:].any(axis=tuple(range(1, left.ndim))))
+        if len(moved):
+            found[moved] = numbers.add(found[moved], numbers.multiply(left[moved], right[:1]))
+        return found
+
+    def exact(value: Matrices) -> Matrices:
+        one = numbers.exact(value)
+        return np.concatenate([one[None], np.zeros((count, *one.shape))])
+
+    return Arithmetic(multiply, numbers.add, numbers.subtract, exact)
+
+
+def _step(site: LinearSite, seconds: float) -> Step:
+    """Return a step (1 + k, n_x, n_x + n_u), its derivatives below it, and the magnitudes of both.
 
     [F G]′ is the integral of F(T − s) [A′ B′] [F(s) G(s); 0 1] over s from 0 to T; what F reaches in between
     is taken from both ends and the middle.
     """
-    step = exponential_rows(a[:1].real, b[:1].real, seconds)  # it is one point's
-    half = exponential_rows(a[:1].real, b[:1].real, seconds / 2).matrix
-    n_x, n_u = b.shape[-2:]
+    (a, b), n_x, n_u = (site.a, site.b), *site.b.shape[-2:]
+    step = exponential_rows(a[:1], b[:1], seconds)
+    half = exponential_rows(a[:1], b[:1], seconds / 2).matrix
+    found, size = np.zeros((2, len(a), n_x, n_x + n_u))
+    found[:1], size[:1] = step.matrix, np.maximum(np.abs(step.matrix), step.size)
+    moved = 1 + np.flatnonzero(a[1:].any(axis=(1, 2)) | b[1:].any(axis=(1, 2)))
+    # Of a large site one by one, as its own products leave out the zeros.
+    for some in np.split(moved, len(moved) if n_x > FEW_TOGETHER else 1) if len(moved) else ():
+        near, pushed = (one[:1] + (STEP * 1j) * one[some] for one in (a, b))
+        found[some] = exponential_rows(near, pushed, seconds).matrix.imag / STEP
     whole = np.maximum(np.maximum(step.size, np.abs(half)), np.eye(n_x, n_x + n_u))
-    below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (*whole.shape[:-2], n_u, n_x + n_u))
-    moved = np.concatenate([np.abs(a.imag), np.abs(b.imag)], axis=-1)
-    slope = whole[..., :n_x] @ moved @ np.concatenate([whole, below], axis=-2)
-    large = np.maximum(np.abs(step.matrix), step.size)
-    return Step(large + 1j * seconds * slope, large, step.roundings)
+    below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (1, n_u, n_x + n_u))
+    slopes = np.abs(np.concatenate([a[moved], b[moved]], axis=-1))
+    size[moved] = seconds * (whole[..., :n_x] @ slopes @ np.concatenate([whole, below], axis=-2))
+    return Step(found, size, step.roundings)
