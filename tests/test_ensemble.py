@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.simulation import ensemble, summary
 from apc.simulation.blocks import pushes
 from apc.simulation.ensemble import PART, Ensemble, Run, play_many, share_interval
 from apc.simulation.native import compiler
@@ -48,12 +49,12 @@ def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it() -> None:
 def test_run_0_is_the_run_that_is_played_alone() -> None:
     system = compiled(SHAKY)
     [alone] = play_many(system, Settings(Fraction(1, 2), seed=3, jit=False), runs=1).runs
-    summary, _ = play(prepare(system, Settings(Fraction(1, 2), seed=3, jit=False)), [])
-    assert summary.largest_force is not None
+    one, _ = play(prepare(system, Settings(Fraction(1, 2), seed=3, jit=False)), [])
+    assert one.largest_force is not None
     assert (alone.verdict, alone.settled, alone.largest_force) == (
-        summary.verdict,
-        summary.settled,
-        summary.largest_force[1],
+        one.verdict,
+        one.settled,
+        one.largest_force[1],
     )
 
 
@@ -103,6 +104,16 @@ def test_machine_code_judges_the_runs_as_the_virtual_machine_does() -> None:
         assert (one.number, one.verdict, one.settled) == (other.number, other.verdict, other.settled)
         assert one.largest_force == pytest.approx(other.largest_force, rel=1e-12)
         assert one.copies_apart == pytest.approx(other.copies_apart, abs=1e-15)
+
+
+def test_runs_of_a_scene_without_positions_are_judged_as_one_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (ensemble, summary):
+        monkeypatch.setattr(module, "is_position", lambda _: False)
+    system, how = compiled(SHAKY), Settings(Fraction(1, 10), seed=3)
+    found = play_many(system, how, runs=3).runs
+    alone, _ = play(prepare(system, how), [])
+    assert [one.verdict for one in found] == [alone.verdict] * 3
+    assert [one.copies_apart for one in found] == [None] * 3
 
 
 def test_runs_that_diverge_are_told_from_those_beside_them() -> None:

@@ -233,7 +233,7 @@ def _together(side: _Side, runs: range) -> list[Run]:
             time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
             rows = played.rows if kept.all() else played.rows[kept]
             rows = rows.reshape(len(time), len(simulation.signals), player.runs)
-            watch.take(time, rows[:, list(side.positions)].reshape(len(time), -1))
+            watch.take(time, rows[:, list(side.positions)].reshape(len(time), watch.signals * player.runs))
             low, high = rows.min(axis=0, initial=0.0), rows.max(axis=0, initial=0.0)
             finite &= (np.isfinite(low) & np.isfinite(high)).all(axis=0)
             size = np.maximum(high, -low)[list(side.forces)].max(axis=0, initial=0.0)

@@ -46,6 +46,12 @@ class Stepwise:
         """
         self.population, self.timetable = population, timetable
         self.segments = [[_Moving(m, one) for one in m.program.segments] for m in population.members]
+        # Of each member the rows of its carry that are the work done, and which parts these are.
+        layouts = [m.program.layout for m in population.members]
+        self.work = [
+            (one.work, np.array([population.parts.index(part) for part in one.parts], np.int64))
+            for one in layouts
+        ]
         self.looks: dict[tuple[int, int], Callable[..., Any]] = {}
         self.begin(0)
 
@@ -66,16 +72,13 @@ class Stepwise:
         rows = np.full((count * marks, population.width), np.nan)
         work = np.zeros((count, len(population.parts)))
         seen = self._seen(first, count)
-        for n in range(count):
-            for g, member in enumerate(population.members):
-                for part, done in zip(
-                    member.program.layout.parts, self.carries[g][member.program.layout.work], strict=True
-                ):
-                    work[n, population.parts.index(part)] += done.sum()
-            # Where a solver gives up CasADi prints its arguments, and then the ones that it was called from.
-            with contextlib.redirect_stderr(io.StringIO()), np.errstate(all="ignore"):
+        # Where a solver gives up CasADi prints its arguments, and then the ones that it was called from.
+        with contextlib.redirect_stderr(io.StringIO()), np.errstate(all="ignore"):
+            for n in range(count):
+                for carry, (done, places) in zip(self.carries, self.work, strict=True):
+                    np.add.at(work[n], places, np.add.reduce(carry[done], axis=1))
+                now = [None if one is None else one[n] for one in pushes]
                 try:
-                    now = [None if one is None else one[n] for one in pushes]
                     self._frame(first + n, rows[n * marks : (n + 1) * marks], next(seen, ()), now)
                 except RuntimeError:
                     return Played(rows, work, n)
@@ -83,10 +86,7 @@ class Stepwise:
 
     def in_range(self) -> Flags:
         """Say whether all that moves is still a number (see `Player`)."""
-        moving = (
-            carry[: member.program.layout.work.start]
-            for carry, member in zip(self.carries, self.population.members, strict=True)
-        )
+        moving = (carry[: done.start] for carry, (done, _) in zip(self.carries, self.work, strict=True))
         return np.array([all(bool(np.isfinite(one).all()) for one in (self.packets, *moving))])
 
     def _seen(self, first: int, count: int) -> Iterator[tuple[Seen, ...]]:
@@ -143,7 +143,7 @@ class Stepwise:
         match one:
             case Total(place, key, lag, ranges):
                 row = self._packet(number, key, lag)
-                self.totals[place] = sum(row[begin:end].sum() for begin, end in ranges)
+                self.totals[place] = sum(np.add.reduce(row[begin:end]) for begin, end in ranges)
             case Complete(g, place, total, key, lag, divisor):
                 own: Floats | float = 0.0
                 if key >= 0:

@@ -172,8 +172,8 @@ class Watch:
         self.ends += times.reshape(number, -1)[:, -1].tolist()
         positions = values
         if len(self.positions) < self.signals:
-            positions = values.reshape(len(values), -1, self.runs)[:, self.positions].reshape(len(values), -1)
-        moving = np.concatenate([self.before, positions])
+            positions = values.reshape(len(values), -1, self.runs)[:, self.positions]
+        moving = np.concatenate([self.before, positions.reshape(len(values), self.turns.shape[1])])
         up, down = moving[1:] > moving[:-1], moving[1:] < moving[:-1]
         found = (up[1:] & down[:-1]) | (down[1:] & up[:-1])
         turned = np.zeros((len(values), moving.shape[1]), dtype=np.bool_)
