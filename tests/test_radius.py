@@ -11,8 +11,6 @@ import pytest
 
 from apc.frame.radius import FLOATS, RADII, radius_of, rounded, value_of, with_radius
 
-STEP = 1e-60
-
 
 def _fractions(matrix: Any) -> Any:
     exact = np.empty(matrix.size, dtype=object)
@@ -65,20 +63,6 @@ def test_a_radius_is_of_the_size_of_what_is_rounded() -> None:
         radius_of(RADII.multiply(RADII.exact(np.eye(30)), RADII.exact(b))) <= 4 * 2.0**-53 * np.abs(b)
     ).all()
     assert not radius_of(RADII.multiply(RADII.exact(0 * a), RADII.exact(b))).any()
-
-
-def test_of_a_complex_step_the_slope_has_a_radius_of_its_own() -> None:
-    """The product of A + hA′ and B + hB′ has the slope A′B + AB′."""
-    random = np.random.default_rng(4)
-    a, b, slope_a, slope_b = (_wild(random, 5, 5) for _ in range(4))
-    found = RADII.multiply(rounded(a + 1j * STEP * slope_a), rounded(b + 1j * STEP * slope_b))
-    exact = [_fractions(one) for one in (a, b, slope_a, slope_b)]
-    slope = exact[2].dot(exact[1]) + exact[0].dot(exact[3])
-    square = 2 * STEP**2 * np.abs(slope_a) @ np.abs(slope_b)  # of the step counts as 0
-    assert _within(with_radius(value_of(found).real, radius_of(found).real + square), exact[0].dot(exact[1]))
-    own = value_of(found).imag / STEP
-    divided = 4 * 2.0**-53 * np.abs(own)  # by STEP, which rounds as STEP itself is rounded
-    assert _within(with_radius(own, radius_of(found).imag / STEP + divided), slope)
 
 
 def test_many_at_once_are_what_each_is_alone() -> None:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
-from apc.frame.radius import FLOATS, RADII, Arithmetic, magnitude, radius_of, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
 from apc.frame.site import LinearSite, every_matrix
 
@@ -175,7 +175,7 @@ def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, S
 def with_roundings(site: LinearSite) -> LinearSite:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
     charge = COEFFICIENT_ROUNDINGS * UNIT
-    return every_matrix(site, lambda matrix: with_radius(matrix, charge * magnitude(matrix)))
+    return every_matrix(site, lambda matrix: with_radius(matrix, charge * np.abs(matrix)))
 
 
 def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:

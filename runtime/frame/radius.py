@@ -1,15 +1,13 @@
 """What the kernel computes with: floats, or floats that carry their radius.
 
-Takes: matrices of floats, real or with a complex step, and bounds on what their entries are off by.
+Takes: matrices of real floats, and bounds on what their entries are off by.
 Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`.
 Guarantees: a sum or product in `RADII` holds that of all matrices within the radii of its operands, its own
 rounding and that of the radius included.
 Does not: divide; carry rational numbers or balls of many digits (see `balls`).
 
 A matrix with its radius has a third axis from the end, (…, 2, n, m): its entries, and how far each may be
-off. A row (2, m) and a single number (2,) have it first. Of a number with a complex step, value + i·h·slope
-with h² ≈ 0, the radius has both, too: a product of magnitudes of such numbers is the magnitude of all that
-its value and its slope add up.
+off. A row (2, m) and a single number (2,) have it first.
 
 A sum of k products is off by at most γ_k = k·u/(1 − k·u) times the same sum of magnitudes (Higham, Accuracy
 and Stability of Numerical Algorithms, section 3.1), in whatever order it is added up. Terms that are exactly
@@ -53,7 +51,7 @@ def with_radius(value: Matrix, radius: Matrix) -> Matrix:
 
 def rounded(value: Matrix) -> Matrix:
     """Return matrices (…, n, m) of which each entry was rounded once, with their radii."""
-    return with_radius(value, UNIT * magnitude(value))
+    return with_radius(value, UNIT * np.abs(value))
 
 
 def value_of(matrix: Matrix) -> Matrix:
@@ -66,31 +64,22 @@ def radius_of(matrix: Matrix) -> Matrix:
     return matrix[..., 1, :, :]
 
 
-def magnitude(value: Matrix) -> Matrix:
-    """Return |value|, or |value| + i·h·|slope| of numbers with a complex step."""
-    if value.dtype.kind == "c":
-        return np.asarray(np.abs(value.real) + 1j * np.abs(value.imag))
-    return np.asarray(np.abs(value))
-
-
 def _multiply(left: Matrix, right: Matrix) -> Matrix:
     """Return the product of matrices with their radii; NaN or infinite where a bound is."""
     a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
     terms = a.shape[-1]
     if terms > FEW:  # a term is none where its factor is exactly 0
         terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
-    number = np.result_type(a, b)
-    terms = 2 + (2 * terms if number.kind == "c" else terms)  # of a complex step each is a sum of two
-    charge = terms * UNIT / (1 - terms * UNIT)
+    charge = (terms + 2) * UNIT / (1 - (terms + 2) * UNIT)
     many = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
-    found = np.empty((*many, 2, a.shape[-2], b.shape[-1]), dtype=number)
+    found = np.empty((*many, 2, a.shape[-2], b.shape[-1]), dtype=np.float64)
     np.matmul(a, b, out=value_of(found))
     # Each radius is as much larger as adding it up may have rounded it down. Of many matrices writing and
     # fetching their numbers takes longer than computing them: nothing is written twice.
-    size = magnitude(b)
+    size = np.abs(b)
     weight = (1 + 2 * charge) * off_b
     weight += charge * size
-    off = np.matmul(magnitude(a), weight, out=radius_of(found))
+    off = np.matmul(np.abs(a), weight, out=radius_of(found))
     if off_a.any():
         size += off_b
         size *= 1 + 2 * charge
@@ -104,7 +93,7 @@ def _added(left: Matrix, right: Matrix, values: Callable[[Matrix, Matrix], Matri
     found = values(left, right)  # the radii are added up below
     value, off = value_of(found), radius_of(found)
     np.add(radius_of(left), radius_of(right), out=off)
-    off += UNIT * magnitude(value)
+    off += UNIT * np.abs(value)
     off *= 1 + 4 * UNIT
     return found
 
