@@ -98,7 +98,7 @@ class _LateSheet:
         turned = -turn * (sent[:, :, :n_z] @ inverse[:, :n_z])
         number, unit = values.astype(np.intp), np.eye(sent.shape[1])
         value, turning = np.zeros((2, len(values), len(points)), np.complex128)
-        for which in np.unique(self.alike[number]).tolist():
+        for which in sorted(set(self.alike[number].tolist())):
             heard = self.loops.heard[:, which, None]
             back, back_turned = sent @ heard, turned @ heard
             for row in np.flatnonzero(self.alike[number] == which).tolist():
