@@ -38,7 +38,7 @@ from apc.frame.parameters import Numbers, exact_numbers, resolve
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.scheduling import build_schedules
 from apc.frame.site import LinearSite
-from apc.threads import single_threaded
+from apc.threads import load_pool, single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -247,12 +247,11 @@ class _Part:
         self.units, self.norm, n = np.ones(len(states)), np.inf, len(states)
         if n <= FEW_TOGETHER:
             return
-        import scipy.linalg
-
         dense = np.zeros((n, n))
         for i, row in enumerate(self.rows):
             dense[i, [j for j, _ in row]] = [float(one) for _, one in row]
-        balanced, (units, _) = scipy.linalg.matrix_balance(dense, permute=False, separate=True)
+        balance = load_pool("scipy.linalg").matrix_balance
+        balanced, (units, _) = balance(dense, permute=False, separate=True)
         norm = float(np.abs(balanced).sum(axis=1).max()) * (1 + n * UNIT)
         turns = sum(max(1.0, norm * float(length)) for length in lengths)
         if turns * sum(map(len, self.rows)) * SINGLE < len(set(lengths)) * n**3 * WITHIN:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -63,10 +64,8 @@ def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matri
 def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
     """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
     if len(rows) > MOST_PIVOTED:
-        import scipy.linalg
-
         scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        order = scipy.linalg.qr(scaled, mode="r", pivoting=True, check_finite=False)[1]
+        order = load_pool("scipy.linalg").qr(scaled, mode="r", pivoting=True, check_finite=False)[1]
         return np.sort(order[: len(rows)]).astype(np.intp)
     left = np.array(rows)
     places: list[int] = []

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]  # float64 or complex128
@@ -192,9 +193,7 @@ def exponential(
     """
     units = np.ones(len(a))
     if len(a) > FEW_TOGETHER:
-        import scipy.linalg
-
-        a, (units, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
+        a, (units, _) = load_pool("scipy.linalg").matrix_balance(a, permute=False, separate=True)
     step = exponential_rows(a[None], b[None] / units[:, None], seconds, rounded=rounded)
     whole = units[:, None] / np.concatenate([units, np.ones(b.shape[1])])
     return Step(step.matrix[0], step.size[0], step.roundings), whole

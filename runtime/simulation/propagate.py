@@ -209,8 +209,10 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
     """
     n_x, width = len(rates_of.kind.states), len(rates_of.kind.states) + len(rates_of.kind.holds) + 1
     flat = np.asarray(rates_of.matrices.map(len(vectors))(vectors.T), np.float64).T
-    keys = np.ascontiguousarray(flat + 0.0).view(np.dtype((np.void, flat.shape[1] * flat.itemsize or 1)))
-    _, first, which = np.unique(keys.reshape(len(vectors), -1)[:, 0], return_index=True, return_inverse=True)
+    # One column at least, and no −0.
+    told = np.ascontiguousarray(np.hstack([flat, np.zeros((len(flat), 1))]) + 0.0)
+    keys = told.view(np.dtype((np.void, told.shape[1] * told.itemsize)))[:, 0]
+    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
     exactly = np.ones(len(first), np.bool_)
     found = [np.empty((len(first), n_x, width)) for _ in durations]
     if len(first) > MOST_EXACT:
