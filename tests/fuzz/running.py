@@ -130,7 +130,9 @@ def _warm_up() -> None:
     for name in _WarmLibrary.builtin.component_names:
         _WarmLibrary.builtin.component(name)
     pipeline.Library = _WarmLibrary  # type: ignore[misc] # for the fuzzer's own processes
-    importlib.import_module("numpy.ma")  # NumPy loads it when it first meets some arrays, and compiles text
+    # What is loaded when it is first needed, and compiles text then: for a hint, for a large scene.
+    for module in ("numpy.ma", "numpy.random", "difflib", "tempfile", "traceback", "scipy.linalg"):
+        importlib.import_module(module)
     for scene in ("three-users-average", "finger", "users-table"):
         run_stages(MODELS / "scenes" / f"{scene}.yaml", until="compiled")
     before = Path.cwd()
