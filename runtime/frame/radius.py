@@ -4,7 +4,8 @@ Takes: matrices of real floats, and bounds on what their entries are off by.
 Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`.
 Guarantees: a sum or product in `RADII` holds that of all matrices within the radii of its operands, its own
 rounding and that of the radius included.
-Does not: divide; carry rational numbers or balls of many digits (see `balls`).
+Does not: divide; carry rational numbers or balls of many digits (see `balls`); charge what underflows, less
+than 1e-307 a product.
 
 A matrix with its radius has a third axis from the end, (…, 2, n, m): its entries, and how far each may be
 off. A row (2, m) and a single number (2,) have it first.
