@@ -160,6 +160,16 @@ def test_so_do_other_graphs_clocks_and_groups(name: str, tmp_path: Path) -> None
     np.testing.assert_allclose(same, plain, rtol=0, atol=1e-12 * np.abs(plain).max())
 
 
+@pytest.mark.parametrize("jit", [False, True])
+def test_how_finely_time_is_counted_changes_nothing(jit: bool) -> None:
+    """A delay longer by 1e-13 s makes quanta of that, and 2 s of them more than a half of 2^63 parts hold."""
+    coarse = apart(AVERAGE, "jitter: 25 ms, distribution: pareto, reorder: all")
+    fine = replaced(coarse, ("delay: 8 ms, j", "delay: 8.0000000001 ms, j"))
+    scenes = [prepare(compiled(one), Settings(Fraction(2), jit=jit)) for one in (coarse, fine)]
+    assert [one.quantum for one in scenes] == [MS, Fraction(1, 10**13)]
+    np.testing.assert_array_equal(*map(rows_of, scenes))
+
+
 def test_a_link_that_loses_everything_leaves_every_copy_where_it_is_or_holds_the_start() -> None:
     zero = played(compiled(apart(AVERAGE, "loss: 100 %, on_loss: zero")), duration=Fraction(4))
     names = [f"user[{i}].cube.x" for i in (1, 2, 3)]

@@ -116,3 +116,17 @@ def test_too_many_ways_are_refused() -> None:
         len(timetable(system_of("loss: 1 %, graph: ring", ("count: 3", "count: 500"))).routes[0].pairs)
         == 1000
     )
+
+
+@pytest.mark.parametrize("on_loss", ["hold", "zero"])
+def test_a_delay_of_more_parts_than_can_be_counted_is_refused(on_loss: str) -> None:
+    system = system_of(f"loss: 1 %, on_loss: {on_loss}", ("delay: 8 ms,", "delay: 2 s,"))
+    with pytest.raises(ApcError, match=r"E892 lan is unreliable, .* parts of 1e-12 s"):
+        timetable(system, quantum=Fraction(1, 10**12))
+
+
+def test_more_packets_on_their_way_than_can_be_kept_are_refused() -> None:
+    """A thousand peers, 999,000 ways; 10 s are 1,250 packets of each."""
+    changes = ("count: 3", "count: 1000"), ("delay: 8 ms,", "delay: 10 s,")
+    with pytest.raises(ApcError, match=r"E892 lan is unreliable, .* 999000 ways .* at most 536870912"):
+        timetable(system_of("loss: 1 %", *changes))

@@ -30,13 +30,15 @@ Flags = NDArray[np.bool_]
 
 # Ways from peer to peer: of each some packets are on their way, and 200 bytes are kept.
 MOST_WAYS = 2_000_000
+# Packets on their way on all ways of a link: 2 GiB of places in lists of 31 bits (see `engine.c`).
+MOST_PACKETS = 2**29
 
 START = -1  # the "packet" before the first: the sender's start values
 
 # Arrivals are told apart down to this part of a quantum; everything that happens at ticks happens at whole
 # quanta. A delay of some whole quanta, written as a float of seconds, is then that number exactly.
 FINENESS = 2**20
-# No delay is longer than so many quanta: beyond, a packet counts as lost (and integers would overflow).
+# No delay or frame is longer than so many quanta: integers of their parts would overflow.
 LONGEST = 2**40
 
 
@@ -95,15 +97,15 @@ class Luck:
 
     def kept(self, route: Route) -> int:
         """Return how many packets of a way may be sent before the first of them is heard, or missed."""
-        return route.slots * (self._latest(route) // (route.ticks * self.tick_period) + 3)
+        return route.slots * (self.latest(route) // (route.ticks * self.tick_period) + 3)
 
     def buckets(self, route: Route) -> int:
         """Return how many ticks may be before the first to see a packet, from the frame on that sends it."""
-        return self._latest(route) // self.tick_period + 2 * route.ticks + 2
+        return self.latest(route) // self.tick_period + 2 * route.ticks + 2
 
-    def _latest(self, route: Route) -> int:
-        longest = max(route.longest, float(self.delays.max(initial=0.0)))
-        return math.ceil(min(longest / float(self.quantum), LONGEST)) + 1
+    def latest(self, route: Route) -> int:
+        """Return the quanta within which a packet of a way has arrived, or is missed."""
+        return math.ceil(max(route.longest, float(self.delays.max(initial=0.0))) / float(self.quantum)) + 1
 
 
 def luck_of(
@@ -131,14 +133,15 @@ def luck_of(
     Raises
     ------
     ApcError
-        E891 a group sets a number of the link for itself.
+        E891 a group sets a number of the link for itself; E892 too many packets on their way, or times too
+        long for so small a quantum.
     """
     link = exchange.links[route.link]
     assert link.channel is not None
     grids = {one.name: (timings[one.phase] / quantum, timings[one.period] / quantum) for one in system.clocks}
     groups, of_way = _groups(exchange, route.pairs)
     late = [timings[exchange.delay(link.name, *pair)] for pair in groups]
-    return Luck(
+    luck = Luck(
         law=channel_law(system, link, timings[link.delay]),
         delays=np.array([float(one) for one in late])[of_way],
         nominal=np.array([int(one / quantum) for one in late], np.int64)[of_way],
@@ -149,6 +152,27 @@ def luck_of(
         quantum=quantum,
         newest=link.channel.reorder == "newest",
     )
+    _check_luck(system, route, luck)
+    return luck
+
+
+def _check_luck(system: CompiledSystem, route: Route, luck: Luck) -> None:
+    """Refuse what could not be followed: too many packets on their way, or too many quanta."""
+    latest, ways = luck.latest(route), len(route.pairs)
+    if max(latest, route.ticks * luck.tick_period) > LONGEST:
+        what = (
+            f"{route.link} is unreliable, and all its times are counted in parts of {float(luck.quantum):.6g} s, "
+            f"of which periods, phases and delays are whole multiples: at most {LONGEST} of them"
+        )
+        raise ApcError(Mistake("E892", Place(system.name), what, hint="periods and delays in whole µs"))
+    packets = luck.kept(route) * ways
+    if packets > MOST_PACKETS:
+        what = (
+            f"{route.link} is unreliable, and on {ways} ways up to {latest * float(luck.quantum):.3g} s long "
+            f"{packets} packets are kept; at most {MOST_PACKETS} can be followed"
+        )
+        hint = "a shorter delay or jitter, fewer peers, or graph: ring"
+        raise ApcError(Mistake("E892", Place(system.name), what, hint=hint))
 
 
 class Listener:

@@ -17,10 +17,11 @@ typedef struct {
   const whole *nominal, *senders, *receivers;     /* of each way: quanta, peers of the scene */
   const whole *columns, *keys;                    /* of each way's sender and run; (channels, slots) */
   double *held;                                   /* (channels, ways · runs): what is in effect */
-  whole *effective, *gap, *arrived;               /* (ways · runs,): numbers, and when the first arrived */
+  whole *effective, *gap, *arrived;               /* (ways · runs,): numbers, and the tick that first saw it */
   int8_t *bad;                                    /* (ways · runs,) */
   int32_t *heads, *next;                          /* (buckets,), (kept, ways · runs): packets by their tick */
-  whole *when;                                    /* (kept, ways · runs), where the order of arrival matters */
+  whole *waits;                                   /* (kept, ways · runs), where the order of arrival matters:
+                                                     from its arrival to its tick, in parts of a quantum */
   uint64_t key[2];                                /* of the first run */
   whole heard;                                    /* ticks so far */
 } Route;
@@ -138,9 +139,16 @@ static int draw(Route *r, whole number) {
     int32_t *head = r->heads + (bucket + ticks < r->buckets ? bucket + ticks : bucket + ticks - r->buckets), id = (int32_t)(2 * (slot * all + w) + lost);
     next[w] = *head;
     *head = id;
-    if (r->when && !lost) r->when[slot * all + w] = sent * ONE + fine;
+    if (r->waits && !lost) r->waits[slot * all + w] = (ticks * r->tick_period - since) * ONE + (ONE - fine % ONE) % ONE;
   }
   return 0;
+}
+
+/* Say whether a packet arrived before the one in effect, or with it but sent before; both since the last tick. */
+static inline int is_before(const Route *r, whole w, whole number) {
+  const whole all = r->ways * r->runs, other = r->effective[w];
+  whole wait = r->waits[number % r->kept * all + w], its = r->waits[other % r->kept * all + w];
+  return wait > its || (wait == its && number < other);
 }
 
 /* Bring in effect what a tick is the first to see. `newest` is the number of the packet sent last. */
@@ -156,12 +164,9 @@ static void deliver(const Plan *plan, Route *r, whole tick, whole newest) {
         if (number > r->gap[w]) r->gap[w] = number;
         continue;
       }
-      if (r->newest ? number < r->effective[w]
-                    : r->when[slot * all + w] < r->arrived[w] ||
-                        (r->when[slot * all + w] == r->arrived[w] && number < r->effective[w]))
-        continue;
+      if (r->newest ? number < r->effective[w] : r->arrived[w] == r->heard && is_before(r, w, number)) continue;
       r->effective[w] = number;
-      if (!r->newest) r->arrived[w] = r->when[slot * all + w];
+      r->arrived[w] = r->heard;
       whole frames_ago = quotient(ago, r->slots), kept = frame - frames_ago;
       const whole *keys = r->keys + r->slots - 1 - (ago - frames_ago * r->slots);
       if (kept < 0) kept += plan->frames_kept;

@@ -236,7 +236,7 @@ def _together(side: _Side, runs: range) -> list[Run]:
             watch.take(time, rows[:, list(side.positions)].reshape(len(time), watch.signals * player.runs))
             low, high = rows.min(axis=0, initial=0.0), rows.max(axis=0, initial=0.0)
             finite &= (np.isfinite(low) & np.isfinite(high)).all(axis=0)
-            size = np.maximum(high, -low)[list(side.forces)].max(axis=0, initial=0.0)
+            size = np.maximum(abs(high), abs(low))[list(side.forces)].max(axis=0, initial=0.0)
             largest = np.maximum(largest, size)
         finite &= player.in_range()
         found = _amounts(watch, runs, largest if side.forces else None)

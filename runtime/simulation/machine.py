@@ -113,7 +113,7 @@ ROUTE = _fields(
     ("distribution traced", WHOLE),
     ("p r one_minus_h one_minus_k bad_share jitter quantum", NUMBER),
     ("trace delays nominal senders receivers columns keys held effective gap arrived bad", ADDRESS),
-    ("heads next when key0 key1", ADDRESS),
+    ("heads next waits key0 key1", ADDRESS),
     ("heard", WHOLE),
 )
 MEMBER = _fields(
@@ -488,7 +488,7 @@ class Machine:
             next=self._own(np.empty((kept, ways), np.int32)),
         )
         if not luck.newest:
-            record["when"] = self._own(np.empty((kept, ways), np.int64)).ctypes.data
+            record["waits"] = self._own(np.empty((kept, ways), np.int64)).ctypes.data
         return record
 
     def _columns(self, places: Integers) -> Integers:
