@@ -150,7 +150,7 @@ E887 runtime: a table needs a library that is not installed
 E888 runtime/sweeps: a cluster can't compute
 E889 runtime runtime/cli runtime/sweeps: processes can't compute, or not for ever
 E891 runtime/network: a link's law of packets can't differ by group
-E892 runtime/network: too many ways with packets of their own, or too many of these, or in too fine parts of time
+E892 runtime/network: too many ways or packets to follow, or in too fine parts of time
 E893 runtime/simulation: a missing value has no own one to stand in for it
 E894 runtime/simulation: nothing is left to chance
 E895 runtime/simulation: a process that played runs ended
