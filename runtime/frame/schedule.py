@@ -2,7 +2,7 @@
 
 Takes: what `scheduling` found out.
 Gives: `Schedule` and its events, `Event`; `Repeats`, `HELD`; the names of what is computed, sent and heard;
-`shifted`, `remembered`; `ORDER`.
+`shifted`, `remembered`; `tick_by_tick`; `ORDER`.
 Guarantees: exact time (integers of one quantum).
 Does not: find out what happens when (see `scheduling`).
 
@@ -13,7 +13,7 @@ tick `index`, counted from the frame's first tick of that clock; a negative inde
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 # The order of coincident events. Continuous variables are continuous, so sampling needs no place in it.
@@ -200,3 +200,12 @@ class Schedule:
         ticks = [one for one in self.events if isinstance(one, Tick) and one.partition == partition]
         heard = [self.heard[row] for tick in ticks for row in tick.heard[receive]]
         return tuple(dict.fromkeys((one.way, one.sent.channel) for one in heard))
+
+
+def tick_by_tick(schedule: Schedule) -> Schedule:
+    """Return a schedule that hears what is selected, as if that were the first packet of a frame.
+
+    Its rows of r are those of `schedule.selected`, in order.
+    """
+    heard = tuple(Heard(row.way, Sent(row.way.link, row.channel, 0), 0) for row in schedule.selected)
+    return replace(schedule, heard=heard, selected=())

@@ -30,7 +30,7 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.frame.hyperperiod import ClockGrid, Times
 from apc.frame.names import Free
 from apc.frame.parameters import resolve
-from apc.frame.schedule import Heard, Schedule, Selected, Sent
+from apc.frame.schedule import Schedule, Selected, tick_by_tick
 from apc.frame.scheduling import build_schedules, newest
 from apc.vary.delays import INSIDE, reaches_parameters, system_with_delay, timing_slopes
 from apc.vary.plane import count_beyond
@@ -152,7 +152,7 @@ def late_stretches(
         for name in {row.way.delay for one in schedules for row in one.selected}
     }
     packets = _packets(inside, schedules, delays, prepared.order)
-    apart = {id(one): _by_tick(one) for one in schedules}
+    apart = {id(one): tick_by_tick(one) for one in schedules}
     by_tick = replace(prepared, schedules=tuple(apart[id(one)] for one in schedules), timings=timings)
     selected = {id(apart[id(one)]): one.selected for one in schedules}
     found = np.zeros(len(pieces))
@@ -177,12 +177,6 @@ def _only_late(system: CompiledSystem, free: Free, prepared: Prepared, moving: s
         if acting is not None
     }
     return not moving & held and not reaches_parameters(system, free)
-
-
-def _by_tick(schedule: Schedule) -> Schedule:
-    """Return a schedule that hears what is selected, as if that were the first packet of a frame."""
-    heard = tuple(Heard(row.way, Sent(row.way.link, row.channel, 0), 0) for row in schedule.selected)
-    return replace(schedule, heard=heard, selected=())
 
 
 def _packets(

@@ -1,0 +1,304 @@
+"""The spectral radius of second moments, from how luck drives itself.
+
+Takes: the mean loops of a scene and what the luck of its channels does to them.
+Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`.
+Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
+Does not: know where the loops come from (see `crowd`).
+
+Let V hold the covariances of the luck of one channel of each kind, growing by λ a frame. The means answer to
+it, once for each channel of a kind, with moments Σ_f λ^−f A^(f−1) B V Bᵀ A^(f−1)ᵀ, a Stein equation; of these
+follows how far packets are from what is heard, and of that, by the law of chance, V again: V = G(λ) V. G maps
+covariances to covariances and falls as λ rises, so second moments grow by the λ > ρ(A)² at which the largest
+eigenvalue of G is 1, or by ρ(A)² where it is smaller than 1 all the way down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.eigen.enclosure import enclose_eigenvalues
+from apc.frame.discretize import UNIT
+from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.moments.mean_loops import Channel, MeanLoop, Route
+
+Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
+
+# What is left of a sum that is doubled, relative to the whole: far below any rounding.
+NOTHING = 1e-24
+
+# Doublings until a sum counts as endless: 2^60 frames.
+DOUBLINGS = 60
+
+# Steps towards the radius; secants need some six. The first is so near above the means' own growth.
+STEPS, NEAR = 60, 1e-9
+
+# How near it is enclosed at first, relatively, and how much farther at last.
+FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Luck:
+    """The luck of equal channels, on `route` from each of `senders` peers of class `sender` to each of some.
+
+    Each of the `receivers` peers of class `receiver` hears `heard` of them. `spreads` are the covariances of
+    whether what is uncertain of each slot's packet is replaced, number by number (k_slot, k_slot).
+    """
+
+    route: Route
+    sender: int
+    receiver: int
+    receivers: int
+    heard: int
+    spreads: tuple[Matrix, ...]
+
+    @property
+    def entries(self) -> list[list[tuple[int, int]]]:
+        """The entries (a, b) of each slot's covariance, a ≤ b."""
+        return [
+            [(a, b) for a in range(spread.shape[-1]) for b in range(a, spread.shape[-1])]
+            for spread in self.spreads
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A loop of means: all peers of each class alike (`apart` is None), or those of class `apart` apart.
+
+    `classes` are the peers' classes of its sites; `channels` the kinds of luck, by number, that drive it.
+    """
+
+    loop: MeanLoop
+    apart: int | None
+    classes: tuple[int, ...]
+    channels: Mapping[int, Channel]
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """All loops and all kinds of luck of a scene; `means` are bounds on the means' spectral radius."""
+
+    parts: tuple[Part, ...]
+    luck: tuple[Luck, ...]
+    means: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Enclosed:
+    """The spectral radius of second moments a frame, and bounds on it; infinite where there is none."""
+
+    radius: float
+    low: float
+    high: float
+
+
+def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
+    """Return matrices entry by entry times others, or times numbers."""
+    if numbers is FLOATS:
+        return np.asarray(matrix * by)
+    value, factor, off = value_of(matrix), value_of(by), radius_of(by)
+    product = value * factor
+    radius = radius_of(matrix) * (np.abs(factor) + off) + np.abs(value) * off + UNIT * np.abs(product)
+    return with_radius(product, radius * (1 + 8 * UNIT))
+
+
+def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
+    """Return Σ_k M^k B M^kᵀ of a matrix M (n, n) and matrices B (b, n, n), None where it does not end.
+
+    Notes
+    -----
+    Doubled (Smith, 1968): of 2j terms, the second half is M^j times the first. What is left out after the last
+    doubling is M^j Y M^jᵀ, at most ‖M^j‖² / (1 − ‖M^j‖²) of the largest entry of what is there.
+    """
+    total, power = driven, matrix
+    for _ in range(DOUBLINGS):
+        total = numbers.add(total, _around(power, total, numbers))
+        power = numbers.multiply(power, power)
+        sums = np.abs(power).sum(axis=-1)
+        size = float((sums if numbers is FLOATS else sums.sum(axis=0)).max(initial=0.0))
+        if not np.isfinite(size):
+            return None
+        if size**2 < NOTHING:
+            if numbers is not FLOATS:
+                most = (np.abs(value_of(total)) + radius_of(total)).max(axis=(-2, -1), keepdims=True)
+                radius_of(total)[...] += 2 * size**2 * most
+            return total
+    return None
+
+
+def _around(left: Matrix, inner: Matrix, numbers: Arithmetic, right: Matrix | None = None) -> Matrix:
+    """Return L X Rᵀ, R being L unless given."""
+    other = left if right is None else right
+    return numbers.multiply(numbers.multiply(left, inner), np.swapaxes(other, -1, -2))
+
+
+def gain(of: Moments, growth: float, numbers: Arithmetic = FLOATS) -> Matrix | None:
+    """Return G(λ) over the entries of all covariances of luck, None where the means grow faster.
+
+    Parameters
+    ----------
+    of
+        The loops and their luck.
+    growth
+        λ, what second moments grow by in a frame.
+    numbers
+        Floats, or floats with their radii.
+    """
+    firsts = np.cumsum([0] + [sum(map(len, one.entries)) for one in of.luck]).tolist()
+    found = _of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
+    shrink, root = _number(1 / growth, numbers), _number(growth**-0.5, numbers)
+    for part in of.parts:
+        for d, channel in part.channels.items():
+            kind = of.luck[d]
+            covariances = _of_kind(RADII.exact(_units(kind)), numbers)
+            driven = scaled(_around(_of_kind(channel.driven, numbers), covariances, numbers), shrink, numbers)
+            moments = stein(scaled(_of_kind(channel.matrix, numbers), root, numbers), driven, numbers)
+            if moments is None:
+                return None
+            answer = _Answer(channel.matrix.shape[-1], moments, covariances, numbers)
+            # One channel drives the mean of all receivers by 1/n, and them apart by 1 − 1/n or −1/n.
+            alone = 1 / kind.receivers
+            share = kind.heard * (alone if part.apart is None else 1 - alone)
+            for (site, route, slot), rows in channel.misses.items():
+                miss = _of_kind(rows, numbers)
+                same = scaled(answer.of(miss, miss), _number(share, numbers), numbers)
+                for c, other in enumerate(of.luck):
+                    if (other.route, other.sender) != (route, part.classes[site]):
+                        continue
+                    moved = same
+                    if c == d:
+                        own = _of_kind(channel.own[slot], numbers)
+                        both = answer.of(miss, own)
+                        both = numbers.add(both, np.swapaxes(both, -1, -2))
+                        factor = _number(alone if part.apart is None else -alone, numbers)
+                        moved = numbers.add(moved, scaled(both, factor, numbers))
+                        if part.apart is None:
+                            moved = numbers.add(moved, answer.of(own, own))
+                    moved = scaled(moved, _of_kind(other.spreads[slot], numbers), numbers)
+                    listed = np.array(other.entries[slot], np.intp).reshape(-1, 2).T
+                    block = np.moveaxis(moved[..., listed[0], listed[1]], 0, -1)
+                    first = firsts[c] + sum(map(len, other.entries[:slot]))
+                    place = np.s_[..., first : first + listed.shape[1], firsts[d] : firsts[d + 1]]
+                    found[place] = numbers.add(found[place], block)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """How states of a part and of a channel answer to each unit of its luck's covariance."""
+
+    states: int
+    moments: Matrix
+    covariances: Matrix
+    numbers: Arithmetic
+
+    def of(self, left: Matrix, right: Matrix) -> Matrix:
+        """Return the moments E[l rᵀ] of linear forms of states and luck."""
+        n, numbers = self.states, self.numbers
+        late = _around(left[..., :n], self.moments, numbers, right[..., :n])
+        return numbers.add(late, _around(left[..., n:], self.covariances, numbers, right[..., n:]))
+
+
+def _units(kind: Luck) -> Floats:
+    """Return a unit of each entry of its covariances, over the luck of all slots (b, k, k)."""
+    sizes = [spread.shape[-1] for spread in kind.spreads]
+    starts = np.cumsum([0, *sizes])
+    found = np.zeros((sum(map(len, kind.entries)), starts[-1], starts[-1]))
+    listed = [(starts[slot] + a, starts[slot] + b) for slot, own in enumerate(kind.entries) for a, b in own]
+    for number, (a, b) in enumerate(listed):
+        found[number, a, b] = found[number, b, a] = 1.0
+    return found
+
+
+def _of_kind(matrix: Matrix, numbers: Arithmetic) -> Matrix:
+    """Return a matrix with its radius as it is, or without it."""
+    return value_of(matrix) if numbers is FLOATS else matrix
+
+
+def _number(value: float, numbers: Arithmetic) -> Matrix:
+    """Return a number that was rounded a few times, to scale by."""
+    if numbers is FLOATS:
+        return np.array(value)
+    return np.array([value, 4 * UNIT * abs(value)]).reshape(2, 1, 1)
+
+
+def mean_square_radius(of: Moments) -> Enclosed:
+    """Enclose what second moments grow by in a frame, for all start states.
+
+    Parameters
+    ----------
+    of
+        The loops and their luck.
+    """
+    low, high = of.means
+    if not np.isfinite(high):
+        return Enclosed(np.nan, 0.0, np.inf)
+    square = (low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT))
+    if not of.luck:
+        return Enclosed((low * high), *square)
+    radius = _radius(of, max(high**2, np.finfo(np.float64).tiny))
+    if radius is None:
+        return Enclosed(low * high, *square)
+    width, below, above = FIRST_WIDTH, square[0], np.inf
+    while width <= LAST_WIDTH and not (np.isfinite(above) and below >= radius * (1 - width / 4)):
+        if not np.isfinite(above) and _compared(of, radius * (1 + width)) is False:
+            above = radius * (1 + width) * (1 + UNIT)
+        if radius * (1 - width) > below and _compared(of, radius * (1 - width)) is True:
+            below = radius * (1 - width) * (1 - UNIT)
+        if np.isfinite(above) and below >= radius * (1 - 1.01 * width):
+            break
+        width *= 8
+    return Enclosed(radius, min(below, radius), max(above, square[1], radius))
+
+
+def _compared(of: Moments, growth: float) -> bool | None:
+    """Say whether second moments grow faster than `growth`, None if that is open."""
+    matrix = gain(of, growth, RADII)
+    if matrix is None or not np.isfinite(matrix).all():
+        return None
+    _, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
+    return True if found.low > 1 else False if found.high < 1 else None
+
+
+def _largest(of: Moments, growth: float) -> float:
+    """Return the largest eigenvalue of G(λ) in floats, infinite where there is none."""
+    with np.errstate(all="ignore"):
+        matrix = gain(of, growth)
+    if matrix is None or not np.isfinite(matrix).all():
+        return np.inf
+    return float(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0))
+
+
+def _radius(of: Moments, least: float) -> float | None:
+    """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
+
+    1/G is followed, which is nearly straight where G has its pole: by secants, halved where they lead astray.
+    """
+    start = least * (1 + NEAR)
+    low, at_low = start, 1 / _largest(of, start) - 1
+    if at_low > 0:
+        return None
+    high = max(least, 1e-3) * 1.1
+    while (at_high := 1 / max(_largest(of, high), np.finfo(np.float64).tiny) - 1) < 0:
+        low, at_low, high = high, at_high, 2 * high
+        if not np.isfinite(high):
+            return None
+    for step in range(STEPS):
+        middle = low - at_low * (high - low) / (at_high - at_low) if step % 3 < 2 else (low + high) / 2
+        found = 1 / max(_largest(of, middle), np.finfo(np.float64).tiny) - 1
+        if found < 0:
+            if low == middle:
+                break
+            low, at_low = middle, found
+        else:
+            if high == middle:
+                break
+            high, at_high = middle, found
+        if high - low <= 4 * UNIT * high or abs(found) <= 4 * UNIT:
+            return middle
+    return (low + high) / 2

@@ -1,0 +1,337 @@
+"""The loops that the mean of all peers moves by, and what one channel's luck does to them.
+
+Takes: the loops of a scene whose ticks each hear by themselves, and what channels remember.
+Gives: `Remembered`, `remember`; `Listened`, `Channel`, `MeanLoop`, `mean_loop`.
+Guarantees: each matrix comes with the radius of its rounding, those of the sites' frames included; rigid
+motions are taken out, which no luck moves.
+Does not: compute second moments (see `gains`).
+
+A channel's memory is what its receiver goes on with (see `memory`). Its mean depends on the sender alone and
+is a state η of the sender, as packets on their way are; what is left, δ = h − η, moves by itself, driven by
+its own luck ξ, and reaches the receiver:
+
+    η⁺ = (1 − π) η + π q        δ⁺ = (1 − π) δ + ξ        ξ = (I − π)(q − η − δ)
+
+ξ has mean 0 whatever came before, and is uncorrelated with that of any other channel or packet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.relative import relative_coordinates
+from apc.frame.discretize import UNIT
+from apc.frame.lift import FrameMap
+from apc.frame.radius import RADII, radius_of, value_of, with_radius
+from apc.frame.schedule import Selected, Sent, Way
+from apc.moments.memory import CHANCE_ROUNDINGS, Memory
+
+Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
+
+# The packets of one link with one delay: what luck is drawn for.
+Route = tuple[str, str]
+
+
+# What stands still is sent as a small fraction of how far it stands aside: a gear's ratio, say.
+FINEST = 10**6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Remembered:
+    """What is remembered of a link's packets with one delay: of each of its `channels` the same."""
+
+    route: Route
+    memory: Memory
+    channels: tuple[str, ...]
+    followed: Followed
+
+
+@dataclass(frozen=True, slots=True)
+class Listened:
+    """A channel on `route`, whose receiver is the site `site` and weighs it by way."""
+
+    site: int
+    route: Route
+    weights: Mapping[Way, Fraction]
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """What the luck of a channel does to a loop.
+
+    `matrix` (2, n + m, n + m) moves the loop's n states and the channel's own m, `driven` (2, n + m, k) is
+    what its luck ξ, slot by slot, does to them. `misses` says how far what is uncertain of each site's
+    packets, by site, route and slot, is from what is sent, over these states and ξ (2, k_slot, n + m + k);
+    `own`, of each slot, what the channel itself adds to that.
+    """
+
+    of: Listened
+    matrix: Matrix
+    driven: Matrix
+    misses: Mapping[tuple[int, Route, int], Matrix]
+    own: tuple[Matrix, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MeanLoop:
+    """A loop of means in relative coordinates: its `matrix` (2, n, n) with its radius."""
+
+    name: str
+    multiplicity: int
+    matrix: Matrix
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """One number a channel remembers, through a frame: over [kept values, packets sent] and over its luck.
+
+    `whole` and `luck` are each value's once all packets are sent; `before` and `luck_before` those of each
+    slot's uncertain values before its packet.
+    """
+
+    whole: Matrix
+    luck: Matrix
+    before: tuple[Matrix, ...]
+    luck_before: tuple[Matrix, ...]
+
+
+def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembered:
+    """Follow what is remembered on a route through a frame."""
+    n_e, slots = memory.chances.shape
+    known = np.zeros((n_e, memory.count + slots))
+    known[np.arange(n_e), memory.old] = 1.0
+    sizes = [len(memory.uncertain(slot)) for slot in range(slots)]
+    luck = np.zeros((n_e, sum(sizes)))
+    before, luck_before = [], []
+    roundings, first = CHANCE_ROUNDINGS, 0
+    for slot in range(slots):
+        uncertain, chance = memory.uncertain(slot), memory.chances[:, slot, None]
+        before.append(_rounded(known[uncertain], roundings))
+        luck_before.append(_rounded(luck[uncertain], roundings))
+        known, luck = (1 - chance) * known, (1 - chance) * luck
+        known[:, memory.count + slot] += chance[:, 0]
+        luck[uncertain, first + np.arange(len(uncertain))] = 1.0
+        first += len(uncertain)
+        roundings += CHANCE_ROUNDINGS + 2
+    return Remembered(
+        *(route, memory, tuple(channels)),
+        Followed(_rounded(known, roundings), _rounded(luck, roundings), tuple(before), tuple(luck_before)),
+    )
+
+
+def _rounded(values: Floats, roundings: int) -> Matrix:
+    """Return numbers made of probabilities by so many roundings, with their radii."""
+    certain = (values == 0) | (values == 1)
+    return with_radius(values, np.where(certain, 0.0, roundings * UNIT * np.maximum(np.abs(values), 1.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Site:
+    """A site with what its receivers remember of it on the mean: its map, whose s holds two kinds of rows.
+
+    `values` says which row is a value that ticks hear, by route, channel and value; `misses` are those of how
+    far a slot's uncertain values are from what is sent.
+    """
+
+    map: FrameMap
+    names: tuple[str, ...]
+    values: Mapping[tuple[Route, str, int], int]
+    misses: Mapping[tuple[Route, int], slice]
+
+
+def _with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> _Site:
+    """Return a site whose state holds what its receivers remember of it on the mean."""
+    plain, row_of = group.lifted.bounded, {one: row for row, one in enumerate(group.schedule.sent)}
+    numbers = [
+        (one, channel)
+        for one in remembered
+        for channel in one.channels
+        if Sent(one.route[0], channel, 0) in row_of
+    ]
+    counts = [one.memory.count for one, _ in numbers]
+    firsts, n_m, n_s = np.cumsum([0, *counts]), sum(counts), len(row_of)
+
+    def over_all(block: Matrix, place: int) -> Matrix:
+        """Return rows over one number's kept values and packets as rows over those of all."""
+        one, channel = numbers[place]
+        found = np.zeros((2, block.shape[-2], n_m + n_s))
+        found[..., firsts[place] : firsts[place + 1]] = block[..., : one.memory.count]
+        for slot in range(one.memory.slots):
+            found[..., n_m + row_of[Sent(one.route[0], channel, slot)]] = block[..., one.memory.count + slot]
+        return found
+
+    rows, kept = [np.zeros((2, 0, n_m + n_s))], [np.zeros((2, 0, n_m + n_s))]
+    values: dict[tuple[Route, str, int], int] = {}
+    misses: dict[tuple[Route, int], slice] = {}
+    count = 0
+    for place, (one, channel) in enumerate(numbers):
+        whole = over_all(one.followed.whole, place)
+        values |= {(one.route, channel, value): count + value for value in range(len(one.memory.old))}
+        rows.append(whole)
+        kept.append(whole[:, one.memory.kept])
+        count += whole.shape[-2]
+    for one in dict.fromkeys(one for one, _ in numbers):
+        for slot in range(one.memory.slots):
+            start = count
+            for place, (other, channel) in enumerate(numbers):
+                if other is not one:
+                    continue
+                held = over_all(one.followed.before[slot], place)
+                sent = np.zeros_like(held)
+                sent[0, :, n_m + row_of[Sent(one.route[0], channel, slot)]] = 1.0
+                rows.append(RADII.subtract(sent, held))
+                count += held.shape[-2]
+            misses[one.route, slot] = slice(start, count)
+    listed, keeping = np.concatenate(rows, axis=-2), np.concatenate(kept, axis=-2)
+    n_z = plain.p.shape[-1]
+    p = np.zeros((2, n_z + n_m, n_z + n_m))
+    p[:, :n_z, :n_z] = plain.p
+    p[:, n_z:, :n_z] = RADII.multiply(keeping[..., n_m:], plain.s)
+    p[:, n_z:, n_z:] = keeping[..., :n_m]
+    q = np.concatenate([plain.q, RADII.multiply(keeping[..., n_m:], plain.d)], axis=-2)
+    s = np.concatenate([RADII.multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
+    d = RADII.multiply(listed[..., n_m:], plain.d)
+    names = [f"{channel} heard" for (_, channel), count in zip(numbers, counts, strict=True) for _ in range(count)]
+    return _Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses)
+
+
+@dataclass(frozen=True, slots=True)
+class _Apart:
+    """What a channel's memory is apart from its mean, over [δ, ξ]: `values`, by number and value; `kept`
+    those of the next frame; `misses` of each slot."""
+
+    values: Matrix
+    kept: Matrix
+    misses: tuple[Matrix, ...]
+
+
+def _apart(one: Remembered) -> _Apart:
+    """Follow what a channel remembers apart from its mean through a frame."""
+    memory, count = one.memory, len(one.channels)
+    sizes = [len(memory.uncertain(slot)) for slot in range(memory.slots)]
+    starts, lucks = np.cumsum([0, *sizes]), np.cumsum([0, *sizes]) * count
+    states = memory.count * count
+
+    def over_all(block: Matrix, luck: Matrix, number: int) -> Matrix:
+        found = np.zeros((2, block.shape[-2], states + lucks[-1]))
+        found[..., number * memory.count : (number + 1) * memory.count] = block[..., : memory.count]
+        for slot, size in enumerate(sizes):
+            first = states + lucks[slot] + number * size
+            found[..., first : first + size] = luck[..., starts[slot] : starts[slot + 1]]
+        return found
+
+    followed = one.followed
+    values = [over_all(followed.whole, followed.luck, number) for number in range(count)]
+    misses = [
+        np.concatenate([over_all(before, luck, number) for number in range(count)], axis=-2)
+        for before, luck in zip(followed.before, followed.luck_before, strict=True)
+    ]
+    return _Apart(
+        np.concatenate(values, axis=-2),
+        np.concatenate([own[:, memory.kept] for own in values], axis=-2),
+        tuple(np.stack([-value_of(rows), radius_of(rows)]) for rows in misses),
+    )
+
+
+def mean_loop(
+    loop: Loop,
+    heard: Sequence[Sequence[Selected]],
+    remembered: Sequence[Remembered],
+    listened: Sequence[Listened],
+    standing: Floats,
+) -> tuple[MeanLoop, list[Channel]]:
+    """Close a loop of means, and say what the luck of some channels does to it.
+
+    Parameters
+    ----------
+    loop
+        The loop, its sites hearing each tick by itself.
+    heard
+        What each row of r of each site hears.
+    remembered
+        What is remembered on each route.
+    listened
+        The channels.
+    standing
+        The rigid motions over the loop's own z, site after site (Σ n_z, d).
+    """
+    of_route = {one.route: one for one in remembered}
+    sites = [_with_memory(group, remembered) for group in loop.sites]
+    offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
+    starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
+    layout = StateLayout(tuple(offsets[:-1]), tuple(name for one in sites for name in one.names), {})
+    apart = [_apart(of_route[one.route]) for one in listened]
+    firsts = np.cumsum([offsets[-1]] + [one.values.shape[-1] for one in apart]).tolist()
+    feedback = []
+    for g, rows in enumerate(heard):
+        now, before = np.zeros((2, len(rows), starts[-1])), np.zeros((2, len(rows), firsts[-1]))
+        for line, row in enumerate(rows):
+            one = of_route.get((row.way.link, row.way.delay))
+            if one is None or row.channel not in one.channels:
+                continue
+            value = one.memory.heard[row.clock, row.tick]
+            for h, weight in enumerate(loop.coupling[row.way][g]):
+                if weight:
+                    place = starts[h] + sites[h].values[one.route, row.channel, value]
+                    now[:, line, place] = bounded_weight(weight, loop.doubts.get(row.way, 0.0))
+            place = one.channels.index(row.channel) * len(one.memory.old) + value
+            for channel, own, first in zip(listened, apart, firsts, strict=False):
+                if channel.site == g and channel.route == one.route and channel.weights.get(row.way):
+                    weight = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
+                    span = slice(first, first + own.values.shape[-1])
+                    before[:, line, span] = RADII.multiply(weight, own.values[:, place, None])[:, 0]
+        feedback.append(Feedback(now, before))
+    closed = close([one.map for one in sites], feedback, layout, numbers=RADII)
+    at = relative_coordinates(_standing(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
+    rest, n = at.rest, len(at.rest)
+    moved = closed.matrix[:, rest]
+    if len(at.held):
+        weights = with_radius(at.weights, at.doubt)
+        moved = RADII.subtract(moved, RADII.multiply(weights, closed.matrix[:, at.held]))
+    found = []
+    for channel, own, first, last in zip(listened, apart, firsts, firsts[1:], strict=False):
+        states = len(own.kept[0])
+        matrix = np.zeros((2, n + states, n + states))
+        matrix[:, :n, :n], matrix[:, :n, n:] = moved[..., rest], moved[..., first : first + states]
+        matrix[:, n:, n:] = own.kept[..., :states]
+        driven = np.concatenate([moved[..., first + states : last], own.kept[..., states:]], axis=-2)
+        columns = np.concatenate([rest, np.arange(first, last)])
+        misses = {
+            (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
+            for h, site in enumerate(sites)
+            for which, rows in site.misses.items()
+        }
+        within = [np.concatenate([np.zeros((2, rows.shape[-2], n)), rows], axis=-1) for rows in own.misses]
+        found.append(Channel(channel, matrix, driven, misses, tuple(within)))
+    return MeanLoop(loop.name, loop.multiplicity, moved[..., rest]), found
+
+
+def _standing(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequence[int]) -> Floats:
+    """Return rigid motions with what is remembered of them: whatever stands still is heard as it is sent.
+
+    Of rational weights, it is made of small fractions; which of them, the matrix tells.
+    """
+    own = [len(group.lifted.z_names) for group in loop.sites]
+    moving = np.concatenate([offset + np.arange(size) for offset, size in zip(offsets, own, strict=False)])
+    basis = np.zeros((offsets[-1], standing.shape[1]))
+    basis[moving] = standing
+    rest = np.delete(np.arange(offsets[-1]), moving)
+    if not standing.shape[1] or not len(rest):
+        return basis
+    value = value_of(matrix)
+    held = np.linalg.solve(
+        np.eye(len(rest)) - value[np.ix_(rest, rest)], value[np.ix_(rest, moving)] @ standing
+    )
+    basis[rest] = [[float(Fraction(one).limit_denominator(FINEST)) for one in row] for row in held.tolist()]
+    off = RADII.subtract(RADII.multiply(matrix, RADII.exact(basis)), RADII.exact(basis))
+    assert (np.abs(value_of(off)) <= radius_of(off)).all(), "what stands still is heard otherwise"
+    return basis
