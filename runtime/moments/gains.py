@@ -38,6 +38,9 @@ DOUBLINGS = 60
 # Steps towards the radius; secants need some six. The first is so near above the means' own growth.
 STEPS, NEAR = 60, 1e-9
 
+# Where G is first looked for to be small, beside the means' own growth or this; and how near 1 is near enough.
+LEAST, FARTHER, CLOSE = 1e-3, 1.1, 1e-14
+
 # How near it is enclosed at first, relatively, and how much farther at last.
 FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
 
@@ -277,28 +280,30 @@ def _largest(of: Moments, growth: float) -> float:
 def _radius(of: Moments, least: float) -> float | None:
     """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
 
-    1/G is followed, which is nearly straight where G has its pole: by secants, halved where they lead astray.
+    1/G is followed, which is nearly straight where G has its pole: by secants between a point on either side,
+    the one that stays where it is counting half each time (the Illinois rule).
     """
-    start = least * (1 + NEAR)
-    low, at_low = start, 1 / _largest(of, start) - 1
+
+    def over(growth: float) -> float:
+        return 1 / max(_largest(of, growth), np.finfo(np.float64).tiny) - 1
+
+    low, high = least * (1 + NEAR), max(least, LEAST) * FARTHER
+    at_low, at_high = over(low), over(high)
     if at_low > 0:
         return None
-    high = max(least, 1e-3) * 1.1
-    while (at_high := 1 / max(_largest(of, high), np.finfo(np.float64).tiny) - 1) < 0:
+    while at_high < 0:
         low, at_low, high = high, at_high, 2 * high
-        if not np.isfinite(high):
-            return None
-    for step in range(STEPS):
-        middle = low - at_low * (high - low) / (at_high - at_low) if step % 3 < 2 else (low + high) / 2
-        found = 1 / max(_largest(of, middle), np.finfo(np.float64).tiny) - 1
+        at_high = over(high)
+    best, off = (low, -at_low) if -at_low < at_high else (high, at_high)
+    for _ in range(STEPS):
+        middle = low - at_low * (high - low) / (at_high - at_low)
+        if off <= CLOSE or not low < middle < high:
+            break
+        found = over(middle)
+        if abs(found) < off:
+            best, off = middle, abs(found)
         if found < 0:
-            if low == middle:
-                break
-            low, at_low = middle, found
+            low, at_low, at_high = middle, found, at_high / 2
         else:
-            if high == middle:
-                break
-            high, at_high = middle, found
-        if high - low <= 4 * UNIT * high or abs(found) <= 4 * UNIT:
-            return middle
-    return (low + high) / 2
+            high, at_high, at_low = middle, found, at_low / 2
+    return best
