@@ -1,10 +1,10 @@
 """The mean loops and the luck of a scene: what its second moments are made of.
 
 Takes: a `CompiledSystem` whose links lose or delay packets independently of each other.
-Gives: `crowd`.
+Gives: `crowd`; `Hearing`, `hearing`, `own_value`; `peer_classes`, `remembered_of`, `standing_motions`.
 Guarantees: equal peers on complete graphs cost the same, however many they are; peers that can change places
 are one class on any graph.
-Does not: serve what `unserved` names.
+Does not: say what it can't serve (see `network`).
 """
 
 from __future__ import annotations
@@ -12,29 +12,115 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups
-from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop, without_packets
+from apc.compiler.compiled import Clock, CompiledSystem, Kind
+from apc.eigen.closing import Coupling, Loop, without_packets
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
 from apc.eigen.peer_group import PeerGroup, used_ways
 from apc.eigen.rigid import find_rigid_modes
+from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.parameters import resolve
-from apc.frame.radius import RADII, radius_of, value_of, with_radius
-from apc.frame.discretize import UNIT
-from apc.frame.schedule import Schedule, Selected, Way, tick_by_tick
+from apc.frame.radius import radius_of, value_of, with_radius
+from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
 from apc.moments.gains import Luck, Moments, Part
 from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember
-from apc.moments.memory import memory_of
-from apc.network.channel import channel_law
+from apc.moments.memory import CHANCE_ROUNDINGS, memory_of
+from apc.network.channel import ChannelLaw, channel_law
 
 Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
+
+# A link on which every packet takes the nominal delay.
+PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hearing:
+    """The peers of a scene, each tick of theirs hearing by itself: `rows` says what, by the schedule's id."""
+
+    groups: tuple[PeerGroup, ...]
+    exchange: Exchange
+    rows: Mapping[int, tuple[Selected, ...]]
+    timings: Mapping[str, Fraction]
+    frame: Fraction
+    strictly: bool  # a tick misses what arrives just then
+
+    def of(self, loop: Loop) -> list[tuple[Selected, ...]]:
+        """Return what each row of r of each site of a loop hears."""
+        return [self.rows[id(site.schedule)] for site in loop.sites]
+
+
+def hearing(
+    system: CompiledSystem, prepared: Prepared, *, first: Fraction = Fraction(0), stand_in: bool = False
+) -> Hearing:
+    """Lift the peers of a scene with a row of r for each tick that hears.
+
+    Parameters
+    ----------
+    system, prepared
+        As for `crowd`.
+    first
+        When frames begin, in seconds.
+    stand_in
+        Whether peers send, at each tick, what would stand in for a value they miss (see `own_value`).
+    """
+    timings = dict(resolve(system).timings)
+    for clock in system.clocks:
+        timings[clock.phase] = (timings[clock.phase] - first) % timings[clock.period]
+    patterns = [site.pattern for site in prepared.jacobians]
+    kept = {link.name: 0 for link in system.links}
+    schedules = build_schedules(system, timings, patterns, order=prepared.order, kept=kept)
+    apart = {
+        (id(one), group.kind): standing_in(one, system.kinds[group.kind]) if stand_in else tick_by_tick(one)
+        for one, group in zip(schedules, system.groups, strict=True)
+    }
+    by_tick = tuple(apart[id(one), group.kind] for one, group in zip(schedules, system.groups, strict=True))
+    rows = {id(own): one.selected for one, own in zip(schedules, by_tick, strict=True)}
+    moved = replace(system, timings=tuple(replace(one, value=timings[one.name]) for one in system.timings))
+    groups, exchange = lifted_groups(moved, prepared=replace(prepared, schedules=by_tick, timings=timings))
+    strictly = prepared.order.index("tick") < prepared.order.index("deliver")
+    return Hearing(groups, exchange, rows, timings, schedules[0].frame_s, strictly)
+
+
+def own_value(row: Selected) -> Sent:
+    """Return the name of what a peer sends itself at a tick, to stand in for a value it misses."""
+    return Sent(f"{row.way.link} at {row.clock}", row.channel, row.tick)
+
+
+def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
+    """Return `tick_by_tick` of a schedule, with what stands in for missed values sent at the ticks."""
+    partition = {one.link: place for place, one in enumerate(kind.sends)}
+    sent = list(schedule.sent)
+    events: list[Event] = []
+    for event in schedule.events:
+        places = [place for listed in event.heard for place in listed] if isinstance(event, Tick) else []
+        for row in (schedule.selected[place - len(schedule.heard)] for place in places):
+            if row.gap:
+                own = own_value(row)
+                if own not in sent:
+                    sent.append(own)
+                number = partition[row.way.link]
+                channel = kind.sends[number].channels.index(row.channel)
+                events.append(Send(number, ((channel, sent.index(own)),)))
+        events.append(event)
+    more = len(sent) - len(schedule.sent)
+    return replace(
+        tick_by_tick(schedule),
+        events=tuple(events),
+        sent=tuple(sent),
+        depths=(*schedule.depths, *[0] * more),
+        sent_names=(*schedule.sent_names, *[one.link for one in sent[len(schedule.sent) :]]),
+        sent_times=(*schedule.sent_times, *[0] * more),
+        repeats=None,
+    )
 
 
 def crowd(system: CompiledSystem, prepared: Prepared) -> Moments:
@@ -47,128 +133,137 @@ def crowd(system: CompiledSystem, prepared: Prepared) -> Moments:
     prepared
         From `analysis.prepare`, of this system with any numbers.
     """
-    numbers = resolve(system)
-    timings = numbers.timings
-    patterns = [site.pattern for site in prepared.jacobians]
-    kept = {link.name: 0 for link in system.links}
-    schedules = build_schedules(system, timings, patterns, order=prepared.order, kept=kept)
-    apart = {id(one): tick_by_tick(one) for one in schedules}
-    rows = {id(apart[id(one)]): one.selected for one in schedules}
-    by_tick = replace(prepared, schedules=tuple(apart[id(one)] for one in schedules), timings=timings)
-    groups, exchange = lifted_groups(system, prepared=by_tick)
-    loops, weights = _loops(groups, exchange)
-    remembered = _remembered(system, timings, schedules, rows, loops[0], prepared.order)
-    listened = _listened(loops[0], weights, remembered)
-    parts = []
-    means = [0.0, 0.0]
+    told = hearing(system, prepared)
+    loops, weights = peer_classes(told)
+    common = loops[0]
+    remembered = {one.route: one for one in remembered_of(system, told, common)}
+    listened = _listened(common, weights, list(remembered.values()))
     luck = [
         Luck(
             route=one.route,
             sender=g,
             receiver=one.site,
-            receivers=loops[0].sites[one.site].count,
-            heard=loops[0].sites[g].count - (1 if g == one.site else 0),
-            spreads=tuple(_spread(next(r for r in remembered if r.route == one.route), slot)
-                          for slot in range(next(r for r in remembered if r.route == one.route).memory.slots)),
+            receivers=common.sites[one.site].count,
+            heard=common.sites[g].count - (1 if g == one.site else 0),
+            spreads=_spreads(remembered[one.route]),
         )
         for g, one in listened
     ]
+    parts, bounds = [], []
     for place, loop in enumerate(loops):
-        alone = None if place == 0 else next(
-            h for h, site in enumerate(loops[0].sites) if site.name == loop.sites[0].name
-        )
+        alone = _class_apart(loops, place)
         own = {
             d: one if alone is None else replace(one, site=0)
             for d, (_, one) in enumerate(listened)
             if alone is None or one.site == alone
         }
-        standing = find_rigid_modes(without_packets(loop), with_drifts=False).directions
-        z = sum(len(site.lifted.z_names) for site in loop.sites)
         mean, channels = mean_loop(
-            loop,
-            [rows[id(site.schedule)] for site in loop.sites],
-            remembered,
-            list(own.values()),
-            standing[:z],
+            loop, told.of(loop), list(remembered.values()), list(own.values()), standing_motions(loop)
         )
         _, found = enclose_eigenvalues(value_of(mean.matrix), radius_of(mean.matrix))
-        means = [max(means[0], found.low), max(means[1], found.high)]
+        bounds.append((found.low, found.high))
         classes = tuple(range(len(loop.sites))) if alone is None else (alone,)
         parts.append(Part(mean, alone, classes, dict(zip(own, channels, strict=True))))
-    return Moments(tuple(parts), tuple(luck), (means[0], means[1]))
+    low, high = np.max(bounds, axis=0).tolist()
+    return Moments(tuple(parts), tuple(luck), (low, high))
 
 
-def _spread(one: Remembered, slot: int):
-    spread = one.memory.spread(slot)
-    many = np.kron(np.ones((len(one.channels), len(one.channels))), spread)
-    return with_radius(many, 16 * UNIT * np.abs(many))
+def standing_motions(loop: Loop) -> Floats:
+    """Return the rigid motions of a loop over its sites' own states."""
+    states = sum(len(site.lifted.z_names) for site in loop.sites)
+    return find_rigid_modes(without_packets(loop), with_drifts=False).directions[:states]
 
 
-def _loops(groups: Sequence[PeerGroup], exchange: Exchange):
-    """Return the loops, that of all classes first, and one channel's weight by way, receiver and sender."""
-    ways = used_ways(group.schedule for group in groups)
-    if all(exchange.is_complete(way.link) for way in ways):
+def _class_apart(loops: Sequence[Loop], place: int) -> int | None:
+    """Return the class whose peers a loop moves apart, None for that of all alike."""
+    names = [site.name for site in loops[0].sites]
+    return names.index(loops[place].sites[0].name) if place else None
+
+
+def _spreads(one: Remembered) -> tuple[Matrix, ...]:
+    """Return the covariances of each slot's luck: all numbers of a packet have the same."""
+    numbers = np.ones((len(one.channels), len(one.channels)))
+    spreads = [np.kron(numbers, one.memory.spread(slot)) for slot in range(one.memory.slots)]
+    return tuple(with_radius(spread, 2 * CHANCE_ROUNDINGS * UNIT * spread) for spread in spreads)
+
+
+def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
+    """Return the loops of a scene, that of all classes first, and what a peer of one weighs one of another by.
+
+    Peers of a class can change places: each hears all others alike, of its own class too, or none of them.
+    """
+    groups, exchange = told.groups, told.exchange
+    if all(exchange.is_complete(way.link) for way in used_ways(group.schedule for group in groups)):
         degrees = complete_degrees(groups, exchange)
-        one = couple(groups, exchange, lambda way, g, h: Fraction(groups[h].count > (1 if g == h else 0)), degrees)
-        return complete_loops(groups, exchange), one
+
+        def one(way: Way, g: int, h: int) -> Fraction:
+            return Fraction(groups[h].count > (1 if g == h else 0))
+
+        return complete_loops(groups, exchange), couple(groups, exchange, one, degrees)
     whole = dense_loop(groups, exchange)
     loops = split_exchangeable(whole, exchange)
-    places = {int(group.peers[0]): place for place, group in enumerate(whole.sites)}
-    first = [int(site.peers[0]) for site in loops[0].sites]
-    other = [int(site.peers[-1]) for site in loops[0].sites]
+    place = {int(group.peers[0]): number for number, group in enumerate(whole.sites)}
+    first = [place[int(site.peers[0])] for site in loops[0].sites]
+    last = [place[int(site.peers[-1])] for site in loops[0].sites]
     weights = {
         way: tuple(
-            tuple(rows[places[first[g]]][places[other[h] if g == h else first[h]]] if g != h or first[g] != other[g] else Fraction(0)
-                  for h in range(len(first)))
-            for g in range(len(first))
+            tuple(rows[g][last[k] if g == h else h] for k, h in enumerate(first)) for g in first
         )
         for way, rows in whole.coupling.items()
     }
     return loops, weights
 
 
-def _remembered(system, timings, schedules, rows, common: Loop, order) -> list[Remembered]:
-    links = {link.name: link for link in system.links}
-    clocks = {one.name: one for one in system.clocks}
-    frame = schedules[0].frame_s
+def remembered_of(
+    system: CompiledSystem, told: Hearing, common: Loop, *, perfect: bool = False
+) -> list[Remembered]:
+    """Return what is remembered on each route that anybody listens to.
+
+    Parameters
+    ----------
+    system, told
+        The compiled scene and its peers.
+    common
+        The loop of all classes.
+    perfect
+        Whether every packet counts as on time.
+    """
     heard: dict[Route, list[Selected]] = {}
-    for site in common.sites:
-        q = site.lifted.q
-        d = site.lifted.d
-        for row, one in enumerate(rows[id(site.schedule)]):
-            if one.gap or not (q[:, row].any() or d[:, row].any()):
-                continue
-            heard.setdefault((one.way.link, one.way.delay), []).append(one)
+    for site, rows in zip(common.sites, told.of(common), strict=True):
+        felt = site.lifted.q.any(axis=0) | site.lifted.d.any(axis=0)
+        for place, row in enumerate(rows):
+            if felt[place] and not row.gap:
+                heard.setdefault((row.way.link, row.way.delay), []).append(row)
+    links = {link.name: link for link in system.links}
+    clocks = {clock.name: clock for clock in system.clocks}
     found = []
     for route, listed in sorted(heard.items()):
-        link = links[route[0]]
-        delay = timings[route[1]]
-        period = timings[clocks[link.clock].period]
-        phase = timings[clocks[link.clock].phase] % period
-        sent = [phase + k * period for k in range(int(frame / period))]
-        ticks = {}
-        for one in listed:
-            own = timings[clocks[one.clock].period]
-            ticks[one.clock, one.tick] = timings[clocks[one.clock].phase] % own + one.tick * own
-        law = channel_law(system, link, delay)
-        strictly = order.index("tick") < order.index("deliver")
-        memory = memory_of(law, delay, sent, ticks, frame, strictly=strictly)
-        found.append(remember(route, memory, tuple(sorted({one.channel for one in listed}))))
+        link, delay = links[route[0]], told.timings[route[1]]
+        sent = _instants(told, clocks[link.clock])
+        ticks = {(row.clock, row.tick): _instants(told, clocks[row.clock])[row.tick] for row in listed}
+        law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
+        memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly)
+        found.append(remember(route, memory, sorted({row.channel for row in listed})))
     return found
 
 
-def _listened(common: Loop, weights, remembered) -> list[tuple[int, Listened]]:
+def _instants(told: Hearing, clock: Clock) -> list[Fraction]:
+    """Return when a clock ticks in a frame, in seconds."""
+    phase, period = told.timings[clock.phase], told.timings[clock.period]
+    return [phase % period + number * period for number in range(int(told.frame / period))]
+
+
+def _listened(
+    common: Loop, weights: Coupling, remembered: Sequence[Remembered]
+) -> list[tuple[int, Listened]]:
+    """Return the channels left to chance, one of each kind, by the class that sends."""
     found = []
     for one in remembered:
         if not any(len(one.memory.uncertain(slot)) for slot in range(one.memory.slots)):
             continue
         for h, site in enumerate(common.sites):
-            for g, sender in enumerate(common.sites):
-                own = {
-                    way: rows[h][g]
-                    for way, rows in weights.items()
-                    if (way.link, way.delay) == one.route and rows[h][g]
-                }
-                if own and (g != h or site.count > 1):
+            for g in range(len(common.sites)):
+                own = {way: rows[h][g] for way, rows in weights.items() if (way.link, way.delay) == one.route}
+                if any(own.values()) and (g != h or site.count > 1):
                     found.append((g, Listened(h, one.route, own)))
     return found

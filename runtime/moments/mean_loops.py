@@ -1,7 +1,7 @@
 """The loops that the mean of all peers moves by, and what one channel's luck does to them.
 
 Takes: the loops of a scene whose ticks each hear by themselves, and what channels remember.
-Gives: `Remembered`, `remember`; `Listened`, `Channel`, `MeanLoop`, `mean_loop`.
+Gives: `Remembered`, `remember`; `Site`, `with_memory`, `standing_state`; `Listened`, `Channel`, `MeanLoop`, `mean_loop`.
 Guarantees: each matrix comes with the radius of its rounding, those of the sites' frames included; rigid
 motions are taken out, which no luck moves.
 Does not: compute second moments (see `gains`).
@@ -135,20 +135,21 @@ def _rounded(values: Floats, roundings: int) -> Matrix:
 
 
 @dataclass(frozen=True, slots=True)
-class _Site:
-    """A site with what its receivers remember of it on the mean: its map, whose s holds two kinds of rows.
+class Site:
+    """A site with what its receivers remember of it on the mean: its map, whose s holds three kinds of rows.
 
     `values` says which row is a value that ticks hear, by route, channel and value; `misses` are those of how
-    far a slot's uncertain values are from what is sent.
+    far a slot's uncertain values are from what is sent; `sent` is the row of each packet as it is sent.
     """
 
     map: FrameMap
     names: tuple[str, ...]
     values: Mapping[tuple[Route, str, int], int]
     misses: Mapping[tuple[Route, int], slice]
+    sent: Mapping[Sent, int]
 
 
-def _with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> _Site:
+def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
     """Return a site whose state holds what its receivers remember of it on the mean."""
     plain, row_of = group.lifted.bounded, {one: row for row, one in enumerate(group.schedule.sent)}
     numbers = [
@@ -191,6 +192,9 @@ def _with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> _Site:
                 rows.append(RADII.subtract(sent, held))
                 count += held.shape[-2]
             misses[one.route, slot] = slice(start, count)
+    plainly = np.zeros((2, n_s, n_m + n_s))
+    plainly[0, :, n_m:] = np.eye(n_s)
+    rows.append(plainly)
     listed, keeping = np.concatenate(rows, axis=-2), np.concatenate(kept, axis=-2)
     n_z = plain.p.shape[-1]
     p = np.zeros((2, n_z + n_m, n_z + n_m))
@@ -200,8 +204,9 @@ def _with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> _Site:
     q = np.concatenate([plain.q, RADII.multiply(keeping[..., n_m:], plain.d)], axis=-2)
     s = np.concatenate([RADII.multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
     d = RADII.multiply(listed[..., n_m:], plain.d)
-    names = [f"{channel} heard" for (_, channel), count in zip(numbers, counts, strict=True) for _ in range(count)]
-    return _Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses)
+    names = [f"{channel} heard" for (_, channel), many in zip(numbers, counts, strict=True) for _ in range(many)]
+    sent = {one: count + row for one, row in row_of.items()}
+    return Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses, sent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +270,7 @@ def mean_loop(
         The rigid motions over the loop's own z, site after site (Σ n_z, d).
     """
     of_route = {one.route: one for one in remembered}
-    sites = [_with_memory(group, remembered) for group in loop.sites]
+    sites = [with_memory(group, remembered) for group in loop.sites]
     offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
     starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
     layout = StateLayout(tuple(offsets[:-1]), tuple(name for one in sites for name in one.names), {})
@@ -291,7 +296,7 @@ def mean_loop(
                     before[:, line, span] = RADII.multiply(weight, own.values[:, place, None])[:, 0]
         feedback.append(Feedback(now, before))
     closed = close([one.map for one in sites], feedback, layout, numbers=RADII)
-    at = relative_coordinates(_standing(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
+    at = relative_coordinates(standing_state(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
     rest, n = at.rest, len(at.rest)
     moved = closed.matrix[:, rest]
     if len(at.held):
@@ -315,7 +320,7 @@ def mean_loop(
     return MeanLoop(loop.name, loop.multiplicity, moved[..., rest]), found
 
 
-def _standing(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequence[int]) -> Floats:
+def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequence[int]) -> Floats:
     """Return rigid motions with what is remembered of them: whatever stands still is heard as it is sent.
 
     Of rational weights, it is made of small fractions; which of them, the matrix tells.

@@ -133,7 +133,7 @@ def memory_of(
     strictly
         Whether a tick misses what arrives just then.
     """
-    ahead = math.ceil(Fraction(law.longest) / frame) + 2
+    ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
     chance: dict[Fraction, float] = {}
 
     def described(time: Fraction) -> tuple[float, ...]:
