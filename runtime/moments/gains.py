@@ -1,7 +1,8 @@
 """The spectral radius of second moments, from how luck drives itself.
 
 Takes: the mean loops of a scene and what the luck of its channels does to them.
-Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`.
+Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `stein`, `around`, `scaled`,
+`of_kind`, `number_of`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd`).
 
@@ -14,7 +15,7 @@ eigenvalue of G is 1, or by ρ(A)² where it is smaller than 1 all the way down.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,9 @@ from apc.moments.mean_loops import Channel, MeanLoop, Route
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
+
+# G(λ) in numbers of a kind, None where the means grow faster.
+Gain = Callable[[float, Arithmetic], Matrix | None]
 
 # What is left of a sum that is doubled, relative to the whole: far below any rounding.
 NOTHING = 1e-24
@@ -120,7 +124,7 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     """
     total, power = driven, matrix
     for _ in range(DOUBLINGS):
-        total = numbers.add(total, _around(power, total, numbers))
+        total = numbers.add(total, around(power, total, numbers))
         power = numbers.multiply(power, power)
         sums = np.abs(power).sum(axis=-1)
         size = float((sums if numbers is FLOATS else sums.sum(axis=0)).max(initial=0.0))
@@ -134,7 +138,7 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     return None
 
 
-def _around(left: Matrix, inner: Matrix, numbers: Arithmetic, right: Matrix | None = None) -> Matrix:
+def around(left: Matrix, inner: Matrix, numbers: Arithmetic, right: Matrix | None = None) -> Matrix:
     """Return L X Rᵀ, R being L unless given."""
     other = left if right is None else right
     return numbers.multiply(numbers.multiply(left, inner), np.swapaxes(other, -1, -2))
@@ -153,14 +157,14 @@ def gain(of: Moments, growth: float, numbers: Arithmetic = FLOATS) -> Matrix | N
         Floats, or floats with their radii.
     """
     firsts = np.cumsum([0] + [sum(map(len, one.entries)) for one in of.luck]).tolist()
-    found = _of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
-    shrink, root = _number(1 / growth, numbers), _number(growth**-0.5, numbers)
+    found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
+    shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
     for part in of.parts:
         for d, channel in part.channels.items():
             kind = of.luck[d]
-            covariances = _of_kind(RADII.exact(_units(kind)), numbers)
-            driven = scaled(_around(_of_kind(channel.driven, numbers), covariances, numbers), shrink, numbers)
-            moments = stein(scaled(_of_kind(channel.matrix, numbers), root, numbers), driven, numbers)
+            covariances = of_kind(RADII.exact(_units(kind)), numbers)
+            driven = scaled(around(of_kind(channel.driven, numbers), covariances, numbers), shrink, numbers)
+            moments = stein(scaled(of_kind(channel.matrix, numbers), root, numbers), driven, numbers)
             if moments is None:
                 return None
             answer = _Answer(channel.matrix.shape[-1], moments, covariances, numbers)
@@ -168,21 +172,21 @@ def gain(of: Moments, growth: float, numbers: Arithmetic = FLOATS) -> Matrix | N
             alone = 1 / kind.receivers
             share = kind.heard * (alone if part.apart is None else 1 - alone)
             for (site, route, slot), rows in channel.misses.items():
-                miss = _of_kind(rows, numbers)
-                same = scaled(answer.of(miss, miss), _number(share, numbers), numbers)
+                miss = of_kind(rows, numbers)
+                same = scaled(answer.of(miss, miss), number_of(share, numbers), numbers)
                 for c, other in enumerate(of.luck):
                     if (other.route, other.sender) != (route, part.classes[site]):
                         continue
                     moved = same
                     if c == d:
-                        own = _of_kind(channel.own[slot], numbers)
+                        own = of_kind(channel.own[slot], numbers)
                         both = answer.of(miss, own)
                         both = numbers.add(both, np.swapaxes(both, -1, -2))
-                        factor = _number(alone if part.apart is None else -alone, numbers)
+                        factor = number_of(alone if part.apart is None else -alone, numbers)
                         moved = numbers.add(moved, scaled(both, factor, numbers))
                         if part.apart is None:
                             moved = numbers.add(moved, answer.of(own, own))
-                    moved = scaled(moved, _of_kind(other.spreads[slot], numbers), numbers)
+                    moved = scaled(moved, of_kind(other.spreads[slot], numbers), numbers)
                     listed = np.array(other.entries[slot], np.intp).reshape(-1, 2).T
                     block = np.moveaxis(moved[..., listed[0], listed[1]], 0, -1)
                     first = firsts[c] + sum(map(len, other.entries[:slot]))
@@ -203,8 +207,8 @@ class _Answer:
     def of(self, left: Matrix, right: Matrix) -> Matrix:
         """Return the moments E[l rᵀ] of linear forms of states and luck."""
         n, numbers = self.states, self.numbers
-        late = _around(left[..., :n], self.moments, numbers, right[..., :n])
-        return numbers.add(late, _around(left[..., n:], self.covariances, numbers, right[..., n:]))
+        late = around(left[..., :n], self.moments, numbers, right[..., :n])
+        return numbers.add(late, around(left[..., n:], self.covariances, numbers, right[..., n:]))
 
 
 def _units(kind: Luck) -> Floats:
@@ -218,32 +222,34 @@ def _units(kind: Luck) -> Floats:
     return found
 
 
-def _of_kind(matrix: Matrix, numbers: Arithmetic) -> Matrix:
+def of_kind(matrix: Matrix, numbers: Arithmetic) -> Matrix:
     """Return a matrix with its radius as it is, or without it."""
     return value_of(matrix) if numbers is FLOATS else matrix
 
 
-def _number(value: float, numbers: Arithmetic) -> Matrix:
+def number_of(value: float, numbers: Arithmetic) -> Matrix:
     """Return a number that was rounded a few times, to scale by."""
     if numbers is FLOATS:
         return np.array(value)
     return np.array([value, 4 * UNIT * abs(value)]).reshape(2, 1, 1)
 
 
-def mean_square_radius(of: Moments) -> Enclosed:
+def mean_square_radius(means: tuple[float, float], of: Gain | None) -> Enclosed:
     """Enclose what second moments grow by in a frame, for all start states.
 
     Parameters
     ----------
+    means
+        Bounds on the spectral radius of the means.
     of
-        The loops and their luck.
+        G(λ), None where nothing is left to chance.
     """
-    low, high = of.means
+    low, high = means
     if not np.isfinite(high):
         return Enclosed(np.nan, 0.0, np.inf)
     square = (low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT))
-    if not of.luck:
-        return Enclosed((low * high), *square)
+    if of is None:
+        return Enclosed(low * high, *square)
     radius = _radius(of, max(high**2, np.finfo(np.float64).tiny))
     if radius is None:
         return Enclosed(low * high, *square)
@@ -259,25 +265,25 @@ def mean_square_radius(of: Moments) -> Enclosed:
     return Enclosed(radius, min(below, radius), max(above, square[1], radius))
 
 
-def _compared(of: Moments, growth: float) -> bool | None:
+def _compared(of: Gain, growth: float) -> bool | None:
     """Say whether second moments grow faster than `growth`, None if that is open."""
-    matrix = gain(of, growth, RADII)
+    matrix = of(growth, RADII)
     if matrix is None or not np.isfinite(matrix).all():
         return None
     _, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
     return True if found.low > 1 else False if found.high < 1 else None
 
 
-def _largest(of: Moments, growth: float) -> float:
+def _largest(of: Gain, growth: float) -> float:
     """Return the largest eigenvalue of G(λ) in floats, infinite where there is none."""
     with np.errstate(all="ignore"):
-        matrix = gain(of, growth)
+        matrix = of(growth, FLOATS)
     if matrix is None or not np.isfinite(matrix).all():
         return np.inf
     return float(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0))
 
 
-def _radius(of: Moments, least: float) -> float | None:
+def _radius(of: Gain, least: float) -> float | None:
     """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
 
     1/G is followed, which is nearly straight where G has its pole: by secants between a point on either side,

@@ -1,0 +1,342 @@
+"""Second moments where a receiver puts its own value in the place of a missing one.
+
+Takes: a scene whose packets are due at the same instant of each frame, lost independently of each other.
+Gives: `stand_in`.
+Guarantees: equal peers cost the same, however many they are.
+Does not: serve bursts (see `patterns`), jitter, or several unreliable links.
+
+A peer that hears a_g of the n_g others of class g puts its own value in the place of the n_g − a_g it misses,
+tick by tick; so how it moves depends on how many it hears, and not on which of them:
+
+    x_j⁺ = P(a) x_j + Σ_g K_g(a) Σ_(i heard of g) x_i
+
+All peers are lucky or not independently of each other. So the moments of different peers are those of the
+means, and each peer's own hold Ω more, which is linear in all moments. With P and K polynomials in a, the
+mean over all a is a Gauss quadrature of the binomial distribution, exact with a node for every two degrees.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared
+from apc.compiler.compiled import CompiledSystem
+from apc.eigen.enclosure import enclose_eigenvalues
+from apc.eigen.relative import Relative, relative_coordinates
+from apc.frame.discretize import UNIT
+from apc.frame.radius import RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.moments.crowd import hearing, own_value, peer_classes, remembered_of, standing_motions
+from apc.moments.gains import Gain, around, number_of, of_kind, scaled, stein
+from apc.moments.mean_loops import standing_state, with_memory
+from apc.network.channel import channel_law
+
+Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
+
+# Ways of hearing so many of each class that are looked at together.
+MOST_NODES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class _Receiver:
+    """How a peer of a class moves by how many it hears: each row of `heard` (m, K) of probability `weight`.
+
+    `mean` (2, n, n) is that of P(a), `shares` are k_g, the mean that one peer of each class g takes part with
+    (2, n, n_g). `apart` (m, 2, n, n + Σ n_g) is [P(a) − P, a K_g(a) − n_g k_g], and `per_peer` K_g(a) − k_g.
+    """
+
+    heard: Floats
+    weight: Floats
+    mean: Matrix
+    shares: tuple[Matrix, ...]
+    apart: Matrix
+    per_peer: tuple[Matrix, ...]
+
+
+def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
+    """Return nodes and weights of a binomial distribution, exact for polynomials up to 2·most − 1.
+
+    Parameters
+    ----------
+    n, chance
+        So many trials, each succeeding so often.
+    most
+        The number of nodes, unless all n + 1 outcomes are fewer.
+
+    Notes
+    -----
+    The recurrence of Krawtchouk's polynomials, and Golub and Welsch (1969).
+    """
+    if n + 1 <= most:
+        outcomes = np.arange(n + 1)
+        weights = [math.comb(n, k) * chance**k * (1 - chance) ** (n - k) for k in range(n + 1)]
+        return outcomes.astype(np.float64), np.array(weights)
+    k = np.arange(most)
+    middle = n * chance + k * (1 - 2 * chance)
+    beside = np.sqrt(k[1:] * (n - k[1:] + 1.0) * chance * (1 - chance))
+    nodes, vectors = np.linalg.eigh(np.diag(middle) + np.diag(beside, 1) + np.diag(beside, -1))
+    return nodes, vectors[0] ** 2
+
+
+def stand_in(
+    system: CompiledSystem, prepared: Prepared, first: Fraction
+) -> tuple[tuple[float, float], Gain]:
+    """Return bounds on the means' spectral radius and G(λ) of what luck adds, see `gains`.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    first
+        When frames begin: all packets that may be lost are due then.
+    """
+    told = hearing(system, prepared, first=first, stand_in=True)
+    loops, weights = peer_classes(told)
+    common = loops[0]
+    remembered = remembered_of(system, told, common, perfect=True)
+    (one,) = remembered
+    link = next(link for link in system.links if link.name == one.route[0])
+    law = channel_law(system, link, told.timings[one.route[1]])
+    counts = [site.count for site in common.sites]
+    sites = [with_memory(group, remembered) for group in common.sites]
+    sizes = [len(site.names) for site in sites]
+    offsets = np.cumsum([0, *sizes]).tolist()
+    values = []
+    for site in sites:
+        rows = [site.values[one.route, name, value] for name in one.channels for value in range(len(one.memory.old))]
+        assert not site.map.d[:, rows].any(), "what is heard was sent after hearing something in the same frame"
+        values.append(site.map.s[:, rows])
+    receivers = []
+    for h, rows in enumerate(told.of(common)):
+        others = [counts[g] - (g == h) for g in range(len(counts))]
+        ticks = len({(row.clock, row.tick) for row in rows})
+        hears = [any(weights[way][h][g] for way in weights) for g in range(len(counts))]
+        nodes = [
+            quadrature(n, 1 - law.mean_loss, ticks + 3) if does else (np.zeros(1), np.ones(1))
+            for n, does in zip(others, hears, strict=True)
+        ]
+        heard = np.array(list(itertools.product(*(own for own, _ in nodes))))
+        weight = np.array([math.prod(listed) for listed in itertools.product(*(own for _, own in nodes))])
+        receivers.append(
+            _receiver(sites[h], h, rows, one, values, weights, others, heard, weight)
+        )
+    return _gains(receivers, counts, sizes, offsets, common, loops)
+
+
+def _receiver(site, h, rows, one, values, weights, others, heard, weight) -> _Receiver:
+    """Close a peer's loop with itself: what stands in for what it misses."""
+    plain = site.map
+    own_places = sorted({site.sent[own_value(row)] for row in rows if row.gap})
+    m, n_r = len(heard), len(rows)
+    gap = np.zeros((m, 2, n_r, len(own_places)))
+    from_class = [np.zeros((2, n_r, rows_of.shape[-2])) for rows_of in values]
+    for line, row in enumerate(rows):
+        if (row.way.link, row.way.delay) != one.route or row.channel not in one.channels:
+            continue
+        if row.gap:
+            missed = sum(
+                float(weights[row.way][h][g]) * (others[g] - heard[:, g]) for g in range(len(others))
+            )
+            place = own_places.index(site.sent[own_value(row)])
+            gap[:, 0, line, place] = missed
+            gap[:, 1, line, place] = 16 * UNIT * sum(
+                abs(float(weights[row.way][h][g])) * (others[g] + np.abs(heard[:, g])) for g in range(len(others))
+            )
+            continue
+        value = one.channels.index(row.channel) * len(one.memory.old) + one.memory.heard[row.clock, row.tick]
+        for g, block in enumerate(from_class):
+            own = float(weights[row.way][h][g])
+            block[0, line, value], block[1, line, value] = own, UNIT * abs(own)
+    own_rows, own_heard = plain.s[:, own_places], plain.d[:, own_places]
+    # r = gap o + s and o = O x + D r: time orders it, D gap is nilpotent.
+    felt = np.broadcast_to(RADII.exact(np.eye(n_r)), (m, 2, n_r, n_r)).copy()
+    step = RADII.multiply(gap, own_heard)
+    term = felt
+    for _ in range(n_r):
+        term = RADII.multiply(step, term)
+        if not term.any():
+            break
+        felt = RADII.add(felt, term)
+    reached = RADII.multiply(plain.q, felt)
+    own = RADII.add(
+        np.broadcast_to(plain.p, (m, *plain.p.shape)), RADII.multiply(RADII.multiply(reached, gap), own_rows)
+    )
+    from_class = tuple(
+        RADII.multiply(RADII.multiply(reached, block), rows_of)
+        for block, rows_of in zip(from_class, values, strict=True)
+    )
+    mean = _mean(weight, own)
+    apart, shares, per_peer = [RADII.subtract(own, mean)], [], []
+    for g, block in enumerate(from_class):
+        alike = _each(block, heard[:, g])
+        shared = _mean(weight, alike)
+        shares.append(scaled(shared, number_of(1 / max(others[g], 1), RADII), RADII))
+        apart.append(RADII.subtract(alike, shared))
+        per_peer.append(RADII.subtract(block, shares[g]))
+    return _Receiver(
+        heard, weight, mean, tuple(shares), np.concatenate(apart, axis=-1), tuple(per_peer)
+    )
+
+
+def _mean(weight: Floats, blocks: Matrix) -> Matrix:
+    """Return the mean (2, n, n) of matrices (m, 2, n, n), the weights rounded."""
+    value = np.tensordot(weight, blocks[:, 0], 1)
+    size = np.tensordot(np.abs(weight), np.abs(blocks[:, 0]), 1)
+    radius = np.tensordot(np.abs(weight), blocks[:, 1], 1) + NODE_ROUNDINGS * (len(weight) + 4) * UNIT * size
+    return with_radius(value, radius * (1 + 8 * UNIT))
+
+
+NODE_ROUNDINGS = 16
+
+
+def _gains(receivers, counts, sizes, offsets, common, loops) -> tuple[tuple[float, float], Gain]:
+    classes = range(len(counts))
+    n = offsets[-1]
+    whole = np.zeros((2, n, n))
+    for h in classes:
+        for g in classes:
+            others = counts[g] - (g == h)
+            block = scaled(receivers[h].shares[g], number_of(float(others), RADII), RADII)
+            block = RADII.add(receivers[h].mean, block) if h == g else block
+            whole[:, offsets[h] : offsets[h + 1], offsets[g] : offsets[g + 1]] = block
+    at = relative_coordinates(standing_state(whole, standing_motions(common), common, offsets))
+    parts: list[tuple[int | None, Matrix, Relative]] = [(None, _reduced(whole, at), at)]
+    for loop in loops[1:]:
+        h = [site.name for site in common.sites].index(loop.sites[0].name)
+        apart = RADII.subtract(receivers[h].mean, receivers[h].shares[h])
+        own = relative_coordinates(standing_state(apart, standing_motions(loop), loop, [0, sizes[h]]))
+        parts.append((h, _reduced(apart, own), own))
+    bounds = [enclose_eigenvalues(value_of(matrix), radius_of(matrix))[1] for _, matrix, _ in parts]
+    low, high = max(one.low for one in bounds), max(one.high for one in bounds)
+
+    def gain(growth: float, numbers: Arithmetic) -> Matrix | None:
+        return _gain(growth, numbers, receivers, counts, offsets, parts)
+
+    return (low, high), gain
+
+
+def _each(blocks: Matrix, by: Floats) -> Matrix:
+    """Return matrices (m, 2, n, n), each times a number of its own (m,)."""
+    factor = by[:, None, None, None]
+    found = blocks * np.abs(factor)
+    found[:, 0] = blocks[:, 0] * by[:, None, None]
+    found[:, 1] += NODE_ROUNDINGS * UNIT * np.abs(found[:, 0])
+    return found
+
+
+def _reduced(matrix: Matrix, at: Relative) -> Matrix:
+    inner = matrix[:, at.rest[:, None], at.rest]
+    if not len(at.held):
+        return inner
+    weights = with_radius(at.weights, at.doubt)
+    return RADII.subtract(inner, RADII.multiply(weights, matrix[:, at.held[:, None], at.rest]))
+
+
+def _gain(growth, numbers, receivers, counts, offsets, parts) -> Matrix | None:
+    """Return G(λ) over the entries of each class's Ω."""
+    classes = range(len(counts))
+    sizes = [offsets[h + 1] - offsets[h] for h in classes]
+    entries = [[(a, b) for a in range(n) for b in range(a, n)] for n in sizes]
+    firsts = np.cumsum([0] + [len(one) for one in entries]).tolist()
+    found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
+    root, shrink = number_of(growth**-0.5, numbers), number_of(1 / growth, numbers)
+    for d in classes:
+        units = np.zeros((len(entries[d]), sizes[d], sizes[d]))
+        for number, (a, b) in enumerate(entries[d]):
+            units[number, a, b] = units[number, b, a] = 1.0
+        kinds = of_kind(RADII.exact(units), numbers)
+        spread: dict[int | None, Matrix] = {}
+        for h, matrix, at in parts:
+            if h not in (None, d):
+                continue
+            # What luck adds to a peer, in relative coordinates; of all peers' mean, a peer is one in n.
+            place = offsets[d] if h is None else 0
+            total = offsets[-1] if h is None else sizes[d]
+            into = np.zeros((2, total, sizes[d]))
+            into[0, place : place + sizes[d]] = np.eye(sizes[d])
+            weights = with_radius(at.weights, at.doubt)
+            into = into[:, at.rest] if not len(at.held) else RADII.subtract(
+                into[:, at.rest], RADII.multiply(weights, into[:, at.held])
+            )
+            driven = scaled(around(of_kind(into, numbers), kinds, numbers), shrink, numbers)
+            if h is None:
+                driven = scaled(driven, number_of(1 / counts[d], numbers), numbers)
+            moments = stein(scaled(of_kind(matrix, numbers), root, numbers), driven, numbers)
+            if moments is None:
+                return None
+            whole = np.zeros((*moments.shape[:-2], total, total))
+            whole[..., at.rest[:, None], at.rest] = moments
+            spread[h] = whole
+        for h in classes:
+            added = _added(h, d, receivers[h], counts, offsets, spread, numbers)
+            listed = np.array(entries[h], np.intp).T
+            block = np.moveaxis(added[..., listed[0], listed[1]], 0, -1)
+            place = np.s_[..., firsts[h] : firsts[h + 1], firsts[d] : firsts[d + 1]]
+            found[place] = numbers.add(found[place], block)
+    return found
+
+
+def _added(h, d, one, counts, offsets, spread, numbers) -> Matrix:
+    """Return Ω of a peer of class h, for moments that class d's luck made (b, n, n)."""
+    classes = range(len(counts))
+
+    def together(g: int, k: int) -> Matrix:
+        """Return the moments of two peers, of classes g and k, that are not the same."""
+        rows, columns = slice(offsets[g], offsets[g + 1]), slice(offsets[k], offsets[k + 1])
+        alike = spread[None][..., rows, columns]
+        if g == k == d and d in spread:
+            return numbers.subtract(alike, scaled(spread[d], number_of(1 / counts[d], numbers), numbers))
+        return alike
+
+    def alone(g: int) -> Matrix:
+        """Return the moments of one peer."""
+        if g == d and d in spread:
+            return numbers.add(together(g, g), spread[d])
+        return together(g, g)
+
+    # What luck adds: how a peer moves apart from the mean of such peers, those it hears taken alike; and which
+    # of those that differ it hears, a of n.
+    size = offsets[h + 1] - offsets[h]
+    ends = np.cumsum([size] + [offsets[g + 1] - offsets[g] for g in classes]).tolist()
+    joint = np.zeros((*alone(h).shape[:-2], ends[-1], ends[-1]))
+    joint[..., :size, :size] = alone(h)
+    for g in classes:
+        rows = slice(ends[g], ends[g + 1])
+        joint[..., :size, rows] = together(h, g)
+        joint[..., rows, :size] = np.swapaxes(together(h, g), -1, -2)
+        for k in classes:
+            joint[..., rows, ends[k] : ends[k + 1]] = together(g, k)
+    total = _mean_of(one.weight, around(of_nodes(one.apart, numbers), joint[:, None], numbers), numbers)
+    if d in spread and one.heard[:, d].any():
+        others = counts[d] - (d == h)
+        here = around(of_nodes(one.per_peer[d], numbers), spread[d][:, None], numbers)
+        total = numbers.add(total, _mean_of(one.weight * one.heard[:, d], here, numbers))
+        share = of_kind(one.shares[d], numbers)
+        missed = float(one.weight @ (others - one.heard[:, d]))
+        there = scaled(around(share, spread[d], numbers), number_of(missed, numbers), numbers)
+        total = numbers.add(total, there)
+    return total
+
+
+def of_nodes(blocks: Matrix, numbers: Arithmetic) -> Matrix:
+    """Return matrices (m, 2, …) with their radii as they are, or without them."""
+    return blocks if numbers is RADII else blocks[:, 0]
+
+
+def _mean_of(weight: Floats, blocks: Matrix, numbers: Arithmetic) -> Matrix:
+    """Return the mean (b, …) of matrices (b, m, …)."""
+    if numbers is not RADII:
+        return np.einsum("m,bmij->bij", weight, blocks)
+    value = np.einsum("m,bmij->bij", weight, blocks[:, :, 0])
+    size = np.einsum("m,bmij->bij", np.abs(weight), np.abs(blocks[:, :, 0]))
+    radius = np.einsum("m,bmij->bij", np.abs(weight), blocks[:, :, 1])
+    radius += NODE_ROUNDINGS * (len(weight) + 4) * UNIT * size
+    return with_radius(value, radius * (1 + 8 * UNIT))
