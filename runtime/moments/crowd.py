@@ -1,7 +1,7 @@
 """The mean loops and the luck of a scene: what its second moments are made of.
 
 Takes: a `CompiledSystem` whose links lose or delay packets independently of each other.
-Gives: `crowd`; `Hearing`, `hearing`, `own_value`; `peer_classes`, `remembered_of`, `standing_motions`.
+Gives: `crowd`; `Hearing`, `hearing`, `own_value`; `peer_classes`, `remembered_of`, `standing_motions`, `instants`.
 Guarantees: equal peers on complete graphs cost the same, however many they are; peers that can change places
 are one class on any graph.
 Does not: say what it can't serve (see `network`).
@@ -239,15 +239,15 @@ def remembered_of(
     found = []
     for route, listed in sorted(heard.items()):
         link, delay = links[route[0]], told.timings[route[1]]
-        sent = _instants(told, clocks[link.clock])
-        ticks = {(row.clock, row.tick): _instants(told, clocks[row.clock])[row.tick] for row in listed}
+        sent = instants(told, clocks[link.clock])
+        ticks = {(row.clock, row.tick): instants(told, clocks[row.clock])[row.tick] for row in listed}
         law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
         memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly)
         found.append(remember(route, memory, sorted({row.channel for row in listed})))
     return found
 
 
-def _instants(told: Hearing, clock: Clock) -> list[Fraction]:
+def instants(told: Hearing, clock: Clock) -> list[Fraction]:
     """Return when a clock ticks in a frame, in seconds."""
     phase, period = told.timings[clock.phase], told.timings[clock.period]
     return [phase % period + number * period for number in range(int(told.frame / period))]

@@ -8,20 +8,27 @@ Does not: look at the nominal network (see `analysis`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem, Link
+from apc.compiler.multiples import common_multiple
 from apc.finite_equations import finite_equations
+from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve
+from apc.moments.bursts import tagged_radius
 from apc.moments.crowd import crowd
-from apc.moments.gains import mean_square_radius
+from apc.moments.gains import gain, mean_square_radius
 from apc.moments.memory import is_memoryless
 from apc.moments.patterns import MOST_CHANNELS, pattern_radius, patterns
-from apc.network.channel import ChannelLaw, channel_law
+from apc.moments.stand_in import stand_in
+from apc.moments.traces import trace_radius
+from apc.network.channel import LATEST, ChannelLaw, channel_law
 from apc.result import Result
 from apc.threads import single_threaded
 
@@ -29,6 +36,16 @@ STABLE = "stable in mean square"
 UNSTABLE = "unstable in mean square"
 UNDECIDED = "undecided"
 NOT_JUDGED = "not judged"
+
+# Peers whose bursts are followed with all tags, and with so many at most; the orders then compared.
+EXACTLY_TAGGED, MOST_TAGGED, ORDERS = 4, 8, (2, 3)
+
+# What an iteration leaves of an eigenvalue, relatively: 1e-13 asked for, and references met to 1e-11.
+ITERATED = 1e-10
+ROUNDED = 1e-15
+
+# How much earlier than its nominal delay a jitter of 1 can make a packet.
+EARLIEST = {"uniform": 1.0, "normal": LATEST["normal"], "pareto": 2 / 3}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +87,7 @@ class NetworkVerdict(Result):
 class Growth:
     """What second moments grow by in a frame, with bounds; estimates where `exact` is False.
 
-    `why` says why there is none.
+    `why` says why there is none, `note` what it is.
     """
 
     radius: float
@@ -78,6 +95,7 @@ class Growth:
     high: float
     exact: bool
     why: str = ""
+    note: str = ""
     proof: str = ""
 
     @property
@@ -104,14 +122,150 @@ def growth(system: CompiledSystem, prepared: Prepared) -> Growth:
         The compiled scene, and what `analysis.prepare` made of it with any numbers.
     """
     lossy = unreliable(system)
-    if why := _unserved(system, prepared, lossy):
-        return Growth(np.nan, 0.0, np.inf, False, why)
-    by_chance = all(is_memoryless(law) for _, law in lossy)
-    if by_chance and all(link.channel.on_loss == "hold" for link, _ in lossy):
-        found = mean_square_radius(crowd(system, prepared))
-        return Growth(found.radius, found.low, found.high, True)
-    first, why = _due(system, prepared, lossy)
+    why = _unserved(system, prepared, lossy)
     if why:
         return Growth(np.nan, 0.0, np.inf, False, why)
+    if any(law.trace is not None for _, law in lossy):
+        found = trace_radius(system, prepared)
+        if isinstance(found, str):
+            return Growth(np.nan, 0.0, np.inf, False, found)
+        low, high = found[0] ** 2, found[1] ** 2
+        return Growth((low + high) / 2, low * (1 - ROUNDED), high * (1 + ROUNDED), True)
+    holding = {link.channel.on_loss == "hold" for link, _ in lossy if link.channel is not None}
+    if all(is_memoryless(law) for _, law in lossy):
+        if holding == {True} or not any(law.mean_loss for _, law in lossy):
+            of = crowd(system, prepared)
+            inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None)
+            return Growth(inner.radius, inner.low, inner.high, True)
+        first, why = _due(system, lossy)
+        if not why and len(lossy) == 1 and len(system.links) == 1:
+            means, adds = stand_in(system, prepared, first)
+            inner = mean_square_radius(means, adds)
+            return Growth(inner.radius, inner.low, inner.high, True)
+    else:
+        first, why = _due(system, lossy)
+    if why:
+        return Growth(np.nan, 0.0, np.inf, False, why)
+    return _by_patterns(system, prepared, first, lossy, holding)
+
+
+def _by_patterns(
+    system: CompiledSystem,
+    prepared: Prepared,
+    first: Fraction,
+    lossy: Sequence[tuple[Link, ChannelLaw]],
+    holding: set[bool],
+) -> Growth:
+    """Return what second moments grow by where losses come in bursts, or links differ."""
+    channels = sum(_channels(link, system.peers) for link, _ in lossy)
+    laws = {(law.p, law.r) for _, law in lossy}
+    sure = all(law.one_minus_h == 1 and law.one_minus_k == 0 for _, law in lossy)
+    alike = len(system.groups) == 1 and not system.groups[0].columns and len(lossy) == 1
+    complete = all(link.graph.shape == "complete" for link in system.links)
+    if holding == {True} and sure and len(laws) == 1 and alike and complete and system.peers <= MOST_TAGGED:
+        if system.peers <= EXACTLY_TAGGED:
+            (radius,) = tagged_radius(system, prepared, first, (channels,))
+            return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True)
+        rough, radius = tagged_radius(system, prepared, first, ORDERS)
+        note = (
+            f"an estimate: moments of at most {ORDERS[1]} channels' states together; with {ORDERS[0]} the "
+            f"radius is {rough:.9g}"
+        )
+        return Growth(radius, radius - abs(radius - rough), radius + abs(radius - rough), False, note=note)
+    if channels > MOST_CHANNELS:
+        what = "bursts" if not all(is_memoryless(law) for _, law in lossy) else "values that stand in"
+        why = f"{what} on {channels} ways between different peers; {MOST_CHANNELS} are the most that are followed"
+        return Growth(np.nan, 0.0, np.inf, False, why)
     radius = pattern_radius(patterns(system, prepared, first))
-    return Growth(radius, radius, radius, True)
+    return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True)
+
+
+def _channels(link: Link, peers: int) -> int:
+    """Return how many ways a link has."""
+    return peers * (peers - 1) if link.graph.shape == "complete" else len(arcs(link.graph, peers)[0])
+
+
+def _unserved(
+    system: CompiledSystem, prepared: Prepared, lossy: Sequence[tuple[Link, ChannelLaw]]
+) -> str:
+    """Return what of the scene can't be judged, "" if all can."""
+    if any(law.trace is not None for _, law in lossy):
+        if not all(law.trace is not None for _, law in lossy):
+            return "recorded delays beside links whose packets get lost or come late by chance"
+        if any(law.trace is not None and not np.isfinite(law.trace).any() for _, law in lossy):
+            return "a trace of losses only: nothing is ever heard"
+        if any(link.channel is not None and link.channel.on_loss == "zero" for link, law in lossy if law.mean_loss):
+            return "recorded losses with on_loss: zero"
+        return ""
+    for link, law in lossy:
+        assert link.channel is not None
+        if law.mean_loss >= 1:
+            return f"{link.name} loses everything: nothing is ever heard, and what is held never changes"
+        if law.jitter and law.mean_loss and link.channel.on_loss == "zero":
+            return f"jitter and losses of {link.name} together with on_loss: zero"
+        if law.jitter and not is_memoryless(law):
+            return f"jitter and bursts of {link.name} together"
+        if law.jitter and link.channel.reorder == "all" and _overtakes(system, link, law):
+            return f"packets of {link.name} that are overtaken and count all the same (reorder: all)"
+        if not is_memoryless(law) and law.r == 0:
+            return f"bursts of {link.name} that never end (r = 0)"
+    return ""
+
+
+def _overtakes(system: CompiledSystem, link: Link, law: ChannelLaw) -> bool:
+    """Say whether a packet may arrive before one that was sent before it."""
+    timings = resolve(system).timings
+    period = next(timings[clock.period] for clock in system.clocks if clock.name == link.clock)
+    least = max(law.delay - law.jitter * EARLIEST[law.distribution], 0.0)
+    return law.longest - least >= float(period)
+
+
+def _due(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> tuple[Fraction, str]:
+    """Return when in a frame packets are due, or why there is no one instant."""
+    timings = resolve(system).timings
+    clocks = {clock.name: clock for clock in system.clocks}
+    found = set()
+    for link, _ in lossy:
+        clock = clocks[link.clock]
+        for delay in {timings[link.delay], *(timings[one.delay] for one in link.delays)}:
+            found.add((timings[clock.period], (timings[clock.phase] + delay) % timings[clock.period]))
+    if len(found) > 1:
+        return Fraction(0), "packets that are due at different instants of a frame"
+    ((period, first),) = found
+    frame = common_multiple([timings[clock.period] for clock in system.clocks])
+    if frame != period:
+        return first, f"a frame of {float(frame) * 1e3:.6g} ms with several packets of {lossy[0][0].name}"
+    return first, ""
+
+
+def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> NetworkVerdict | None:
+    """Judge a scene over the network that it has, None where every packet takes its nominal delay.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
+    """
+    if not unreliable(system):
+        return None
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        prepared = prepared or prepare(system)
+        found = growth(system, prepared)
+    told = bool(np.isfinite(found.radius))
+    verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[found.stable] if told else NOT_JUDGED
+    if told and not found.exact and found.stable is not None:
+        verdict = f"probably {verdict}"
+    return NetworkVerdict(
+        topology=system.name,
+        verdict=verdict,
+        stable=found.stable if told else None,
+        mean_square_radius=found.radius if told else None,
+        error=max(found.high - found.radius, found.radius - found.low) if told else None,
+        exact=found.exact,
+        proof=found.proof,
+        rms_error_m=None,
+        losses_in_a_row=None,
+        notes=tuple(text for text in (found.why and f"not judged: {found.why}", found.note) if text),
+    )

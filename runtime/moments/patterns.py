@@ -1,7 +1,7 @@
 """Second moments of a few peers, pattern by pattern of which packets are lost: bursts, and what stands in.
 
 Takes: a scene of few channels, all of whose packets are due at the same instant of each frame.
-Gives: `Patterns`, `patterns`; `pattern_radius`.
+Gives: `Frames`, `frames`; `Patterns`, `patterns`; `pattern_radius`.
 Guarantees: exact but for rounding: every pattern of lost packets is looked at.
 Does not: bound its rounding; serve jitter, or packets due at different instants.
 
@@ -13,7 +13,7 @@ A_b; second moments X_s, of the frames that begin in pattern s, move by
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -26,19 +26,132 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Feedback, StateLayout, close
 from apc.eigen.modes import dense_loop
 from apc.eigen.pseudospectrum import balance
-from apc.eigen.relative import relative_coordinates
+from apc.eigen.relative import relative, relative_coordinates
 from apc.frame.lift import FrameMap
 from apc.frame.radius import RADII, value_of
-from apc.moments.crowd import Hearing, hearing, own_value, remembered_of, standing_motions
-from apc.moments.mean_loops import Remembered, Route, standing_state, with_memory
+from apc.moments.crowd import hearing, own_value, remembered_of, standing_motions
+from apc.moments.mean_loops import standing_state, with_memory
 from apc.network.channel import ChannelLaw, channel_law
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 
-# Channels whose patterns are all looked at: 2^12 matrices.
-MOST_CHANNELS = 12
+# Channels whose patterns are all looked at: 64 matrices, of three peers.
+MOST_CHANNELS = 6
+
+# What the frame of a motion that stands still may be off by, in floats.
+STANDING = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """The whole scene in frames whose packets are lost as patterns say: `matrices` (k, n, n).
+
+    The state holds each peer's own, then what each of the `channels` (link, delay, receiver, sender) holds,
+    from `held` of it on. `basis` (n, d) are the motions that nothing holds back, `laws` those of the channels.
+    `sites` (N + 1,) says where each peer's own starts.
+    """
+
+    matrices: Floats
+    basis: Floats
+    channels: tuple[tuple[str, str, int, int], ...]
+    held: Mapping[int, range]
+    sites: tuple[int, ...]
+    laws: tuple[ChannelLaw, ...]
+
+
+def frames(
+    system: CompiledSystem,
+    prepared: Prepared,
+    first: Fraction,
+    lost: Callable[[int], NDArray[np.int64]],
+) -> Frames:
+    """Close the whole scene for some patterns of lost packets.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    first
+        When frames begin: all packets that may be lost are due then.
+    lost
+        Gives the patterns (k, C) of C channels: 1 for a packet that is lost.
+    """
+    told = hearing(system, prepared, first=first, stand_in=True)
+    loop = dense_loop(told.groups, told.exchange)
+    remembered = {one.route: one for one in remembered_of(system, told, loop, perfect=True)}
+    links = {link.name: link for link in system.links}
+    laws = {
+        route: channel_law(system, links[route[0]], told.timings[route[1]])
+        for route in remembered
+        if links[route[0]].channel is not None
+    }
+    channels = sorted(
+        {
+            (way.link, way.delay, g, h)
+            for way, rows in loop.coupling.items()
+            if (way.link, way.delay) in laws
+            for g, row in enumerate(rows)
+            for h, weight in enumerate(row)
+            if weight
+        }
+    )
+    sites = [with_memory(group, list(remembered.values())) for group in loop.sites]
+    starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
+    offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
+    held: dict[int, range] = {}
+    n = offsets[-1]
+    for place, one in enumerate(channels):
+        channel = links[one[0]].channel
+        if channel is not None and channel.on_loss == "hold":
+            held[place] = range(n, n + len(remembered[one[0], one[1]].channels))
+            n = held[place].stop
+    names = tuple(name for one in sites for name in one.names)
+    layout = StateLayout(tuple(offsets[:-1]), (*names, *["held"] * (n - offsets[-1])), {})
+    number = {one: place for place, one in enumerate(channels)}
+    gone = lost(len(channels))
+    feedback = []
+    for g, rows in enumerate(told.of(loop)):
+        now, before = np.zeros((len(gone), len(rows), starts[-1])), np.zeros((len(gone), len(rows), n))
+        for line, row in enumerate(rows):
+            route = row.way.link, row.way.delay
+            one = remembered.get(route)
+            if one is None or row.channel not in one.channels:
+                continue
+            for h, weight in enumerate(loop.coupling[row.way][g]):
+                if not weight:
+                    continue
+                value = starts[h] + sites[h].values[route, row.channel, one.memory.heard[row.clock, row.tick]]
+                if route not in laws:
+                    now[:, line, value] = float(weight)
+                    continue
+                place = number[*route, g, h]
+                missed = gone[:, place] * float(weight)
+                if row.gap:
+                    now[:, line, starts[g] + sites[g].sent[own_value(row)]] += missed
+                    continue
+                now[:, line, value] = float(weight) - missed
+                if place in held:
+                    before[:, line, held[place][one.channels.index(row.channel)]] = missed
+        feedback.append(Feedback(now, before))
+    maps = [FrameMap(*(value_of(block) for block in one.map.blocks)) for one in sites]
+    closed = close(maps, feedback, layout)
+    matrix = closed.matrix
+    for place, states in held.items():
+        link, delay, _, h = channels[place]
+        one, missed = remembered[link, delay], gone[:, place, None]
+        value = one.memory.heard[min(one.memory.heard)]
+        for state, name in zip(states, one.channels, strict=True):
+            arrived = closed.sent[:, starts[h] + sites[h].values[one.route, name, value]]
+            matrix[:, state] = arrived * (1 - missed)
+            matrix[:, state, state] += missed[:, 0]
+    known = RADII.exact(matrix[0])
+    known[1] = STANDING
+    basis = standing_state(known, standing_motions(loop), loop, [*offsets[:-1], n])
+    return Frames(
+        matrix, basis, tuple(channels), held, tuple(offsets), tuple(laws[one[0], one[1]] for one in channels)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,102 +166,15 @@ class Patterns:
 
 
 def patterns(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Patterns:
-    """Close the whole scene for every pattern of lost packets.
-
-    Parameters
-    ----------
-    system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
-    first
-        When frames begin: all packets that may be lost are due then.
-    """
-    told = hearing(system, prepared, first=first, stand_in=True)
-    loop = dense_loop(told.groups, told.exchange)
-    remembered = {one.route: one for one in remembered_of(system, told, loop, perfect=True)}
-    links = {link.name: link for link in system.links}
-    lossy = {
-        route: channel_law(system, links[route[0]], told.timings[route[1]])
-        for route in remembered
-        if links[route[0]].channel is not None
-    }
-    channels = sorted(
-        {
-            (way.link, way.delay, g, h)
-            for way, rows in loop.coupling.items()
-            if (way.link, way.delay) in lossy
-            for g, row in enumerate(rows)
-            for h, weight in enumerate(row)
-            if weight
-        }
+    """Close the whole scene for every pattern of lost packets; parameters as for `frames`."""
+    found = frames(
+        *(system, prepared, first), lambda count: (np.arange(2**count)[:, None] >> np.arange(count)) & 1
     )
-    sites = [with_memory(group, list(remembered.values())) for group in loop.sites]
-    starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
-    offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
-    holding = [one for one in channels if _holds(links[one[0]])]
-    firsts: dict[tuple[str, str, int, int], int] = {}
-    n = offsets[-1]
-    for one in holding:
-        firsts[one] = n
-        n += len(remembered[one[0], one[1]].channels)
-    names = tuple(name for one in sites for name in one.names)
-    layout = StateLayout(tuple(offsets[:-1]), (*names, *["held"] * (n - offsets[-1])), {})
-    number = {one: place for place, one in enumerate(channels)}
-    lost = (np.arange(2 ** len(channels))[:, None] >> np.arange(len(channels))) & 1  # (k, C)
-    feedback = []
-    for g, rows in enumerate(told.of(loop)):
-        now, before = np.zeros((len(lost), len(rows), starts[-1])), np.zeros((len(lost), len(rows), n))
-        for line, row in enumerate(rows):
-            route = row.way.link, row.way.delay
-            one = remembered.get(route)
-            if one is None or row.channel not in one.channels:
-                continue
-            for h, weight in enumerate(loop.coupling[row.way][g]):
-                if not weight:
-                    continue
-                value = starts[h] + sites[h].values[route, row.channel, one.memory.heard[row.clock, row.tick]]
-                channel = (*route, g, h)
-                if route not in lossy:
-                    now[:, line, value] = 0.0 if row.gap else float(weight)
-                    continue
-                gone = lost[:, number[channel]] * float(weight)
-                if row.gap:
-                    now[:, line, starts[g] + sites[g].sent[own_value(row)]] += gone
-                    continue
-                now[:, line, value] = float(weight) - gone
-                if channel in firsts:
-                    before[:, line, firsts[channel] + one.channels.index(row.channel)] = gone
-        feedback.append(Feedback(now, before))
-    maps = [FrameMap(*(value_of(block) for block in one.map.blocks)) for one in sites]
-    closed = close(maps, feedback, layout)
-    matrix = closed.matrix
-    sent = closed.sent
-    for channel, place in firsts.items():
-        one, gone = remembered[channel[0], channel[1]], lost[:, number[channel], None]
-        value = one.memory.heard[min(one.memory.heard)]
-        for place_of, name in enumerate(one.channels):
-            row = sent[:, starts[channel[3]] + sites[channel[3]].values[one.route, name, value]]
-            matrix[:, place + place_of] = row * (1 - gone)
-            matrix[:, place + place_of, place + place_of] += gone[:, 0]
-    basis = _standing(matrix[0], standing_motions(loop), loop, offsets)
-    at = relative_coordinates(basis)
-    inner = matrix[:, at.rest[:, None], at.rest]
-    if len(at.held):
-        inner = inner - at.weights @ matrix[:, at.held[:, None], at.rest]
+    at = relative_coordinates(found.basis)
+    inner = relative(found.matrices, at)
     # Rounding is small beside the largest moment only: of states of one size it is beside all.
     scale = balance(np.abs(inner).max(axis=0))
-    inner = inner / scale[:, None] * scale
-    return Patterns(inner, tuple(lossy[one[0], one[1]] for one in channels))
-
-
-def _standing(matrix: Floats, standing: Floats, loop: Any, offsets: Sequence[int]) -> Floats:
-    """Return rigid motions over the state, held values included."""
-    bounded = RADII.exact(matrix)
-    bounded[1] = 1e-12
-    return standing_state(bounded, standing, loop, [*offsets[:-1], len(matrix)])
-
-
-def _holds(link: Any) -> bool:
-    return link.channel is not None and link.channel.on_loss == "hold"
+    return Patterns(inner / scale[:, None] * scale, found.laws)
 
 
 def pattern_radius(of: Patterns) -> float:

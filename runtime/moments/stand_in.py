@@ -109,9 +109,9 @@ def stand_in(
     sites = [with_memory(group, remembered) for group in common.sites]
     sizes = [len(site.names) for site in sites]
     offsets = np.cumsum([0, *sizes]).tolist()
-    values = []
+    values, heard_now = [], sorted(set(one.memory.heard.values()))
     for site in sites:
-        rows = [site.values[one.route, name, value] for name in one.channels for value in range(len(one.memory.old))]
+        rows = [site.values[one.route, name, value] for name in one.channels for value in heard_now]
         assert not site.map.d[:, rows].any(), "what is heard was sent after hearing something in the same frame"
         values.append(site.map.s[:, rows])
     receivers = []
@@ -126,12 +126,12 @@ def stand_in(
         heard = np.array(list(itertools.product(*(own for own, _ in nodes))))
         weight = np.array([math.prod(listed) for listed in itertools.product(*(own for _, own in nodes))])
         receivers.append(
-            _receiver(sites[h], h, rows, one, values, weights, others, heard, weight)
+            _receiver(sites[h], h, rows, one, heard_now, values, weights, others, heard, weight)
         )
     return _gains(receivers, counts, sizes, offsets, common, loops)
 
 
-def _receiver(site, h, rows, one, values, weights, others, heard, weight) -> _Receiver:
+def _receiver(site, h, rows, one, heard_now, values, weights, others, heard, weight) -> _Receiver:
     """Close a peer's loop with itself: what stands in for what it misses."""
     plain = site.map
     own_places = sorted({site.sent[own_value(row)] for row in rows if row.gap})
@@ -151,7 +151,8 @@ def _receiver(site, h, rows, one, values, weights, others, heard, weight) -> _Re
                 abs(float(weights[row.way][h][g])) * (others[g] + np.abs(heard[:, g])) for g in range(len(others))
             )
             continue
-        value = one.channels.index(row.channel) * len(one.memory.old) + one.memory.heard[row.clock, row.tick]
+        value = heard_now.index(one.memory.heard[row.clock, row.tick])
+        value += one.channels.index(row.channel) * len(heard_now)
         for g, block in enumerate(from_class):
             own = float(weights[row.way][h][g])
             block[0, line, value], block[1, line, value] = own, UNIT * abs(own)
