@@ -2,9 +2,9 @@
 
 Takes: a function that gives the matrices and their derivatives at many points of an interval, or of many.
 Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`; `extremes`.
-Guarantees: every cell between samples is either shown clear by the eigenvalues and their derivatives at both
-ends, or divided down to the cell size; every change found is bracketed.
-Does not: prove anything (see `critical`), or choose the interval.
+Guarantees: every cell between samples is divided until the eigenvalues and their derivatives at both ends
+speak against a crossing that the ends don't show, or down to the cell size; every change found is bracketed.
+Does not: prove anything (see `bracket`), or choose the interval.
 
 Between two samples an eigenvalue follows the cubic through its values and slopes at both; how far the
 tangents of the two ends miss each other half-way, e, stands for what the cubic doesn't know.
@@ -137,7 +137,7 @@ def _stacked(one: Complexes, other: Complexes) -> Complexes:
 
 
 def scan(course: Course, points: Floats, *, least: float) -> Scan:
-    """Find every crossing between the first and the last of some points.
+    """Find the crossings between the first and the last of some points.
 
     Parameters
     ----------

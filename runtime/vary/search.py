@@ -104,7 +104,8 @@ class Search:
     `edges` are the crossings in order, and `stable` says of each stretch, one more than there are crossings,
     whether it is stable; it is empty when no sample told. `known` says whether the equations are enclosed
     between the `looked` values that were looked at, `enters` whether any matrix was seen to change along the
-    way.
+    way. Where a delay moves packets only, `stretches` is in how many stretches nothing depends on it; what
+    grows in each was counted in floats, and those beside a change were analysed.
     """
 
     edges: tuple[Crossing, ...]
@@ -114,6 +115,7 @@ class Search:
     known: bool
     looked: int
     enters: bool
+    stretches: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -443,7 +445,7 @@ def _late_search(
     known = [one for one in late if one.stable is not None]
     edges: list[Crossing] = []
     stable = [True] if from_stable else [bool(one.stable) for one in known[:1]]
-    whole, before = True, None
+    whole, before = len(known) == len(late), None
     for one in known:
         if one.stable != stable[-1]:
             pair = [one] if before is None else [before, one]
@@ -460,9 +462,8 @@ def _late_search(
             if from_stable:
                 break
         before = one
-    return Search(
-        tuple(edges), tuple(stable), (float(late[0].low), float(end)), whole, True, len(known), enters=True
-    )
+    scanned = float(late[0].low), float(end)
+    return Search(tuple(edges), tuple(stable), scanned, whole, True, len(known), True, len(late))
 
 
 def delay_reach(
