@@ -13,8 +13,6 @@ side by side, so that a frame of a thousand ticks needs no more columns than the
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -204,20 +202,19 @@ def _surd_ball(surd: Surd) -> Any:
 
 
 def _multiply(matrix: Balls, rows: Balls) -> Balls:
-    """Return the product with a matrix that is mostly zeros, as rows may be; exact zeros are the integer."""
+    """Return the product with a matrix that is mostly zeros, as rows may be; an exact zero is the integer."""
     product = np.zeros((len(matrix), rows.shape[1]), dtype=object)
     columns = rows.T.tolist()
-    for line, factors in zip(product, matrix.tolist(), strict=True):
-        used = [(place, factor) for place, factor in enumerate(factors) if not _is_zero(factor)]
-        for column, entries in enumerate(columns):
-            terms = [entries[place] * one for place, one in used if not _is_zero(entries[place])]
-            if terms:
-                line[column] = functools.reduce(operator.add, terms)
+    for line, entries in zip(product, matrix.tolist(), strict=True):
+        used = [(row, entry) for row, entry in enumerate(entries) if not isinstance(entry, int) or entry]
+        for place, column in enumerate(columns):
+            total = 0
+            for row, entry in used:
+                other = column[row]
+                if not isinstance(other, int) or other:
+                    total = other * entry + total
+            line[place] = total
     return product
-
-
-def _is_zero(entry: Any) -> bool:
-    return isinstance(entry, int) and not entry
 
 
 BALLS = Arithmetic(_multiply, np.add, np.subtract, lambda value: value.astype(object))

@@ -24,13 +24,13 @@ from apc.analysis.analysis import Prepared, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
 from apc.compiler.words import counted
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedSystem, close_loop
 from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, solve_spectrum
 from apc.frame.names import Free, parameter_of
-from apc.vary.batch import BatchEvaluator
+from apc.vary.batch import BatchEvaluator, lifted_here
 from apc.vary.bends import bends
 from apc.vary.bracket import Bracket, bracket, bracket_in_floats
 from apc.vary.crossings import Course, Courses, Root, Scan, scan
@@ -321,7 +321,7 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
         ]
 
     def at(value: float) -> ClosedSystem:
-        return family.system_at(point(value), root.system)
+        return close_loop(lifted_here([systems(value)[root.system][0]])[0])
 
     proved = bracket(root, systems, low=low, high=high)
     if proved is None:
