@@ -112,13 +112,15 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: 
     # A coarse cell whose corners agree, beside none that was divided, has nothing to tell.
     for j, i in np.argwhere((mixed | near) & ~suspect):
         leaves[int(i) * step, int(j) * step] = step
-    while divided:
-        leaves, divided = _divide(lattice, leaves, divided)
-        if not divided:
-            divided = [(*corner, size) for corner, size in leaves.items() if _tangled(lattice, corner, size)]
-            for i, j, _ in divided:
-                del leaves[i, j]
-    return _linked(lattice, leaves, cells)
+    while True:
+        while divided:
+            leaves, divided = _divide(lattice, leaves, divided)
+        changes = {corner: _changes(lattice, corner, size) for corner, size in leaves.items()}
+        # A cell that more than one piece of the boundary crosses is divided, if it can be.
+        tangled = [corner for corner, size in leaves.items() if size > 1 and len(changes[corner]) > 2]
+        if not tangled:
+            return _linked(lattice, leaves, changes, cells)
+        divided = [(*corner, leaves.pop(corner)) for corner in tangled]
 
 
 class _Lattice:
@@ -262,18 +264,15 @@ def _changes(lattice: _Lattice, corner: Node, size: int) -> list[tuple[Edge, boo
     return found
 
 
-def _tangled(lattice: _Lattice, corner: Node, size: int) -> bool:
-    """Say whether a leaf that can be divided is crossed by more than one piece of the boundary."""
-    return size > 1 and len(_changes(lattice, corner, size)) > 2
-
-
-def _linked(lattice: _Lattice, leaves: Mapping[Node, int], cells: int) -> Survey:
+def _linked(
+    lattice: _Lattice, leaves: Mapping[Node, int], every: Mapping[Node, list[tuple[Edge, bool]]], cells: int
+) -> Survey:
     """Link the crossings of all leaves: with the stable side on the left, a piece of the boundary enters a
     cell where its rim, counter-clockwise, leaves the stable side, and goes where it comes back to it.
     """
     follows: dict[Edge, Edge] = {}
     for corner, size in sorted(leaves.items()):
-        changes = _changes(lattice, corner, size)
+        changes = every[corner]
         leaving = [edge for edge, out in changes if out]
         back = [edge for edge, out in changes if not out]
         if len(changes) > 2 and _centre_is_stable(lattice, corner, size):
