@@ -1,7 +1,7 @@
 """Where the largest eigenvalue magnitude of a family of matrices crosses 1 as one number varies.
 
 Takes: a function that gives the matrices and their derivatives at many points of an interval, or of many.
-Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`; `extremes`.
+Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`; `extremes`, `narrowest`.
 Guarantees: every cell between samples is divided until the eigenvalues and their derivatives at both ends
 speak against a crossing that the ends don't show, or down to the cell size; every change found is bracketed.
 Does not: prove anything (see `bracket`), or choose the interval.
@@ -170,7 +170,7 @@ def scan_lines(
     count = len(points)
     if not any(len(one) for one in points):
         return tuple(Scan(np.empty(0), np.empty(0, dtype=bool), (), whole=True) for _ in points)
-    narrow = [_narrow(*pair) for pair in zip(points, least, strict=True)]
+    narrow = [narrowest(*pair) for pair in zip(points, least, strict=True)]
     lines = np.repeat(np.arange(count), [len(one) for one in points])
     samples = _sample(courses, lines, np.concatenate(points), ends=True)
     new = np.ones(len(samples.points), dtype=bool)
@@ -267,7 +267,7 @@ def _off_circle(samples: _Samples, way: Integers, sure: Truths) -> _Samples:
     return replace(samples, values=tuple(moved)).chosen(kept)
 
 
-def _narrow(points: Floats, least: float) -> Floats:
+def narrowest(points: Floats, least: float) -> Floats:
     """Return, for each cell between the points to begin with, how narrow its parts may get."""
     size = np.maximum(np.maximum(np.abs(points[:-1]), np.abs(points[1:])), least)
     return np.asarray(np.minimum(CELL * size, SHARE * np.diff(points)))

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.bordered import Logarithm
-from apc.vary.crossings import CELL, SHARE, Root, Scan, extremes
+from apc.vary.crossings import Root, Scan, extremes, narrowest
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -182,7 +182,7 @@ def cross(sheets: Sequence[LineSheet], points: Floats, least: float, *, first: b
     first
         Whether what lies beyond the first stretch that is seen to be unstable all along is left alone.
     """
-    narrow = np.minimum(CELL * np.maximum(np.abs(points[1:]), least), SHARE * np.diff(points))
+    narrow = narrowest(points, least)
     unstable = np.zeros(len(points) - 1, dtype=bool)
     for one in sheets:
         unstable |= _beyond_all_along(one, points)

@@ -32,7 +32,7 @@ from apc.eigen.spectrum import DRIFTS, solve_spectrum
 from apc.frame.names import Free, parameter_of
 from apc.vary.batch import BatchEvaluator, lifted_here
 from apc.vary.bends import bends
-from apc.vary.bracket import Bracket, bracket, bracket_in_floats
+from apc.vary.bracket import Bracket, ExactSystems, bracket, bracket_in_floats
 from apc.vary.crossings import Course, Courses, Root, Scan, scan
 from apc.vary.delays import (
     INSIDE,
@@ -323,12 +323,29 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
     def at(value: float) -> ClosedSystem:
         return close_loop(lifted_here([systems(value)[root.system][0]])[0])
 
-    proved = bracket(root, systems, low=low, high=high)
-    if proved is None:
-        proved = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
-    if proved is None and _alike(*(family.closed_at(point(one)) for one in beside)):
+    return _bracketed(root, found, (low, high), systems, at, lambda value: family.closed_at(point(value)))
+
+
+def _bracketed(
+    root: Root,
+    found: Scan,
+    ends: tuple[float, float],
+    systems: ExactSystems,
+    at: Callable[[float], ClosedSystem],
+    every: Callable[[float], Sequence[ClosedSystem]],
+) -> Crossing | None:
+    """Prove a crossing between two ends by balls or, where these don't tell, by the bounds of floats.
+
+    `systems` gives the systems of a value for balls, `at` the one that crosses as an analysis has it, and
+    `every` all of them.
+    """
+    low, high = ends
+    held = bracket(root, systems, low=low, high=high)
+    if held is None:
+        held = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
+    if held is None and _alike(*map(every, _beside(root, found))):
         return None
-    return _described(root, proved, [(at(root.value), systems(root.value)[root.system][1])])
+    return _described(root, held, [(at(root.value), systems(root.value)[root.system][1])])
 
 
 def _beside(root: Root, found: Scan) -> tuple[float, float]:
@@ -529,14 +546,8 @@ def _delay_crossing(
         listed = split(*lifted_groups(moved, prepared=prepared)).systems
         return list(with_rigid(listed))
 
-    held = bracket(root, systems, low=float(piece.low), high=float(piece.high))
-    if held is None:
-        held = bracket_in_floats(
-            root,
-            lambda value: [systems(value)[root.system][0]],
-            low=float(piece.low),
-            high=float(piece.high),
-        )
-    if held is None and _alike(*([one for one, _ in systems(value)] for value in _beside(root, found))):
-        return None
-    return _described(root, held, [systems(root.value)[root.system]])
+    return _bracketed(
+        *(root, found, (float(piece.low), float(piece.high)), systems),
+        lambda value: systems(value)[root.system][0],
+        lambda value: [one for one, _ in systems(value)],
+    )
