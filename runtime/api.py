@@ -169,7 +169,7 @@ def critical(
     lower: str | None = None,
     upper: str | None = None,
 ) -> Critical:
-    """Find every value of a parameter or delay at which a scene becomes stable or unstable.
+    """Find the values of a parameter or delay at which a scene becomes stable or unstable.
 
     Parameters
     ----------

@@ -8,13 +8,14 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from apc.analysis.analysis import analyze, lifted_groups
+from apc.analysis.analysis import analyze, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import frame_balls, precision
 from apc.eigen.modes import split
 from apc.eigen.relative import relative
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
+from apc.frame.schedule import ORDER
 from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.evaluator import evaluator, reaches_time
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
@@ -54,6 +55,20 @@ def test_other_graphs_clocks_and_groups_are_batched_alike(name: str) -> None:
         alone = analyze(apply(system, [Override(Free("contact.stiffness"), Fraction(value))]))
         radius = max(float(np.abs(np.linalg.eigvals(one[k])).max()) for one in found)
         assert abs(radius - alone.spectral_radius) <= 1e-9
+
+
+@pytest.mark.parametrize("name", ["cube.mass", "contact.delay", "lan.delay"])
+def test_what_is_prepared_once_serves_no_other_numbers_and_no_other_order(name: str) -> None:
+    """Another value has the matrices of a scene written with it, whatever was asked before."""
+    free = [Free("contact.stiffness")]
+    system, value = compiled(AVERAGE), np.array([[700.0]])
+    first = evaluator(system, free)
+    assert evaluator(system, free, prepared=prepare(system)) is first
+    other = apply(system, [Override(Free(name), Fraction(3, 1000))])
+    alone = analyze(apply(other, [Override(free[0], Fraction(700))]))
+    found = evaluator(other, free).matrices(value)
+    assert abs(max(np.abs(np.linalg.eigvals(one)).max() for one in found) - alone.spectral_radius) <= 1e-11
+    assert evaluator(system, free, prepared=prepare(system, order=ORDER[::-1])) is not first
 
 
 def test_derivatives_are_those_of_the_exact_matrices() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import mpmath
 import numpy as np
@@ -18,6 +20,7 @@ from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.critical import critical
 from apc.vary.crossings import scan, scan_lines
+from apc.vary.lags import LateStretch, late_stretches
 from apc.vary.margins import margins
 from tests.bruteforce import Scene, frame_matrices, frame_matrix
 from tests.reference import CONTACT_LIMITS, LIMITS
@@ -174,6 +177,10 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
     assert first.error == 0.0
     ticks = first.value / 1e-3
     assert ticks == pytest.approx(round(ticks), abs=1e-9)
+    assert found.stretches == 16, "a packet comes a tick later after every millisecond"
+    assert "16 pieces nothing depends on it: what grows there was counted in floats" in " ".join(
+        str(found).split()
+    )
     sides = [
         analyze(apply(system, [Override(Free("lan.delay"), Fraction(round(ticks), 1000) + shift)])).stable
         for shift in (Fraction(-1, 10**7), Fraction(1, 10**7))
@@ -304,6 +311,17 @@ def test_verdicts_on_both_sides_of_a_delay_are_those_of_linearizations_there() -
         for side, factor in (("below", 1 - 1e-6), ("above", 1 + 1e-6)):
             beside = Override(Free("wall.delay"), Fraction(one.value * factor))
             assert analyze(apply(system, [beside])).stable is (one.stable_side == side)
+
+
+def test_delays_whose_eigenvalues_were_not_counted_are_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    def uncounted(*given: Any) -> list[LateStretch]:
+        first, *others = late_stretches(*given) or []
+        return [replace(first, stable=None), *others]
+
+    monkeypatch.setattr("apc.vary.search.late_stretches", uncounted)
+    found = critical(compiled(AVERAGE), "lan.delay", upper="16 ms")
+    assert not found.whole
+    assert "an eigenvalue keeps near to the boundary" in str(found)
 
 
 def test_a_delay_where_what_is_heard_at_the_start_decides_is_refused() -> None:

@@ -40,7 +40,7 @@ def test_a_scene_that_is_not_stable_has_no_margins_and_says_so() -> None:
 def test_the_table_fits_80_columns() -> None:
     text = str(margins(compiled(AVERAGE)))
     assert max(map(len, text.splitlines())) <= 80
-    assert "no limit up to" in text
+    assert "none found up to" in text
 
 
 def test_a_delay_that_is_scanned_is_scanned_far_enough_or_said_not_to_be() -> None:

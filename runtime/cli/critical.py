@@ -39,10 +39,10 @@ def critical_command(
     """Find the largest stable value of a parameter, with its error.
 
     PATH names a stiffness, damping, mass or delay, of one group or of all:
-    coordination.stiffness, left.device.mass, lan.delay. Every value at which
-    the scene becomes stable or unstable is found, down to a cell size that
-    is printed, and on which side of it the scene is stable. FILE is a
-    topology or a compiled model.
+    coordination.stiffness, left.device.mass, lan.delay. The values at which
+    the scene becomes stable or unstable are looked for, down to a cell size
+    that is printed; each is proved where it can be, and on which side of it
+    the scene is stable. FILE is a topology or a compiled model.
     """
     start_single_threaded()
     from apc.inputs import open_scene

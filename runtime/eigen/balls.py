@@ -202,12 +202,18 @@ def _surd_ball(surd: Surd) -> Any:
 
 
 def _multiply(matrix: Balls, rows: Balls) -> Balls:
-    """Return the product with a matrix that is mostly zeros."""
+    """Return the product with a matrix that is mostly zeros, as rows may be; an exact zero is the integer."""
     product = np.zeros((len(matrix), rows.shape[1]), dtype=object)
-    for line, entries in enumerate(matrix):
-        for place, entry in enumerate(entries):
-            if not isinstance(entry, int) or entry:  # an exact zero is the integer
-                product[line] += rows[place] * entry
+    columns = rows.T.tolist()
+    for line, entries in zip(product, matrix.tolist(), strict=True):
+        used = [(row, entry) for row, entry in enumerate(entries) if not isinstance(entry, int) or entry]
+        for place, column in enumerate(columns):
+            total = 0
+            for row, entry in used:
+                other = column[row]
+                if not isinstance(other, int) or other:
+                    total = other * entry + total
+            line[place] = total
     return product
 
 

@@ -83,11 +83,11 @@ def left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
     found, vectors = np.linalg.eig(matrix.swapaxes(-1, -2))
     distances = np.abs(values[..., :, None] - found[..., None, :])
     nearest = np.argmin(distances, axis=-1)
-    for one in np.ndindex(*values.shape[:-1]):
-        if len(set(nearest[one].tolist())) < values.shape[-1]:  # each goes to one only, as they come
-            for place, line in enumerate(distances[one]):
-                nearest[one][place] = np.argmin(line)
-                distances[one][:, nearest[one][place]] = np.inf
+    claimed = (np.diff(np.sort(nearest, axis=-1), axis=-1) == 0).any(axis=-1)
+    for one in map(tuple, np.argwhere(claimed).tolist()):  # each goes to one only, as they come
+        for place, line in enumerate(distances[one]):
+            nearest[one][place] = np.argmin(line)
+            distances[one][:, nearest[one][place]] = np.inf
     rows = np.take_along_axis(vectors.swapaxes(-1, -2), nearest[..., None], axis=-2)
     return np.asarray(rows.astype(np.complex128))
 

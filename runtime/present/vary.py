@@ -60,14 +60,18 @@ def critical_text(found: Critical) -> str:
         kind = "jump, " if one.kind == "jump" else ""
         lines.append(f"    {kind}stable {one.stable_side} it, {in_hertz(one.frequency_hz)}, {one.proof}")
     lines += ["", f"  scanned from {low} to {high}"]
-    if found.known:
+    if found.stretches:
+        counts = f"within each of {counted(found.stretches, 'piece', ',d')} nothing depends on it: "
+        analysed = ", and those beside a jump were analysed" if found.crossings else ""
+        lines += wrapped(f"{counts}what grows there was counted in floats{analysed}", "  ", "  ")
+    elif found.known:
         lines.append(f"  two crossings nearer than {found.cell:.0e} of the value could hide")
     else:
         values = counted(found.looked, "value")
         what = f"{values} were looked at; what the equations do between two of them is not known: "
         lines += wrapped(f"{what}a narrow change of the verdict could hide there", "  ", "  ")
     if not found.whole:
-        lines.append("  an eigenvalue keeps near to the boundary: more of them could")
+        lines.append("  an eigenvalue keeps near to the boundary: more crossings could hide")
     return "\n".join(lines)
 
 
@@ -91,7 +95,7 @@ def margins_text(found: Margins) -> str:
             lines.append(f"{name}{start:<14} not looked for: {one.note}")
             continue
         if one.value is None:
-            lines.append(f"{name}{start:<14} no limit up to {one.scanned:.5g} {unit}")
+            lines.append(f"{name}{start:<14} none found up to {one.scanned:.5g} {unit}")
             continue
         end = f"{known_digits(one.value, one.error or 0.0, 7)} {unit}"
         times = f"{one.factor:.4g}" if one.factor is not None else "–"

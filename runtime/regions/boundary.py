@@ -319,7 +319,7 @@ def _search(family: Family, knots: _Knots, intervals: Integers) -> Integers:
     middle = (knots.points[a] + knots.points[b]) / 2
     across = np.stack([chord[:, 1], -chord[:, 0]], axis=1) / 2  # to the right, where it is unstable
     stable, unstable = just_inside(middle - across), just_inside(middle + across)
-    ends = log_magnitudes(family, np.concatenate([stable, unstable]), 1)[:, 0].reshape(2, -1).T
+    ends = log_magnitudes(family.matrices(np.concatenate([stable, unstable])), 1)[:, 0].reshape(2, -1).T
     found = (ends[:, 0] < 0) & (ends[:, 1] >= 0)
     knots.error[a[~found]] = np.linalg.norm(chord[~found], axis=1)
     a, b = a[found], b[found]

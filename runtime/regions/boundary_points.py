@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.regions.cells import INSIDE_RIM
-from apc.regions.eigenpairs import Family, Pairs, follow, leading, log_magnitudes
+from apc.regions.eigenpairs import Family, Pairs, follow, join, leading, log_magnitudes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -67,7 +67,7 @@ def cross(family: Family, stable: Floats, unstable: Floats, growth: Floats) -> t
         middle = (low[rest] + high[rest]) / 2
         looked_at = np.where(arrived, reached, middle)
         spots = stable[rest] + looked_at[:, None] * along[rest]
-        top = log_magnitudes(family, just_inside(spots), 1)[:, 0]
+        top = log_magnitudes(family.matrices(just_inside(spots)), 1)[:, 0]
         good = arrived & (top <= rounded_growth(spots, found.gradient))
         done = rest[good]
         points[done] = place[good]
@@ -123,7 +123,7 @@ def clear(family: Family, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
     """Say of each point of the boundary whether no other eigenvalue has left the unit circle there."""
     alone: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
     if alone.any():
-        top = log_magnitudes(family, just_inside(points[alone]), 1)[:, 0]
+        top = log_magnitudes(family.matrices(just_inside(points[alone])), 1)[:, 0]
         alone[alone] = top <= rounded_growth(points[alone], pairs.gradient[alone])
     return alone
 
@@ -147,21 +147,23 @@ def polish(family: Family, points: Floats, guess: Pairs, along: Floats | None = 
     along
         Directions to stay on (k, 2); left out, each point moves down its gradient.
     """
-    points, pairs = points.copy(), guess.at(np.arange(len(points)))
-    rest = np.arange(len(points))
+    found, parts = np.full(points.shape, np.nan), [guess.at(slice(0))]
+    rest, order = np.arange(len(points)), np.arange(0)
     for _ in range(MOST_STEPS):
-        own = follow(family, points[rest], pairs.at(rest))
-        _put(pairs, rest, own)
-        way = own.gradient if along is None else along[rest]
-        rise = (own.gradient * way).sum(axis=1)
-        step = -(own.growth / np.where(rise == 0, np.nan, rise))[:, None] * way
-        points[rest] += step
-        left = ~(np.linalg.norm(step, axis=1) <= SHORT)
-        lost = ~(np.linalg.norm(step, axis=1) <= 1)
-        points[rest[lost]] = np.nan
-        pairs.value[rest] += (own.slope * np.where(lost[:, None], 0, step)).sum(axis=1)
-        rest = rest[left & ~lost]
+        guess = follow(family, points, guess)
+        way = guess.gradient if along is None else along
+        rise = (guess.gradient * way).sum(axis=1)
+        step = -(guess.growth / np.where(rise == 0, np.nan, rise))[:, None] * way
+        size = np.hypot(*step.T)
+        points, guess = points + step, moved(guess, step)
+        done = size <= SHORT
+        found[rest[done]] = points[done]
+        ended = done | ~(size <= 1)
+        if not ended.any():
+            continue
+        order, parts = np.concatenate([order, rest[ended]]), [*parts, guess.at(ended)]
+        rest, points, guess = rest[~ended], points[~ended], guess.at(~ended)
+        along = along if along is None else along[~ended]
         if not len(rest):
-            return points, pairs
-    points[rest] = np.nan
-    return points, pairs
+            break
+    return found, join([*parts, guess]).at(np.argsort(np.concatenate([order, rest])))

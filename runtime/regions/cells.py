@@ -99,7 +99,7 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: 
     if (unsure[1:, 1:] & unsure[1:, :-1] & unsure[:-1, 1:] & unsure[:-1, :-1]).any():
         what = "in part of the rectangle some motion neither grows nor dies out, as far as floats can tell"
         raise ApcError(Mistake("E905", Place("region"), what, hint="some damping, or wider ranges"))
-    suspect = _suspect(grid)
+    suspect = _suspect(grid[None])[0]
     leaves: dict[Node, int] = {}
     divided = [(int(i) * step, int(j) * step, step) for j, i in np.argwhere(suspect)]
     stable = grid[..., 0] < 0
@@ -112,13 +112,15 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: 
     # A coarse cell whose corners agree, beside none that was divided, has nothing to tell.
     for j, i in np.argwhere((mixed | near) & ~suspect):
         leaves[int(i) * step, int(j) * step] = step
-    while divided:
-        leaves, divided = _divide(lattice, leaves, divided)
-        if not divided:
-            divided = [(*corner, size) for corner, size in leaves.items() if _tangled(lattice, corner, size)]
-            for i, j, _ in divided:
-                del leaves[i, j]
-    return _linked(lattice, leaves, cells)
+    while True:
+        while divided:
+            leaves, divided = _divide(lattice, leaves, divided)
+        changes = {corner: _changes(lattice, corner, size) for corner, size in leaves.items()}
+        # A cell that more than one piece of the boundary crosses is divided, if it can be.
+        tangled = [corner for corner, size in leaves.items() if size > 1 and len(changes[corner]) > 2]
+        if not tangled:
+            return _linked(lattice, leaves, changes, cells)
+        divided = [(*corner, leaves.pop(corner)) for corner in tangled]
 
 
 class _Lattice:
@@ -172,12 +174,11 @@ def _divide(
     nodes = [(i + a * h, j + b * h) for i, j, h in halves for b in range(3) for a in range(3)]
     blocks = lattice.sample(nodes).reshape(len(halves), 3, 3, -1)
     again = []
-    for (i, j, h), block in zip(halves, blocks, strict=True):
-        suspect = _suspect(block) & (h > 1)
+    for (i, j, h), suspect in zip(halves, _suspect(blocks), strict=True):
         for b in range(2):
             for a in range(2):
                 corner = (i + a * h, j + b * h)
-                if suspect[b, a]:
+                if suspect[b, a] and h > 1:
                     again.append((*corner, h))
                 else:
                     leaves[corner] = h
@@ -192,34 +193,32 @@ def _mixed(stable: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _suspect(values: Floats) -> NDArray[np.bool_]:
-    """Say of each cell of a grid of nodes (n + 1, m + 1, branches), rows y, whether it may hide something.
+    """Say of each cell of grids of nodes (g, n + 1, m + 1, branches), rows y, whether it may hide something.
 
     A cell with stable corners hides something when a branch may rise above zero inside; one with unstable
     corners when the first branch may sink below zero; one whose corners disagree when the boundary passes
     through all of its edges, or bends more than it slopes.
     """
-    along_x = CAUTION * _second(values, axis=1)  # (n + 1, m, branches): at the ends of each cell, row by row
-    along_y = CAUTION * _second(values, axis=0)
-    corners = np.stack([values[:-1, :-1], values[:-1, 1:], values[1:, :-1], values[1:, 1:]])
-    bend = np.stack([along_x[:-1], along_x[1:]]).max(axis=0) + np.stack(
-        [along_y[:, :-1], along_y[:, 1:]]
-    ).max(axis=0)
+    along_x = CAUTION * _second(values, axis=2)  # (g, n + 1, m, branches): at the ends of each cell
+    along_y = CAUTION * _second(values, axis=1)
+    x = np.stack([along_x[:, :-1], along_x[:, 1:]])
+    y = np.stack([along_y[:, :, :-1], along_y[:, :, 1:]])
+    lower, upper = values[:, :-1], values[:, 1:]
+    corners = np.stack([lower[:, :, :-1], lower[:, :, 1:], upper[:, :, :-1], upper[:, :, 1:]])
+    bend = x.max(axis=0) + y.max(axis=0)
     top, first = corners[..., 0], bend[..., 0]
-    stable, unstable = (top < 0).all(axis=0), (top >= 0).all(axis=0)
+    below = top < 0
+    stable, unstable = below.all(axis=0), ~below.any(axis=0)
     span = top.max(axis=0) - top.min(axis=0)
-    crossed = (top[0] < 0) == (top[3] < 0)
-    crossed &= ((top[1] < 0) == (top[2] < 0)) & ((top[0] < 0) != (top[1] < 0))
+    crossed = (below[0] == below[3]) & (below[1] == below[2]) & (below[0] != below[1])
     suspect: NDArray[np.bool_] = ~stable & ~unstable & (crossed | (first > 2 * span))
     # At most 1/8 of both second differences: the envelope is looked at only where that reaches zero.
     rising = stable & (corners.max(axis=0) + bend / 8 >= 0).any(axis=-1)
     sinking = unstable & (top.min(axis=0) - first / 8 <= 0)
     for looked_at, sign, branches in ((rising, 1.0, slice(None)), (sinking, -1.0, slice(0, 1))):
-        j, i = np.nonzero(looked_at)
-        if len(j):
-            four = sign * corners[:, j, i, branches]
-            x = np.stack([along_x[j, i, branches], along_x[j + 1, i, branches]])
-            y = np.stack([along_y[j, i, branches], along_y[j, i + 1, branches]])
-            suspect[j, i] = (_envelope(four, x, y) >= 0).any(axis=(0, 1, 3))
+        if looked_at.any():
+            four, own_x, own_y = (one[:, looked_at, branches] for one in (corners, x, y))
+            suspect[looked_at] = (_envelope(sign * four, own_x, own_y) >= 0).any(axis=(0, 1, 3))
     return suspect
 
 
@@ -265,18 +264,15 @@ def _changes(lattice: _Lattice, corner: Node, size: int) -> list[tuple[Edge, boo
     return found
 
 
-def _tangled(lattice: _Lattice, corner: Node, size: int) -> bool:
-    """Say whether a leaf that can be divided is crossed by more than one piece of the boundary."""
-    return size > 1 and len(_changes(lattice, corner, size)) > 2
-
-
-def _linked(lattice: _Lattice, leaves: Mapping[Node, int], cells: int) -> Survey:
+def _linked(
+    lattice: _Lattice, leaves: Mapping[Node, int], every: Mapping[Node, list[tuple[Edge, bool]]], cells: int
+) -> Survey:
     """Link the crossings of all leaves: with the stable side on the left, a piece of the boundary enters a
     cell where its rim, counter-clockwise, leaves the stable side, and goes where it comes back to it.
     """
     follows: dict[Edge, Edge] = {}
     for corner, size in sorted(leaves.items()):
-        changes = _changes(lattice, corner, size)
+        changes = every[corner]
         leaving = [edge for edge, out in changes if out]
         back = [edge for edge, out in changes if not out]
         if len(changes) > 2 and _centre_is_stable(lattice, corner, size):

@@ -21,6 +21,9 @@ STRAIGHT = 0.4
 # Pieces an interval is cut into at most; each doubling makes `between` 16 times better.
 MOST_PIECES = 64
 
+# The other three of each of four points.
+_OTHERS = ([1, 0, 0, 0], [2, 2, 1, 1], [3, 3, 3, 2])
+
 # Pieces whose ends are all worked out at once: intervals rarely need more.
 FIRST_PIECES = 8
 
@@ -158,13 +161,9 @@ def through_four(
     weight = 1 / gaps.prod(axis=2)  # of Lagrange's polynomials
     centre = (1 / gaps).sum(axis=2) - 1
     at = np.asarray(share)[None, :, None] - u[:, None, :]  # (k, m, 4)
-    others = np.ones_like(at)
-    sums = np.zeros_like(at)  # l_j'/l_j times the product of the others: l_j' weighed like l_j
-    for j in range(4):
-        rest = [i for i in range(4) if i != j]
-        one, two, three = (at[..., i] for i in rest)
-        others[..., j] = one * two * three
-        sums[..., j] = one * two + one * three + two * three
+    one, two, three = (at[..., places] for places in _OTHERS)
+    others = one * two * three
+    sums = one * two + one * three + two * three  # of l_j' what `others` is of l_j
     lagrange, lagrange_slope = others * weight[:, None], sums * weight[:, None]
     square, square_slope = lagrange**2, 2 * lagrange * lagrange_slope
     tilt = 1 - 2 * at * centre[:, None]

@@ -66,7 +66,7 @@ class Pairs:
         """log|λ| (k,): above zero the motion grows."""
         return np.log(np.abs(self.value))
 
-    def at(self, places: Integers | NDArray[np.bool_]) -> Pairs:
+    def at(self, places: Integers | NDArray[np.bool_] | slice) -> Pairs:
         """Return some of the points."""
         return Pairs(*(getattr(self, name)[places] for name in self.__slots__))
 
@@ -76,9 +76,9 @@ def join(parts: list[Pairs]) -> Pairs:
     return Pairs(*(np.concatenate([getattr(one, name) for one in parts]) for name in Pairs.__slots__))
 
 
-def log_magnitudes(family: Family, points: Floats, count: int) -> Floats:
+def log_magnitudes(matrices: Sequence[Floats], count: int) -> Floats:
     """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""
-    found = np.hstack([np.abs(np.linalg.eigvals(one)) for one in family.matrices(points)])
+    found = np.hstack([np.abs(np.linalg.eigvals(one)) for one in matrices])
     largest = -np.sort(-found, axis=1)[:, :count]
     logarithms: Floats = np.log(np.maximum(largest, LEAST_MAGNITUDE))
     return logarithms
@@ -126,13 +126,12 @@ def follow(family: Family, points: Floats, guess: Pairs) -> Pairs:
     system = guess.system
     value, slope = np.zeros(k, np.complex128), np.zeros((k, 2), np.complex128)
     right, left = np.zeros_like(guess.right), np.zeros_like(guess.left)
-    for s in np.unique(system).tolist():
-        rows = np.flatnonzero(system == s)
+    for s, rows in _by_system(system):
         n = family.sizes[s]
         matrix, derivatives = family.slopes(s, points[rows])
-        near = guess.at(rows)
         pair = refined(
-            matrix, Eigenpairs(near.value[:, None], near.right[:, :n, None], near.left[:, None, :n])
+            matrix,
+            Eigenpairs(guess.value[rows, None], guess.right[rows, :n, None], guess.left[rows, None, :n]),
         )
         value[rows], slope[rows] = pair.values[:, 0], pair.slopes(derivatives)[..., 0].T
         right[rows, :n], left[rows, :n] = pair.right[..., 0], pair.left[:, 0]
@@ -140,12 +139,17 @@ def follow(family: Family, points: Floats, guess: Pairs) -> Pairs:
     return Pairs(system, value, slope, gradient, right, left)
 
 
+def _by_system(system: Integers) -> list[tuple[int, Integers | slice]]:
+    """Return each system with its points, all of them as a slice."""
+    used = sorted(set(system.tolist()))
+    return [(s, np.flatnonzero(system == s) if len(used) > 1 else slice(None)) for s in used]
+
+
 def value_errors(family: Family, pairs: Pairs) -> Floats:
     """Return by how much the eigenvalues (k,) may be off for what their matrices are off: |w| E |v|/|w v|."""
     found = np.zeros(len(pairs.value))
-    for s in np.unique(pairs.system).tolist():
-        rows, n = np.flatnonzero(pairs.system == s), family.sizes[s]
-        own = pairs.at(rows)
-        pair = Eigenpairs(own.value[:, None], own.right[:, :n, None], own.left[:, None, :n])
+    for s, rows in _by_system(pairs.system):
+        n = family.sizes[s]
+        pair = Eigenpairs(pairs.value[rows, None], pairs.right[rows, :n, None], pairs.left[rows, None, :n])
         found[rows] = pair.errors(family.errors[s])[:, 0]
     return found

@@ -322,7 +322,7 @@ def _samples(
             source.closed_at(value)
             what = "the scene's frame leaves the range of floating point numbers in part of the rectangle"
             raise ApcError(Mistake("E905", PLACE, what, hint="a smaller range"))
-    return log_magnitudes(family, points, BRANCHES)
+    return log_magnitudes(matrices, BRANCHES)
 
 
 def _curve(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, arc: Arc) -> Curve:

@@ -237,7 +237,7 @@ def _moving(
     family = resolve_family(source, rectangle, source.errors)
     if isinstance(family, DirectFamily):
         return None
-    found = survey(lambda points: log_magnitudes(family, points, BRANCHES), cells=cells)
+    found = survey(lambda points: log_magnitudes(family.matrices(points), BRANCHES), cells=cells)
     arcs = trace(family, found, tolerance=tolerance * (1 - RESTATED), offset=rectangle.offset)
     area, off = stable_area(arcs, found)
     offset = rectangle_of(delay, other).offset

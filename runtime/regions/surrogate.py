@@ -100,39 +100,35 @@ class DirectFamily:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChebyshevFamily:
-    """A `Family` that sums series: `terms` (m, 2) are the degrees (i, j) kept, `coefficients` (m, n²) theirs.
+    """A `Family` that sums series: `terms` (m, 2) are the degrees (i, j) of all that some system needs.
 
-    One of each a system.
+    `coefficients` (m, 3 n²), one a system, are those of its matrices and of their derivatives over x and y.
     """
 
-    terms: tuple[NDArray[np.int64], ...]
+    terms: NDArray[np.int64]
     coefficients: tuple[Floats, ...]
     sizes: tuple[int, ...]
     errors: tuple[Floats, ...]
 
     def matrices(self, points: Floats) -> tuple[Floats, ...]:
         """Return each system's matrices (k, n, n) at points (k, 2)."""
-        degree = max(int(one.max(initial=0)) for one in self.terms)
-        x, y = chebvander(2 * points.T - 1, degree)
+        polynomials = self._polynomials(points)
         return tuple(
-            ((x[:, terms[:, 0]] * y[:, terms[:, 1]]) @ coefficients).reshape(-1, n, n)
-            for terms, coefficients, n in zip(self.terms, self.coefficients, self.sizes, strict=True)
+            (polynomials @ coefficients[:, : n * n]).reshape(-1, n, n)
+            for coefficients, n in zip(self.coefficients, self.sizes, strict=True)
         )
 
     def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
         """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
-        terms = self.terms[system]
-        degree = int(terms.max(initial=0))
-        values = chebvander(2 * points.T - 1, degree)
-        derivative = chebder(np.eye(degree + 1), scl=2)  # of each polynomial, as a series
-        slopes = values[..., : len(derivative)] @ derivative
-        (x, y), (slope_x, slope_y) = (
-            (one[0][:, terms[:, 0]], one[1][:, terms[:, 1]]) for one in (values, slopes)
-        )
         n = self.sizes[system]
-        summed = np.concatenate([x * y, slope_x * y, x * slope_y]) @ self.coefficients[system]
-        both = summed.reshape(3, len(points), n, n)
-        return both[0], both[1:]
+        summed = (self._polynomials(points) @ self.coefficients[system]).reshape(-1, 3, n, n)
+        return summed[:, 0], summed[:, 1:].swapaxes(0, 1)
+
+    def _polynomials(self, points: Floats) -> Floats:
+        """Return T_i(x) T_j(y) of every term (k, m) at points (k, 2)."""
+        x, y = chebvander(2 * points.T - 1, int(self.terms.max(initial=0)))
+        found: Floats = x[:, self.terms[:, 0]] * y[:, self.terms[:, 1]]
+        return found
 
 
 def resolve_family(evaluator: Evaluator, rectangle: Rectangle, errors: Errors) -> Family:
@@ -168,16 +164,11 @@ def resolve_family(evaluator: Evaluator, rectangle: Rectangle, errors: Errors) -
             for axis in (0, 1)
         )
         if x_done and y_done:
-            kept = [
-                np.argwhere(np.abs(one).max(axis=2) > DROPPED * most)
-                for one, most in zip(series, largest, strict=True)
-            ]
             left_out = sum(counts) * CONVERGED + counts[0] * counts[1] * DROPPED
+            terms, coefficients = _with_slopes(series, [DROPPED * most for most in largest])
             return ChebyshevFamily(
-                terms=tuple(kept),
-                coefficients=tuple(
-                    one[terms[:, 0], terms[:, 1]] for one, terms in zip(series, kept, strict=True)
-                ),
+                terms=terms,
+                coefficients=coefficients,
                 sizes=tuple(one.shape[1] for one in sampled),
                 errors=tuple(
                     one * scale / scale[:, None] + left_out * most
@@ -208,6 +199,25 @@ def _sample(
         by_y = (x @ values).reshape(counts[0], counts[1], -1)
         series.append(y @ by_y)
     return sampled, series
+
+
+def _with_slopes(series: list[Floats], dropped: list[float]) -> tuple[NDArray[np.int64], tuple[Floats, ...]]:
+    """Return the terms (m, 2) some system's series has beyond what is dropped, or its slopes have of them.
+
+    With them the coefficients (m, 3 n²), one a system, of the series (n_x, n_y, n²) and of both slopes.
+    """
+    found = []
+    for one, least in zip(series, dropped, strict=True):
+        kept = np.where(np.abs(one).max(axis=2, keepdims=True, initial=0.0) > least, one, 0.0)
+        every = np.zeros((3, *one.shape))
+        every[0], every[1, :-1], every[2, :, :-1] = (
+            kept,
+            *(chebder(kept, scl=2, axis=axis) for axis in (0, 1)),
+        )
+        found.append(every)
+    terms = np.argwhere(sum((one != 0).any(axis=(0, 3)) for one in found))
+    picked = (one[:, terms[:, 0], terms[:, 1]].swapaxes(0, 1).reshape(len(terms), -1) for one in found)
+    return terms, tuple(picked)
 
 
 def _to_coefficients(nodes: Floats) -> Floats:

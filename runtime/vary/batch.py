@@ -1,7 +1,7 @@
 """The frame matrices of a system for many values of its parameters at once, with their derivatives.
 
 Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
-Gives: `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`; `relative_here`,
+Gives: `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`; `lifted_here`, `relative_here`,
 `inverse_size`, `is_beyond`.
 Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
 derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
@@ -16,14 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import casadi
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Closed, ClosedSystem, close, close_loop
+from apc.eigen.closing import Closed, ClosedSystem, Loop, close, close_loop
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
@@ -32,7 +32,7 @@ from apc.frame.batch_lift import lift_rows
 from apc.frame.discretize import UNIT, Step, exponential_rows
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import FrameMap, compose, composed_bounded, lift
+from apc.frame.lift import FrameMap, LiftedSite, compose, composed_bounded, lift
 from apc.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
 from apc.frame.parameters import free_rows
@@ -52,6 +52,7 @@ from apc.vary.wiring import (
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
+Wired = TypeVar("Wired", ClosedSystem, Loop)
 
 # The complex step: its square vanishes beside 1, whatever the parameter's size.
 STEP = 1e-60
@@ -183,27 +184,7 @@ class BatchEvaluator:
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
-        return tuple(self.system_at(value, place) for place in range(len(self.wirings)))
-
-    def system_at(self, value: Sequence[float], place: int) -> ClosedSystem:
-        """Return one closed system at one point (m,), as an analysis has it: with error bounds."""
-        assert not self.timed, "another time is another schedule"
-        system = self.wirings[place].system
-        return close_loop(replace(system, sites=self.sites_moved(system.sites, value)))
-
-    def sites_moved(self, sites: Sequence[PeerGroup], value: Sequence[float]) -> tuple[PeerGroup, ...]:
-        """Return some of the sites at one point (m,), linearized and lifted anew."""
-        used = {site_key(group) for group in sites}
-        moved = {
-            site_key(group): _moved(group, vector)
-            for group, vector in self._points(value)
-            if site_key(group) in used
-        }
-        return tuple(
-            replace(one, parameters=new.parameters, site=new.site, exact=new.exact, lifted=new.lifted)
-            for one in sites
-            if (new := moved[site_key(one)])
-        )
+        return tuple(map(close_loop, lifted_here(self.exact_at(value))))
 
     def exact_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems with the sites of one point (m,), for exact arithmetic.
@@ -211,20 +192,22 @@ class BatchEvaluator:
         Their matrices in floats are still those of the point that stands for all.
         """
         assert not self.timed, "another time is another schedule"
-        return self.sites_at(value)
+        return self.with_sites(self.closed, value)
 
-    def sites_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
-        """Return the same, whatever varies; of a time, all but the steps is of that point."""
+    def with_sites(self, systems: Sequence[Wired], value: Sequence[float]) -> tuple[Wired, ...]:
+        """Return systems with the exact sites of one point (m,); of a time, all but the steps is of it."""
+        used = {site_key(group) for system in systems for group in system.sites}
         moved = {
             site_key(group): (vector, linearize_exact(group.jacobians, vector))
             for group, vector in self._points(value)
+            if site_key(group) in used
         }
 
         def at_point(group: PeerGroup) -> PeerGroup:
             vector, exact = moved[site_key(group)]
             return replace(group, parameters=vector, exact=exact)
 
-        return tuple(replace(system, sites=tuple(map(at_point, system.sites))) for system in self.closed)
+        return tuple(replace(system, sites=tuple(map(at_point, system.sites))) for system in systems)
 
     def _points(self, value: Sequence[float]) -> list[tuple[PeerGroup, Floats]]:
         point = np.array([value], dtype=np.float64)
@@ -378,7 +361,7 @@ def _told_apart(evaluator: BatchEvaluator) -> tuple[Wiring, ...]:
         matrix = closed_loop(wiring, lifted)
         moves = bool(np.isfinite(matrix).all() and not are_rigid(wiring, matrix).all())
         if moves and not wiring.rigid.drifts:
-            there = find_rigid_modes(evaluator.sites_at(other)[place], with_drifts=False)
+            there = find_rigid_modes(evaluator.with_sites(evaluator.closed, other)[place], with_drifts=False)
             found.append(told_by_constants(wiring, there))
         else:
             found.append(wiring)
@@ -462,13 +445,19 @@ def relative_here(wiring: Wiring, matrix: Floats, error: Floats) -> Relative:
     return replace(at, doubt=inverse_size(system) @ left)
 
 
-def _moved(group: PeerGroup, vector: Floats) -> PeerGroup:
-    """Return the group with other parameters, linearized and lifted anew."""
-    built = group.jacobians
-    site = site_of_row(built, linearize_rows(built, vector[None])[0])
-    exact = linearize_exact(built, vector)
-    lifted = lift(site, group.schedule, exact=exact)
-    return replace(group, parameters=vector, site=site, exact=exact, lifted=lifted)
+def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:
+    """Return systems whose sites are linearized and lifted at the parameters they have, each once."""
+    known: dict[tuple[int, int], tuple[LinearSite, LiftedSite]] = {}
+
+    def lifted(group: PeerGroup) -> PeerGroup:
+        key, built = site_key(group), group.jacobians
+        if key not in known:
+            site = site_of_row(built, linearize_rows(built, group.parameters[None])[0])
+            known[key] = site, lift(site, group.schedule, exact=group.exact)
+        site, frame = known[key]
+        return replace(group, site=site, lifted=frame)
+
+    return tuple(replace(system, sites=tuple(map(lifted, system.sites))) for system in systems)
 
 
 def is_beyond(a: Matrices, b: Matrices) -> NDArray[np.bool_]:

@@ -4,7 +4,8 @@ Takes: a `CompiledSystem` and the name of a parameter or delay.
 Gives: `Critical`, `critical`.
 Guarantees: every crossing comes with a bound on its error, proved by ball arithmetic wherever the equations
 can be had exactly; what was scanned, and how finely, is part of the answer.
-Does not: find two crossings nearer to each other than the cell size (see `crossings.CELL`).
+Does not: prove that there are no others, or find two nearer to each other than the cell size (see
+`crossings.CELL`).
 """
 
 from __future__ import annotations
@@ -42,9 +43,10 @@ class Critical(Result):
     matters: with the present value stable, the first crossing above it or else the first below it; with the
     present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
     there is no crossing; `verdict` then says whether all that was scanned is stable. `known` says
-    whether the equations are enclosed between the `looked` values that were looked at, so that only crossings
-    nearer than `cell` to one another can hide. `enters` says whether
+    whether the equations are enclosed between the `looked` values that were looked at: what could hide then
+    are crossings nearer than `cell` to one another. `enters` says whether
     anything that decides depends on the parameter: on a start value of a linear scene nothing does.
+    `stretches` are those of `search.Search`.
     `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
     (None where their peers differ) of a parameter that is set for all groups though they have not all the
     same.
@@ -69,6 +71,7 @@ class Critical(Result):
     verdict: str
     left_out: tuple[str, ...] = ()
     groups: tuple[tuple[str, float | None], ...] = ()
+    stretches: int = 0
 
 
 @part("critical")
@@ -80,7 +83,7 @@ def critical(
     upper: str | None = None,
     told: Told | None = None,
 ) -> Critical:
-    """Find every value of a parameter at which a scene becomes stable or unstable.
+    """Find the values of a parameter at which a scene becomes stable or unstable.
 
     Parameters
     ----------
@@ -145,6 +148,7 @@ def critical(
         verdict="" if chosen else verdict,
         left_out=left_out(system, linear=linear),
         groups=_by_group(system, free),
+        stretches=found.stretches,
     )
 
 

@@ -1,10 +1,10 @@
 """Where the largest eigenvalue magnitude of a family of matrices crosses 1 as one number varies.
 
 Takes: a function that gives the matrices and their derivatives at many points of an interval, or of many.
-Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`; `extremes`.
-Guarantees: every cell between samples is either shown clear by the eigenvalues and their derivatives at both
-ends, or divided down to the cell size; every change found is bracketed.
-Does not: prove anything (see `critical`), or choose the interval.
+Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`; `extremes`, `narrowest`.
+Guarantees: every cell between samples is divided until the eigenvalues and their derivatives at both ends
+speak against a crossing that the ends don't show, or down to the cell size; every change found is bracketed.
+Does not: prove anything (see `bracket`), or choose the interval.
 
 Between two samples an eigenvalue follows the cubic through its values and slopes at both; how far the
 tangents of the two ends miss each other half-way, e, stands for what the cubic doesn't know.
@@ -137,7 +137,7 @@ def _stacked(one: Complexes, other: Complexes) -> Complexes:
 
 
 def scan(course: Course, points: Floats, *, least: float) -> Scan:
-    """Find every crossing between the first and the last of some points.
+    """Find the crossings between the first and the last of some points.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def scan_lines(
     count = len(points)
     if not any(len(one) for one in points):
         return tuple(Scan(np.empty(0), np.empty(0, dtype=bool), (), whole=True) for _ in points)
-    narrow = [_narrow(*pair) for pair in zip(points, least, strict=True)]
+    narrow = [narrowest(*pair) for pair in zip(points, least, strict=True)]
     lines = np.repeat(np.arange(count), [len(one) for one in points])
     samples = _sample(courses, lines, np.concatenate(points), ends=True)
     new = np.ones(len(samples.points), dtype=bool)
@@ -267,7 +267,7 @@ def _off_circle(samples: _Samples, way: Integers, sure: Truths) -> _Samples:
     return replace(samples, values=tuple(moved)).chosen(kept)
 
 
-def _narrow(points: Floats, least: float) -> Floats:
+def narrowest(points: Floats, least: float) -> Floats:
     """Return, for each cell between the points to begin with, how narrow its parts may get."""
     size = np.maximum(np.maximum(np.abs(points[:-1]), np.abs(points[1:])), least)
     return np.asarray(np.minimum(CELL * size, SHARE * np.diff(points)))

@@ -13,6 +13,7 @@ changes within a piece at all, as a packet is read at ticks only: see `lags`.)
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import time
@@ -43,6 +44,10 @@ INSIDE = Fraction(28_571, 104_729)
 
 # How far apart two values of a parameter are at which timings tell how fast they follow it.
 STEP = Fraction(1, 1009)
+
+
+# Delays of which it is kept where events coincide: a search asks again and again.
+KEPT = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +165,7 @@ def _count(
     raise ApcError(Mistake("E846", place, what, hint=f"a range up to {float(at):.6g}"))
 
 
+@functools.lru_cache(maxsize=KEPT)
 def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fraction], Fraction]:
     """Return what gives the next value at which events coincide that don't at the values before it.
 
@@ -220,7 +226,8 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
     return following
 
 
-def timing_slopes(system: CompiledSystem, free: Free) -> dict[str, Fraction]:
+@functools.lru_cache(maxsize=KEPT)
+def timing_slopes(system: CompiledSystem, free: Free) -> Mapping[str, Fraction]:
     """Return how fast each timing follows a parameter or timing, by its name."""
     now = delay_now(system, free)
     here, there = (resolve(system_with_delay(system, free, value)).timings for value in (now, now + STEP))

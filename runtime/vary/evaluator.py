@@ -9,8 +9,9 @@ Does not: vary times (see `delays`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,6 +61,9 @@ MOST_STATES = 300
 
 # From so many packets of a loop on their way on, leaving them out of the state is quicker.
 MANY_PACKETS = 24
+
+# Evaluators kept for the next question of the same parameters: another range of theirs, say.
+KEPT = 8
 
 # The blocks of a point that has no matrix.
 NOTHING = [(np.full((1, 1), np.nan), np.full((1, 1), np.nan))]
@@ -238,12 +242,30 @@ def evaluator(
         As `analysis.lifted_groups`.
     """
     prepared = prepared or prepare(system)
-    used = [prepared.jacobians[group.kind] for group in system.groups]
+    known = tuple(map(id, prepared.jacobians))
+    return _evaluator(_Asked(system, tuple(free), known, prepared.order, prepared))
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """All that an evaluator follows from; `known` are the identities of the Jacobians in `prepared`."""
+
+    system: CompiledSystem
+    free: tuple[Free, ...]
+    known: tuple[int, ...]
+    order: tuple[str, ...]
+    prepared: Prepared = field(compare=False)
+
+
+@lru_cache(maxsize=KEPT)
+def _evaluator(of: _Asked) -> BatchEvaluator | PointEvaluator:
+    """Prepare a system, see `evaluator`."""
+    used = [of.prepared.jacobians[group.kind] for group in of.system.groups]
     if not all(site.parameters_suffice for site in used):
-        lifted_groups(system, prepared=prepared)  # what is refused at every value is refused here
-        return PointEvaluator(system, tuple(free), prepared)
-    groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
-    return batch_evaluator(system, free, groups, exchange)
+        lifted_groups(of.system, prepared=of.prepared)  # what is refused at every value is refused here
+        return PointEvaluator(of.system, of.free, of.prepared)
+    groups, exchange = lifted_groups(generic(of.system, of.free), prepared=of.prepared)
+    return batch_evaluator(of.system, of.free, groups, exchange)
 
 
 def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> LoopEvaluator | None:

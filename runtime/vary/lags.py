@@ -3,7 +3,8 @@
 Takes: a `CompiledSystem` and a parameter or timing that reaches nothing but how late packets are.
 Gives: `LateStretch`, `late_stretches`.
 Guarantees: stretches join on without a gap; within one, nothing depends on the delay.
-Does not: vary what is held late, or what a force depends on (see `delays`).
+Does not: vary what is held late, or what a force depends on (see `delays`); prove what it says of a stretch,
+a count in floats as in `plane`.
 
 A site's frame doesn't know which packet each of its ticks hears: with a row of r for each tick, one lifting
 serves for all delays. What they tell is which packet stands in which row, how many frames of age (ζ to the

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from apc.frame.exchange import Exchange
 from apc.frame.lift import FrameMap
 from apc.frame.names import Free
 from apc.large.determinant_spectrum import frequency_of
-from apc.vary.batch import STEP, BatchEvaluator, batch_evaluator
+from apc.vary.batch import STEP, BatchEvaluator, batch_evaluator, lifted_here
 from apc.vary.bracket import Bracket
 from apc.vary.counting import bracket_of_loop
 from apc.vary.crossings import Root, Scan
@@ -104,7 +104,7 @@ class LoopEvaluator:
 
     def loop_at(self, value: Sequence[float], place: int) -> Loop:
         """Return a loop at one point (m,), its sites lifted with bounds on their errors."""
-        return replace(self.loops[place], sites=self.family.sites_moved(self.loops[place].sites, value))
+        return lifted_here(self.family.with_sites([self.loops[place]], value))[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,15 +2,17 @@
 
 Takes: the logarithm of a loop's characteristic function over the circle and over what varies.
 Gives: `Sheet`, `LineSheet`, `over_all`; `cross`, `count_beyond`.
-Guarantees: every cell of the plane, angle by value, is shown clear by what its corners say of each other, or
-shown to hold one crossing, or divided down to the cell size; crossings and counts agree wherever `whole`.
-Does not: prove a crossing (see `bracket`).
+Guarantees: every cell of the plane, angle by value, is divided until its corners agree on its middle, or do
+so of F without the one zero that was found in it, or down to the cell size. `whole` says that all of them
+agreed, and that the crossings found account for how the counts at neighbouring values differ.
+Does not: prove that a cell is empty, or a crossing (see `bracket`). Floats are compared with floats: two
+crossings that undo each other between two values, where corners agree by accident, change no count.
 
 Four corners of a cell each foretell the logarithm of F at its middle, by value and slopes. Where F has no
 zero nearby they agree; a zero within a cell's size of its middle makes them differ, or makes all of them
-foretell a dip. Divided by the linear function that Newton's method leaves of F, a cell with one zero is
-clear, too. How often F goes around 0 along the circle counts the eigenvalues beyond it at each value; with
-crossings in between, each in its direction, neighbouring counts must agree.
+foretell a dip. Divided by the linear function that Newton's method leaves of F, a cell with one zero passes,
+too. How often F goes around 0 along the circle counts the eigenvalues beyond it at each value, by steps that
+agree in the same way; with crossings in between, each in its direction, neighbouring counts must agree.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.bordered import Logarithm
-from apc.vary.crossings import CELL, SHARE, Root, Scan, extremes
+from apc.vary.crossings import Root, Scan, extremes, narrowest
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -167,7 +169,7 @@ def _principal(logarithm: Complexes) -> Complexes:
 
 
 def cross(sheets: Sequence[LineSheet], points: Floats, least: float, *, first: bool = False) -> Scan:
-    """Find every value at which the stability of several loops changes, between the first and last of some.
+    """Find the values at which the stability of several loops changes, between the first and last of some.
 
     Parameters
     ----------
@@ -180,7 +182,7 @@ def cross(sheets: Sequence[LineSheet], points: Floats, least: float, *, first: b
     first
         Whether what lies beyond the first stretch that is seen to be unstable all along is left alone.
     """
-    narrow = np.minimum(CELL * np.maximum(np.abs(points[1:]), least), SHARE * np.diff(points))
+    narrow = narrowest(points, least)
     unstable = np.zeros(len(points) - 1, dtype=bool)
     for one in sheets:
         unstable |= _beyond_all_along(one, points)

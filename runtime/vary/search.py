@@ -24,15 +24,15 @@ from apc.analysis.analysis import Prepared, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
 from apc.compiler.words import counted
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedSystem, close_loop
 from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.modes import split
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, solve_spectrum
 from apc.frame.names import Free, parameter_of
-from apc.vary.batch import BatchEvaluator
+from apc.vary.batch import BatchEvaluator, lifted_here
 from apc.vary.bends import bends
-from apc.vary.bracket import Bracket, bracket, bracket_in_floats
+from apc.vary.bracket import Bracket, ExactSystems, bracket, bracket_in_floats
 from apc.vary.crossings import Course, Courses, Root, Scan, scan
 from apc.vary.delays import (
     INSIDE,
@@ -104,7 +104,8 @@ class Search:
     `edges` are the crossings in order, and `stable` says of each stretch, one more than there are crossings,
     whether it is stable; it is empty when no sample told. `known` says whether the equations are enclosed
     between the `looked` values that were looked at, `enters` whether any matrix was seen to change along the
-    way.
+    way. Where a delay moves packets only, `stretches` is in how many stretches nothing depends on it; what
+    grows in each was counted in floats, and those beside a change were analysed.
     """
 
     edges: tuple[Crossing, ...]
@@ -114,6 +115,7 @@ class Search:
     known: bool
     looked: int
     enters: bool
+    stretches: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -319,14 +321,31 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
         ]
 
     def at(value: float) -> ClosedSystem:
-        return family.system_at(point(value), root.system)
+        return close_loop(lifted_here([systems(value)[root.system][0]])[0])
 
-    proved = bracket(root, systems, low=low, high=high)
-    if proved is None:
-        proved = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
-    if proved is None and _alike(*(family.closed_at(point(one)) for one in beside)):
+    return _bracketed(root, found, (low, high), systems, at, lambda value: family.closed_at(point(value)))
+
+
+def _bracketed(
+    root: Root,
+    found: Scan,
+    ends: tuple[float, float],
+    systems: ExactSystems,
+    at: Callable[[float], ClosedSystem],
+    every: Callable[[float], Sequence[ClosedSystem]],
+) -> Crossing | None:
+    """Prove a crossing between two ends by balls or, where these don't tell, by the bounds of floats.
+
+    `systems` gives the systems of a value for balls, `at` the one that crosses as an analysis has it, and
+    `every` all of them.
+    """
+    low, high = ends
+    held = bracket(root, systems, low=low, high=high)
+    if held is None:
+        held = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
+    if held is None and _alike(*map(every, _beside(root, found))):
         return None
-    return _described(root, proved, [(at(root.value), systems(root.value)[root.system][1])])
+    return _described(root, held, [(at(root.value), systems(root.value)[root.system][1])])
 
 
 def _beside(root: Root, found: Scan) -> tuple[float, float]:
@@ -443,7 +462,7 @@ def _late_search(
     known = [one for one in late if one.stable is not None]
     edges: list[Crossing] = []
     stable = [True] if from_stable else [bool(one.stable) for one in known[:1]]
-    whole, before = True, None
+    whole, before = len(known) == len(late), None
     for one in known:
         if one.stable != stable[-1]:
             pair = [one] if before is None else [before, one]
@@ -460,9 +479,8 @@ def _late_search(
             if from_stable:
                 break
         before = one
-    return Search(
-        tuple(edges), tuple(stable), (float(late[0].low), float(end)), whole, True, len(known), enters=True
-    )
+    scanned = float(late[0].low), float(end)
+    return Search(tuple(edges), tuple(stable), scanned, whole, True, len(known), True, len(late))
 
 
 def delay_reach(
@@ -528,14 +546,8 @@ def _delay_crossing(
         listed = split(*lifted_groups(moved, prepared=prepared)).systems
         return list(with_rigid(listed))
 
-    held = bracket(root, systems, low=float(piece.low), high=float(piece.high))
-    if held is None:
-        held = bracket_in_floats(
-            root,
-            lambda value: [systems(value)[root.system][0]],
-            low=float(piece.low),
-            high=float(piece.high),
-        )
-    if held is None and _alike(*([one for one, _ in systems(value)] for value in _beside(root, found))):
-        return None
-    return _described(root, held, [systems(root.value)[root.system]])
+    return _bracketed(
+        *(root, found, (float(piece.low), float(piece.high)), systems),
+        lambda value: systems(value)[root.system][0],
+        lambda value: [one for one, _ in systems(value)],
+    )
