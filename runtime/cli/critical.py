@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import Command, file_argument, json_option, print_result, set_option
+from apc.cli.options import Command, file_argument, in_option, json_option, print_result, set_option
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
@@ -27,6 +27,7 @@ SCENES = (".yaml", ".yml", ".apc")
 @set_option
 @click.option("--upper", metavar='"VALUE UNIT"', help="Look no further up than this.")
 @click.option("--lower", metavar='"VALUE UNIT"', help="Look no further down than this.")
+@in_option
 @json_option
 def critical_command(
     path: str,
@@ -34,6 +35,7 @@ def critical_command(
     settings: tuple[str, ...],
     upper: str | None,
     lower: str | None,
+    criterion: str | None,
     as_json: bool,
 ) -> None:
     """Find the largest stable value of a parameter, with its error.
@@ -51,7 +53,7 @@ def critical_command(
     _check_order(path, file)
     system = open_scene(file, settings)
     with status_line() as told:
-        found = critical(system, path, lower=lower, upper=upper, told=told)
+        found = critical(system, path, lower=lower, upper=upper, criterion=criterion, told=told)
     print_result(found, as_json=as_json)
 
 

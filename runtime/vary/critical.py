@@ -30,6 +30,7 @@ from apc.threads import single_threaded
 from apc.vary.crossings import CELL
 from apc.vary.delays import delay_now
 from apc.vary.evaluator import reaches_time
+from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, criterion_of, growth_at, search_mean_square
 from apc.vary.search import Crossing, Search, Told, search, search_delay
 
 _PLACE = Place("critical value")
@@ -70,6 +71,7 @@ class Critical(Result):
     enters: bool
     verdict: str
     left_out: tuple[str, ...] = ()
+    criterion: str = NOMINAL
     groups: tuple[tuple[str, float | None], ...] = ()
     stretches: int = 0
 
@@ -81,6 +83,7 @@ def critical(
     *,
     lower: str | None = None,
     upper: str | None = None,
+    criterion: str | None = None,
     told: Told | None = None,
 ) -> Critical:
     """Find the values of a parameter at which a scene becomes stable or unstable.
@@ -95,6 +98,9 @@ def critical(
         Quantities between which to look, such as "5000 N/m". Without `lower`, from the least value allowed,
         or 0 (of a negative value, from `SPAN` times it); without `upper`, up to `SPAN` times the present
         value (of a delay, as far as `search.delay_reach` says).
+    criterion
+        "mean-square": what becomes of second moments over the network as it is; "nominal": every packet on
+        time. None: mean square where a link is unreliable.
     told
         Is told how far the search is.
 
@@ -106,7 +112,10 @@ def critical(
         of an unreliable link; and those of `units.quantity`.
     """
     free = find(system, name.strip(), _PLACE)
-    refuse_channel_number(system, free, _PLACE)
+    chosen_criterion = criterion_of(system, criterion, _PLACE)
+    by_chance = chosen_criterion == MEAN_SQUARE
+    if not by_chance:
+        refuse_channel_number(system, free, _PLACE)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         timed = reaches_time(system, free)
         unit = unit_of(system, free.name)
@@ -115,17 +124,25 @@ def critical(
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
-        if timed:
+        if by_chance:
+            low, high = (None if one is None else float(one) for one in limits)
+            found = search_mean_square(system, free, low, high, present, prepared, _PLACE, told=told)
+        elif timed:
             start = _at_start(system, prepared)
             found = search_delay(system, free, limits[0] or Fraction(0), limits[1], start, told=told)
         else:
             low, high = (None if one is None else float(one) for one in limits)
             found = search(system, free, low, high, prepared, told=told)
-        chosen = _chosen(found, present, lambda: analyze(system, prepared=prepared).stable)
+        def stable_now() -> bool | None:
+            if by_chance:
+                return growth_at(system, prepared, [], _PLACE).stable
+            return analyze(system, prepared=prepared).stable
+
+        chosen = _chosen(found, present, stable_now)
         side = found.stable[0] if found.stable else None
         if not chosen and found.scanned[0] <= present <= found.scanned[1]:
             # Floats alone say of which side all samples are; the analysis bounds its error.
-            side = side if analyze(system, prepared=prepared).stable == side else None
+            side = side if stable_now() == side else None
     words = {True: "stable", False: "unstable", None: "undecided"}[side]
     verdict = f"{words} at every value scanned"
     if not found.enters:
@@ -146,7 +163,8 @@ def critical(
         looked=found.looked,
         enters=found.enters,
         verdict="" if chosen else verdict,
-        left_out=left_out(system, linear=linear),
+        left_out=left_out(system, linear=linear, network=not by_chance),
+        criterion=chosen_criterion,
         groups=_by_group(system, free),
         stretches=found.stretches,
     )

@@ -1,0 +1,199 @@
+"""The values of one parameter at which a scene becomes stable or unstable in mean square.
+
+Takes: a `CompiledSystem` with unreliable links and the name of a parameter, or of what links lose.
+Gives: `MEAN_SQUARE`, `NOMINAL`, `criterion_of`; `search_mean_square`; `growth_at`.
+Guarantees: on either side of a crossing, by its error, bounds on the growth of second moments decide.
+Does not: find two crossings between neighbouring samples; follow a delay, whose pieces are the nominal
+search's (see `delays`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from fractions import Fraction
+
+import numpy as np
+
+from apc.analysis.analysis import Prepared
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.names import Free, unit_of
+from apc.frame.overrides import Override, apply
+from apc.moments.network import Growth, growth, unreliable
+from apc.network.nominal import channel_numbers
+from apc.vary.search import SAMPLES, SPAN, Crossing, Search, Told
+
+MEAN_SQUARE, NOMINAL = "mean-square", "nominal"
+
+# Values looked at between 0 and 1 of a probability.
+SHARES = 33
+
+# How near a crossing is found at first, relatively, and how far its bounds may be at last.
+NEAR, FAR = 1e-12, 1e-4
+
+STEPS = 60
+
+
+def criterion_of(system: CompiledSystem, asked: str | None, place: Place) -> str:
+    """Return the criterion of a verdict: as asked, or mean square where a link is unreliable.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    asked
+        "mean-square", "nominal", or None.
+    place
+        Where it was asked for.
+
+    Raises
+    ------
+    ApcError
+        E897 no such criterion.
+    """
+    if asked not in (None, MEAN_SQUARE, NOMINAL):
+        what = f"{str(asked)[:40]} is no criterion ({MEAN_SQUARE}, {NOMINAL})"
+        raise ApcError(Mistake("E897", place, what, hint=f"--in {MEAN_SQUARE}"))
+    return asked or (MEAN_SQUARE if unreliable(system) else NOMINAL)
+
+
+def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Override], place: Place) -> Growth:
+    """Return what second moments grow by with other numbers.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    overrides
+        The numbers.
+    place
+        Where they were asked for.
+
+    Raises
+    ------
+    ApcError
+        E897 the network can't be judged with these numbers, by name.
+    """
+    changed = apply(system, overrides)
+    found = growth(changed, prepared)
+    if found.why:
+        what = f"the scene can't be judged in mean square: {found.why}"
+        raise ApcError(Mistake("E897", place, what, hint=f"--in {NOMINAL}"))
+    return found
+
+
+def search_mean_square(
+    system: CompiledSystem,
+    free: Free,
+    low: float | None,
+    high: float | None,
+    present: float,
+    prepared: Prepared,
+    place: Place,
+    *,
+    told: Told | None = None,
+) -> Search:
+    """Find where second moments begin or cease to grow as one parameter varies.
+
+    Parameters
+    ----------
+    system, free
+        The compiled scene and what varies.
+    low, high
+        Between which values; where not given, a probability's all, or `SPAN` times smaller and larger than
+        the present value.
+    present
+        The present value.
+    prepared
+        From `analysis.prepare`.
+    place
+        Where it was asked for.
+    told
+        Is told how far the search is.
+
+    Raises
+    ------
+    ApcError
+        E897 the network can't be judged, or a delay is to vary.
+    """
+    if any(timing.name == free.name for timing in system.timings) and free.name not in channel_numbers(system):
+        what = f"{free.label} can't be varied in mean square: packets would come in another order"
+        raise ApcError(Mistake("E897", place, what, hint=f"--in {NOMINAL}"))
+    samples = _samples(system, free, low, high, present)
+    known: dict[float, Growth] = {}
+
+    def at(value: float) -> Growth:
+        if value not in known:
+            known[value] = growth_at(system, prepared, [Override(free, Fraction(value))], place)
+        return known[value]
+
+    for number, value in enumerate(samples):
+        if told is not None:
+            told(f"{number} of {len(samples)} values")
+        at(value)
+    verdicts = [known[value].radius < 1 for value in samples]
+    edges, stable = [], [verdicts[0]]
+    for place_of, (one, other) in enumerate(zip(samples, samples[1:], strict=False)):
+        if verdicts[place_of] != verdicts[place_of + 1]:
+            edges.append(_crossing(at, one, other, stable_below=verdicts[place_of]))
+            stable.append(verdicts[place_of + 1])
+    radii = {known[value].radius for value in samples}
+    return Search(
+        edges=tuple(edges),
+        stable=tuple(stable),
+        scanned=(samples[0], samples[-1]),
+        whole=True,
+        known=False,
+        looked=len(known),
+        enters=len(radii) > 1,
+    )
+
+
+def _samples(
+    system: CompiledSystem, free: Free, low: float | None, high: float | None, present: float
+) -> list[float]:
+    """Return the values to look at first."""
+    if unit_of(system, free.name) == "1" and free.name in channel_numbers(system):
+        bottom, top = low if low is not None else 0.0, high if high is not None else 1 - 1 / SHARES
+        return np.linspace(bottom, top, SHARES).tolist()
+    scale = abs(present) or 1.0
+    bottom = low if low is not None else scale / SPAN
+    top = high if high is not None else max(scale, abs(bottom)) * SPAN
+    if bottom > 0:
+        count = max(math.ceil(SAMPLES * math.log10(top / bottom)), SAMPLES)
+        return np.geomspace(bottom, top, count + 1).tolist()
+    return np.linspace(bottom, top, 6 * SAMPLES + 1).tolist()
+
+
+def _crossing(at: Callable[[float], Growth], low: float, high: float, *, stable_below: bool) -> Crossing:
+    """Return the crossing between two values of other verdicts, and how far bounds leave it open.
+
+    By secants that keep a point on either side, the one that stays counting half each time (Illinois).
+    """
+    ends = {low: math.log(at(low).radius), high: math.log(at(high).radius)}
+    at_low, at_high = ends[low], ends[high]
+    value = low
+    for _ in range(STEPS):
+        middle = low - at_low * (high - low) / (at_high - at_low)
+        if not low < middle < high:
+            break
+        value, found = middle, math.log(at(middle).radius)
+        if abs(found) < NEAR or high - low <= NEAR * abs(high):
+            break
+        if (found < 0) == (at_low < 0):
+            low, at_low, at_high = middle, found, at_high / 2
+        else:
+            high, at_high, at_low = middle, found, at_low / 2
+    width = NEAR * max(abs(value), 1e-300)
+    while width <= FAR * max(abs(value), 1e-300):
+        below, above = at(value - width).stable, at(value + width).stable
+        if None not in (below, above) and below != above:
+            return Crossing(value, width, "below" if below else "above", math.nan, "crossing", BOUNDED)
+        width *= 4
+    side = "below" if stable_below else "above"
+    return Crossing(value, width, side, math.nan, "crossing", ESTIMATED)
+
+
+BOUNDED = "second moments bounded on either side"
+ESTIMATED = "an estimate: bounds leave either side open"
