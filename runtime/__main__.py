@@ -22,7 +22,10 @@ BETWEEN_COLLECTIONS = 100_000
 
 def main() -> None:
     """Run the command line and exit."""
+    from apc.memory import hold_to_memory
+
     gc.set_threshold(BETWEEN_COLLECTIONS)
+    hold_to_memory()
     code = run(sys.argv[1:])
     gc.disable()  # the process ends, and its memory with it
     sys.exit(code)
@@ -64,8 +67,13 @@ def run(arguments: list[str]) -> int:
         _silence_stdout()
         click.echo(f"apc: the output can't be written: {error.strerror}", err=True)
         return 1
-    except Exception:
-        return _bug(arguments)
+    except Exception as error:
+        from apc.memory import is_lack, lacking
+
+        if not is_lack(error):
+            return _bug(arguments)
+        click.echo(str(lacking(" ".join(["apc", *arguments[:1]]))), err=True)
+        return 1
     return 0
 
 

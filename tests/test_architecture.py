@@ -40,7 +40,10 @@ HOUSE = (
     ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
     ("apc.compiler.view", "schema diagram svg layers picture stages listing"),
-    ("apc", "threads finite_equations distribution suffixes optional option_value result tables processes"),
+    (
+        "apc",
+        "threads memory finite_equations distribution suffixes optional option_value result tables processes",
+    ),
     (
         "apc.frame",
         """

@@ -182,7 +182,7 @@ def test_a_proof_that_was_not_had_is_left_out_and_says_why(monkeypatch: pytest.M
 def test_what_is_too_large_to_be_played_is_analysed_all_the_same(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("apc.simulation.simulation.MOST_NUMBERS", 10)
+    monkeypatch.setattr("apc.simulation.simulation.NUMBER", 1e20)
     found = bench(compiled(AVERAGE), rounds=1)
     analysis, simulation = found.comparisons
     assert analysis.measured

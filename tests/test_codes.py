@@ -107,7 +107,7 @@ E703 compiler/language: a cell or row of a table is wrong
 E801 runtime/frame: an operator runs over nobody
 E802 runtime/frame: the weights of a mean add up to nothing
 E803 runtime/eigen: an operator over equal peers has no linearization
-E804 runtime/eigen runtime/large runtime/vary: a matrix would be too large, or what is equal is not linear
+E804 runtime/analysis runtime/eigen runtime/large runtime/vary: too large a matrix, or equals not linear
 E805 runtime/frame: a frame is too long to be taken apart
 E806 runtime/analysis runtime/frame: numbers leave the range of floats
 E807 runtime/frame: an operator over the others has no linearization inside a loop
@@ -115,6 +115,7 @@ E808 runtime runtime/frame: the equations have no finite value at the start
 E809 runtime/frame: a time that follows from others is below zero
 E810 runtime/analysis: a linearization does not hold while the scene moves
 E812 runtime/frame: too many states of one peer move together
+E820 runtime: a command came to the end of the memory
 E830 runtime/analysis: a box's range is written wrong
 E831 runtime/analysis: a parameter can't be left open in a box
 E832 runtime/analysis: a scene's equations can't be enclosed over a box
@@ -135,7 +136,7 @@ E872 runtime/simulation: an equation has no solution while a scene is played
 E873 runtime/simulation: no signal fits a pattern
 E874 runtime/simulation: too many numbers to play at once
 E875 runtime: a library is not installed
-E876 runtime/simulation: too many rows to keep in memory
+E876 runtime/present runtime/simulation: too many rows to keep in memory
 E877 runtime/simulation: a run has no duration, or none above zero
 E878 runtime: a file's suffix is none of a command's formats
 E879 runtime/present: the file of a run can't be written, or not to its end

@@ -125,12 +125,6 @@ def test_a_duration_has_to_be_known_and_positive() -> None:
     ]
 
 
-def test_too_much_to_keep_is_told() -> None:
-    text = replaced(AVERAGE, ("count: 3", "count: 1000"))
-    with pytest.raises(ApcError, match=r"E876 .* too many to keep in memory"):
-        simulate(compiled(text), duration=Fraction(3600))
-
-
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_a_picture_is_written_and_the_same_run_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     pytest.importorskip("matplotlib")

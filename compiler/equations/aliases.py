@@ -46,9 +46,10 @@ class Aliases:
     def substitute(self, expression: sympy.Expr) -> sympy.Expr:
         """Return the expression in the names kept."""
         derivatives = self.derivatives.derivatives(expression)
-        return expression.xreplace(
-            {s: self._stands_for(*derivative) for s, derivative in derivatives.items()}
-        )
+        other = {
+            s: one for s, derivative in derivatives.items() if (one := self._stands_for(*derivative)) is not s
+        }
+        return expression.xreplace(other) if other else expression  # putting it together anew takes longest
 
     def remove(self, residuals: Sequence[Residual]) -> list[Residual]:
         """Take the alias equations out, pass by pass until none is left; return the others, rewritten."""
@@ -116,5 +117,6 @@ class Aliases:
             elif order and name in self.velocities:
                 name, order = self.velocities[name], order - 1
             else:
-                return sign * self.derivatives.symbol(name, order)
+                found = self.derivatives.symbol(name, order)
+                return found if sign == 1 else -found
         return sympy.S.Zero

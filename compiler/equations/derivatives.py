@@ -78,7 +78,7 @@ class Derivatives:
     def derivatives(self, expression: sympy.Expr) -> dict[sympy.Symbol, Derivative]:
         """Return the variables and derivatives an expression holds, in the order of their names."""
         found = [s for s in expression.free_symbols if s in self._derivatives]
-        return {s: self._derivatives[s] for s in sorted(found, key=str)}
+        return {s: self._derivatives[s] for s in sorted(found, key=lambda s: s.name)}
 
     def differentiate(self, expression: sympy.Expr) -> sympy.Expr:
         """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""

@@ -53,6 +53,10 @@ COMPARISONS = {
 }
 
 
+LARGEST = int(sys.float_info.max)
+NO_FLOATS = frozenset({sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I})
+
+
 def head(name: str) -> sympy.core.function.UndefinedFunction:
     """Return the opaque function of this name."""
     return sympy.Function(name)
@@ -100,12 +104,16 @@ def to_sympy(expression: Expr, differentiate: Callable[[sympy.Expr], sympy.Expr]
 
 def is_no_number(expression: sympy.Expr) -> bool:
     """Return whether an expression holds a constant that no float can be: 1/0, sqrt(-1), 1e300^2."""
-    if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
-        return True
-    largest = sympy.Integer(int(sys.float_info.max))
-    if any(abs(number) > largest for number in expression.atoms(sympy.Rational)):
-        return True
-    return any(power.is_number and power.is_real is False for power in expression.atoms(sympy.Pow))
+    return any(map(_no_float, sympy.preorder_traversal(expression)))
+
+
+def _no_float(part: sympy.Basic) -> bool:
+    """Return whether a part of an expression is by itself a constant that no float can be."""
+    if part.is_Rational:
+        return bool(abs(part.p) > LARGEST * part.q)
+    if part.is_Pow:
+        return bool(part.is_number and part.is_real is False)
+    return part in NO_FLOATS
 
 
 class NoDerivativeError(Exception):

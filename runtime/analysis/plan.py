@@ -24,6 +24,7 @@ from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.parameters import Numbers
 from apc.frame.schedule import Schedule
+from apc.memory import refuse_beyond
 
 # Up to so many states of motion of peers that differ, one matrix of all is quicker than what spares it, and
 # says more.
@@ -40,6 +41,10 @@ MANY_EIGENVALUES = 128
 
 # From so many packets on their way on, leaving them out of the state is quicker.
 LONG_LINES = 60
+
+
+# Bytes of an entry of a system's matrix: of each system what is told of it, of the one at work all it needs.
+KEPT, AT_WORK = 200, 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +146,11 @@ def make_plan(
         for loop in loops:
             if loop.states > MOST_STATES:
                 raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
+        needed = (
+            KEPT * sum(loop.states**2 for loop in loops) + AT_WORK * max(loop.states for loop in loops) ** 2
+        )
+        what = f"{len(loops):,} systems of up to {max(loop.states for loop in loops):,} states"
+        refuse_beyond(needed, "E804", Place(exchange.scene), what, "fewer peers that differ, or fewer states")
     return Plan(found, groups, loops, False, _sizes(loops, found), notes)
 
 

@@ -13,7 +13,6 @@ vector are real, each change of sign is half a turn.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -84,11 +83,13 @@ def turns(
         height = max(sum(site.b.shape), 1)
         if not most * height <= MOST or not len(left):
             break
-        chunk, seen = MOST // (most * height), np.zeros(len(values), dtype=np.bool_)
-        fine = _fine(site, schedule, points)
+        # Rows of powers are held for every mode, of each length of step one; the course for every point.
+        chunk = MOST // max(sum(points.values()) * height, most)
+        seen = np.zeros(len(values), dtype=np.bool_)
+        steps = _finest(site, schedule, points)
         for first in range(0, len(left), chunk):
             some = left[first : first + chunk]
-            course = _course(site, schedule, fine, start[:, some], heard[:, some], states[some])
+            course = _course(site, schedule, steps, points, start[:, some], heard[:, some], states[some])
             angle, widest = turned_along(course)
             before, _ = turned_along(course[::2])  # half as finely
             agreed = (np.abs(angle - before) < OFF) | (widest < CLOSE)
@@ -159,13 +160,7 @@ def _courses(
     for duration, number in points.items():
         step = exponential_rows(a, b, float(duration * schedule.quantum) / number).matrix
         power = np.concatenate([step, np.broadcast_to(below, (len(step), *below.shape))], axis=1)
-        # Rows of the powers 0, 1, … of a step: of the state that is followed.
-        rows = np.zeros((len(states), 1, n_x + n_u))
-        rows[np.arange(len(states)), 0, states] = 1.0
-        for _ in range(number.bit_length() - 1):
-            rows = np.concatenate([rows, rows @ power], axis=1)
-            power = power @ power
-        fine[duration] = rows
+        fine[duration], power = _followed(power, states, number)
         steps[duration] = power[:, :n_x]
     halves = [np.stack([one.real, one.imag], axis=-1) for one in (start, heard)]
     parts: list[NDArray[Any]] = []
@@ -190,49 +185,75 @@ def _power_of_two(least: float, doubled: int) -> int:
     return int(2 ** (np.ceil(np.log2(max(least, FEWEST))) + doubled))
 
 
-def _fine(site: LinearSite, schedule: Schedule, points: dict[int, int]) -> dict[int, list[Floats]]:
-    """Return the steps between so many points of each step, of 1, 2, 4, … of these, up to the whole."""
+def _finest(site: LinearSite, schedule: Schedule, points: dict[int, int]) -> dict[int, Floats]:
+    """Return the steps from one of so many points of each step to the next, square, of one site (1, n, n)."""
     n_x, n_u = site.b.shape
-    fine = {}
+    finest = {}
     for duration, number in points.items():
         step, units = exponential(site.a, site.b, float(duration * schedule.quantum) / number)
-        powers = [np.vstack([units * step.matrix, np.eye(n_x + n_u)[n_x:]])]
-        while 2 ** len(powers) <= number:
-            powers.append(powers[-1] @ powers[-1])
-        fine[duration] = powers
-    return fine
+        finest[duration] = np.vstack([units * step.matrix, np.eye(n_x + n_u)[n_x:]])[None]
+    return finest
+
+
+def _followed(power: Floats, states: Integers, number: int) -> tuple[Floats, Floats]:
+    """Return the rows of the powers 0, 1, … of a step of which each site's state follows, and the last power.
+
+    Parameters
+    ----------
+    power
+        The steps of many sites (k, n, n), or (1, n, n) of all.
+    states
+        Which state of each (k,).
+    number
+        How many powers, one of 2.
+
+    Returns
+    -------
+    The rows (k, number, n), and the power of that number.
+    """
+    n = power.shape[-1]
+    rows = np.zeros((len(states), 1, n))
+    rows[np.arange(len(states)), 0, states] = 1.0
+    for _ in range(number.bit_length() - 1):
+        # One product of all rows is much less work than one of each.
+        later = (rows.reshape(-1, n) @ power[0]).reshape(rows.shape) if len(power) == 1 else rows @ power
+        rows = np.concatenate([rows, later], axis=1)
+        power = power @ power
+    return rows, power
 
 
 def _course(
     site: LinearSite,
     schedule: Schedule,
-    fine: dict[int, list[Floats]],
+    finest: dict[int, Floats],
+    points: dict[int, int],
     start: Complexes,
     heard: Complexes,
     states: Integers,
 ) -> Complexes:
     """Return the states followed at so many points of each step, and the end (points, k)."""
-    steps = {duration: powers[-1] for duration, powers in fine.items()}
-    columns = np.arange(start.shape[1])
-    rows: list[Complexes] = []
+    n_x, own = len(site.a), np.unique(states, return_inverse=True)
+    fine = {duration: _followed(step, own[0], points[duration]) for duration, step in finest.items()}
+    steps = {duration: power[0, :n_x] for duration, (_, power) in fine.items()}
+    parts: list[Floats] = []
+
+    def columns(block: Complexes) -> Floats:
+        # A complex column is two real ones: a real matrix times these is half the work.
+        return np.ascontiguousarray(block).view(np.float64)
 
     def watch(duration: int, moving: NDArray[Any]) -> None:
-        # A complex column is two real ones: a real matrix times these is half the work.
-        path = np.ascontiguousarray(moving)[None].view(np.float64)
-        for power in fine[duration][:-1]:
-            path = np.concatenate([path, power @ path])
-        rows.append(path.view(np.complex128)[:, states, columns])
+        rows = fine[duration][0][own[1]]
+        parts.append(rows @ moving.reshape(len(moving), -1, 2).swapaxes(0, 1))
 
-    course = follow(site, schedule, steps, start, _heard_by(heard), watch=watch)
+    listened = columns(heard)
+    course = follow(site, schedule, steps, columns(start), lambda row: listened[row], watch=watch)
     while True:
         try:
             next(course)
         except StopIteration as end:
-            return np.concatenate([*rows, end.value[states, columns][None]])
-
-
-def _heard_by(heard: Complexes) -> Callable[[int], Complexes]:
-    return lambda row: heard[row]
+            last = end.value.reshape(len(end.value), -1, 2)[states, np.arange(len(states))]
+            path = np.concatenate([*parts, last[:, None]], axis=1)
+            return np.ascontiguousarray((path[..., 0] + 1j * path[..., 1]).T)
 
 
 def turned_along(course: Complexes) -> tuple[Floats, Floats]:

@@ -50,7 +50,7 @@ def linearize(
 def linearize_exact(
     site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None = None
 ) -> LinearSite:
-    """Return the same matrices as `linearize` in exact rationals, as object arrays of `Fraction`.
+    """Return the same matrices as `linearize` in exact rationals, as object arrays of `Fraction`, and 0.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def linearize_exact(
     assert site.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
     _finite_slopes(site, parameters, listening)
     arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
-    exact = site_of_entries(site, evaluate_exact(site.function, arguments)[0], Fraction(0))
+    exact = site_of_entries(site, evaluate_exact(site.function, arguments)[0], 0)
     if listening is None:
         return exact
     rest = iter(listening.own)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Closed, Feedback, StateLayout, close, lay_out
+from apc.eigen.peer_group import states_of
 from apc.eigen.spectrum import Mode, oscillation
 from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.course import turns
@@ -29,6 +30,7 @@ from apc.frame.parameters import Numbers
 from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite
+from apc.memory import refuse_beyond
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -37,6 +39,7 @@ Complexes = NDArray[np.complex128]
 
 # Peers of all groups where some differ: a number is kept of each, some hundred megabytes of so many.
 MOST_DIFFERENT = 2 * 10**7
+ENTRY = 100  # bytes of an entry of a different peer's matrix: with its radius, what it is made of and becomes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +86,13 @@ def populations(
     if sum(map(len, numbers.rows)) > MOST_DIFFERENT:
         what = f"{system.peers:,} peers, some of whom differ, and {MOST_DIFFERENT:,} are the most of these"
         raise ApcError(Mistake("E804", Place(system.name), what, hint="smaller counts"))
+    states = [
+        states_of(schedule, jacobians[group.kind])
+        for group, schedule in zip(system.groups, schedules, strict=True)
+    ]
+    needed = ENTRY * sum(len(rows) * n**2 for rows, n in zip(numbers.parameters, states, strict=True))
+    what = f"{sum(map(len, numbers.parameters)):,} different peers of up to {max(states)} states"
+    refuse_beyond(needed, "E804", Place(system.name), what, "fewer peers that differ")
     found = []
     for place, (group, schedule) in enumerate(zip(system.groups, schedules, strict=True)):
         site, parameters = jacobians[group.kind], numbers.parameters[place]

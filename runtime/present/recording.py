@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import begin_file, drop_file, finish_file, is_special, partial_name
+from apc.memory import refuse_beyond
 from apc.present.simulation import provenance_json
 from apc.simulation.blocks import Block
 from apc.simulation.simulation import Simulation
@@ -36,6 +37,9 @@ Floats = NDArray[np.float64]
 
 PROVENANCE = "provenance"
 LARGEST_MAT = 2**31 - 2**20  # bytes: a variable of a MAT-file of version 5 is less than 2 GiB
+# Bytes of a column and of a cell of the block that is written; what Parquet takes of a column, and of each
+# block in it; a cell that waits for its MAT-file to be written.
+COLUMN, CELL, IN_PARQUET, IN_MAT = 2000, 150, (24_000, 500), 32
 LABEL = 256  # bytes of a name with its unit in a MAT- or NPZ-file, without the letters themselves
 
 
@@ -276,8 +280,18 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
     Raises
     ------
     ApcError
-        E878 no such format, E879 it can't be written, E875 a library it needs is not installed.
+        E876 it would not fit the memory, E878 no such format, E879 it can't be written, E875 a library it
+        needs is not installed.
     """
+    suffix, columns = check_suffix(path, SUFFIXES, "--out"), len(simulation.signals) + 1
+    block = min(simulation.rows, simulation.length * len(simulation.marks))
+    each = COLUMN + CELL * block
+    if suffix == ".mat":
+        each += IN_MAT * simulation.rows
+    elif suffix == ".parquet":
+        each += IN_PARQUET[0] + IN_PARQUET[1] * -(-simulation.rows // block)
+    needed, what = columns * each, f"{simulation.rows:,} rows of {columns:,} columns in {path.name}"
+    refuse_beyond(needed, "E876", Place(simulation.system.name), what, "fewer --signals")
     return Recording(path, simulation)
 
 

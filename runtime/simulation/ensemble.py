@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
+from apc.memory import refuse_beyond
 from apc.processes import (
     Patience,
     Workers,
@@ -44,6 +45,7 @@ Floats = NDArray[np.float64]
 QUANTILES = (0.05, 0.5, 0.95)
 SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
 PART = 100  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
+RUN = 300  # bytes of a run that is over
 TOGETHER = 2**18  # numbers that runs side by side keep, and that rows of them are played at once
 
 
@@ -137,9 +139,10 @@ def play_many(
     Raises
     ------
     ApcError
-        E894 nothing in the scene is left to chance; E895 a process ended without a word; and those of
-        `simulation.prepare`.
+        E876 too many runs to keep; E894 nothing in the scene is left to chance; E895 a process ended without
+        a word; and those of `simulation.prepare`.
     """
+    refuse_beyond(RUN * runs, "E876", Place(system.name), f"{runs:,} runs", "fewer --runs")
     if not any(link.channel is not None for link in system.links):
         what = f"nothing in {system.name} is left to chance: every run would be the same"
         raise ApcError(Mistake("E894", Place(system.name), what, hint="links: {lan: {…, loss: 2 %}}"))

@@ -25,6 +25,7 @@ from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.scheduling import build_schedules
+from apc.memory import refuse_beyond
 from apc.network.timetable import Luck, Route, Timetable, luck_of, routes_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
 from apc.simulation.forcing import SiteForcing, forcing_of
@@ -62,8 +63,7 @@ CHUNK = 2**19
 ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
 MOST_FRAMES = 2000  # of one chunk: what has left the range of floats is noticed at its end
 NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
-# Numbers that a frame of all peers may hold: 4 GiB of them with what CasADi copies.
-MOST_NUMBERS = 2**26
+NUMBER = 64  # bytes of a number of all peers' frame, with what CasADi copies
 
 # Rows of one command, all runs together: at a microsecond a row and peer, which machine code needs, some
 # hours. At 1 kHz it is eleven days of simulated time.
@@ -118,6 +118,11 @@ class Simulation:
         if method.name != WHERE_NEEDED:
             return str(method)
         return f"{method}, {CVODES}:{method.tolerance:g} elsewhere" if self.tolerances else EXACT
+
+    @property
+    def rows(self) -> int:
+        """How many rows there are at most: those of whole frames."""
+        return (int(self.settings.duration / self.quantum) // self.frame + 1) * len(self.marks)
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -226,8 +231,7 @@ def size_note(simulation: Simulation, *, decimal: bool) -> str:
     decimal
         Whether the file is a text.
     """
-    frames = int(simulation.settings.duration / (simulation.frame * simulation.quantum))
-    rows, columns = frames * len(simulation.marks), len(simulation.signals) + 1
+    rows, columns = simulation.rows, len(simulation.signals) + 1
     size = rows * columns * (DECIMAL if decimal else BINARY)
     if size < LARGE:
         return ""
@@ -350,12 +354,8 @@ def _check_size(
         own = len(kind.parameters) + lengths * len(kind.states) * (len(kind.states) + len(kind.holds) + 1)
         total += group.count * (own + sum(schedule.depths))
     total += NUMBERS_A_PAIR * count_pairs(system, exchange)
-    if total > MOST_NUMBERS:
-        what = (
-            f"{system.peers} peers hold {total} numbers in a frame; at most {MOST_NUMBERS} can be "
-            "simulated at once"
-        )
-        raise ApcError(Mistake("E874", Place(system.name), what, hint="fewer peers, or fewer --signals"))
+    what = f"{system.peers:,} peers hold {total:,} numbers in a frame, which"
+    refuse_beyond(NUMBER * total, "E874", Place(system.name), what, "fewer peers, or fewer --signals")
 
 
 def _recorded_and_not(choice: Choice) -> list[tuple[Integers, tuple[LocalSignal, ...]]]:

@@ -20,6 +20,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.distribution import versions
+from apc.memory import refuse_beyond
 from apc.option_value import option_value
 from apc.result import Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
@@ -32,7 +33,7 @@ from apc.simulation.summary import Summary, Watch
 
 Floats = NDArray[np.float64]
 
-MOST_KEPT = 2**27  # numbers that are kept in memory: 1 GiB
+NUMBER = 16  # bytes of a number that is kept: in its block, and in the rows put together
 MOST_LISTED = 1000  # peers whose own numbers are written out; the digest of their table covers the others
 
 
@@ -142,15 +143,10 @@ class Keeper:
     """Keeps the rows in memory."""
 
     def __init__(self, simulation: Simulation) -> None:
-        rows = int(simulation.settings.duration / simulation.quantum) // simulation.frame + 1
-        if rows * len(simulation.marks) * len(simulation.signals) > MOST_KEPT:
-            seconds = float(simulation.settings.duration)
-            what = (
-                f"{len(simulation.signals)} signals over {seconds:g} s are more than "
-                f"{MOST_KEPT} numbers, too many to keep in memory"
-            )
-            hint = "fewer --signals, a shorter --duration, or --out FILE.parquet alone"
-            raise ApcError(Mistake("E876", Place(simulation.system.name), what, hint=hint))
+        numbers = simulation.rows * len(simulation.signals)
+        what = f"{len(simulation.signals):,} signals over {float(simulation.settings.duration):g} s"
+        hint = "fewer --signals, a shorter --duration, or --out FILE.parquet alone"
+        refuse_beyond(NUMBER * numbers, "E876", Place(simulation.system.name), what, hint)
         self.signals = len(simulation.signals)
         self.time: list[Floats] = []
         self.values: list[Floats] = []

@@ -25,6 +25,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
 from apc.compiler.timings import part
 from apc.frame.jacobians import jacobians
+from apc.memory import refuse_beyond
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
@@ -96,6 +97,9 @@ class Sweep(Result):
         return table
 
 
+NUMBER, CELL = 16, 150  # bytes of a cell in a column; and where no file keeps the rows
+
+
 @part("points")
 def sweep(
     system: CompiledSystem,
@@ -151,6 +155,10 @@ def sweep(
         check_table_path(out, "out=")
     if jobs is not None and jobs < 1:
         raise ApcError(Mistake("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
+    width = len(grid.axes) + len(quantity.columns)
+    what = f"{grid.points:,} points of {width} columns"
+    needed = grid.points * width * (NUMBER if out else CELL)
+    refuse_beyond(needed, "E883", PLACE, what, "fewer values" if out else "fewer values, or out=FILE.parquet")
     work = Work(model_bytes(system), of, grid, part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
     with _kept(out, made_of) as kept:
