@@ -26,6 +26,9 @@ from .api import (
     critical as critical,
 )
 from .api import (
+    judge_network as judge_network,
+)
+from .api import (
     load as load,
 )
 from .api import (
@@ -64,6 +67,7 @@ from .api import (
 from .benchmark.bench import Bench as Bench
 from .compiler.compiled import CompiledSystem as CompiledSystem
 from .compiler.errors import ApcError as ApcError
+from .moments.network import NetworkVerdict as NetworkVerdict
 from .regions.region import Region as Region
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.sweep import Sweep as Sweep

@@ -25,6 +25,7 @@ from apc.vary.sensitivity import Sensitivities, sensitivities, varied
 if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
     from apc.frame.names import Range
+    from apc.moments.network import NetworkVerdict
 
 # How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
 # well-conditioned frame stay below 1e-12; beyond ten times that, floats have lost what derivatives need.
@@ -44,12 +45,13 @@ class Answer(Result):
 
     `conventions` holds the analyses under every order of coincident events, or under those that could be had
     in passing; `detailed` says that they were asked for. `box` is the proof over a box of parameters, where
-    one was asked for.
+    one was asked for. `network` is the verdict over the network as it is, None where all packets are on time.
     """
 
     shown_by = "analysis:answer"
 
     analysis: Analysis
+    network: NetworkVerdict | None
     sensitivities: Sensitivities
     margins: Margins
     contact_modes: ContactModes | None
@@ -120,6 +122,7 @@ def answer(
         notes = (*notes, compared.not_repeated)
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
+        network=_over_network(system, prepared),
         sensitivities=sensitivities_of(system, prepared, found),
         margins=_margins(system, prepared, found),
         contact_modes=modes,
@@ -127,6 +130,15 @@ def answer(
         detailed=every_convention,
         box=_prove_box(system, box) if box else None,
     )
+
+
+def _over_network(system: CompiledSystem, prepared: Prepared) -> NetworkVerdict | None:
+    """Return the verdict over the network as it is; imported here, as most scenes have an ideal one."""
+    if all(link.channel is None for link in system.links):
+        return None
+    from apc.moments.network import judge_network
+
+    return judge_network(system, prepared)
 
 
 def _prove_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from apc.analysis.methods import Method
     from apc.analysis.paper import PaperRoute
     from apc.benchmark.bench import Bench
+    from apc.moments.network import NetworkVerdict
     from apc.regions.region import Region
     from apc.simulation.trajectory import Trajectory
     from apc.sweeps.sweep import Sweep
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from apc.vary.sensitivity import Sensitivities
 
 Format = Literal["text", "json", "dot", "svg"]
+Criterion = Literal["mean-square", "nominal"]
 
 
 def compile(path: str | Path) -> CompiledSystem:
@@ -168,6 +170,7 @@ def critical(
     set: Mapping[str, str] | None = None,
     lower: str | None = None,
     upper: str | None = None,
+    criterion: Criterion | None = None,
 ) -> Critical:
     """Find the values of a parameter or delay at which a scene becomes stable or unstable.
 
@@ -179,6 +182,9 @@ def critical(
         Its name, such as "coordination.stiffness" or "lan.delay".
     lower, upper
         Quantities between which to look, such as "5000 N/m".
+    criterion
+        "mean-square": stable means that second moments die out over the network as it is, the default where
+        a link loses or delays packets; "nominal": that motions die out if every packet is on time.
 
     Raises
     ------
@@ -187,7 +193,35 @@ def critical(
     """
     from apc.vary import critical as crossings
 
-    return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper)
+    return crossings.critical(
+        _model(model, set), parameter, lower=lower, upper=upper, criterion=criterion
+    )
+
+
+def judge_network(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+) -> NetworkVerdict | None:
+    """Say what becomes of a scene over the network that it has, lost and late packets included.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+
+    Returns
+    -------
+    NetworkVerdict or None
+        Verdict in mean square and the growth of second moments a frame with its error; None where every
+        packet takes its nominal delay.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.moments import network
+
+    return network.judge_network(_model(model, set))
 
 
 def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Margins:

@@ -49,23 +49,11 @@ EARLIEST = {"uniform": 1.0, "normal": LATEST["normal"], "pareto": 2 / 3}
 
 
 @dataclass(frozen=True, slots=True)
-class LossesInARow:
-    """The worst case: losses in a row certified harmless, and a pattern that shakes the scene.
-
-    `unstable_pattern` says of each frame of a period whether its packets are lost; `growth` is per frame.
-    """
-
-    certified: int | None
-    unstable_pattern: tuple[bool, ...] | None
-    growth: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class NetworkVerdict(Result):
     """What becomes of a scene whose packets get lost or come late by chance.
 
-    `mean_square_radius` is what second moments grow by in a frame, right to `error`; `exact` is False where
-    it is an estimate. `rms_error_m` is how far a copy is from the mean of the others; null where not asked or
+    `mean_square_radius` is what second moments grow by in a frame, right to `error`; its root compares with
+    the nominal spectral radius. `exact` is False where it is an estimate. `rms_error_m` is how far a copy is from the mean of the others; null where not asked or
     not served, as `notes` say.
     """
 
@@ -79,6 +67,7 @@ class NetworkVerdict(Result):
     exact: bool
     proof: str
     rms_error_m: float | None
+    almost_sure: AlmostSure | None
     losses_in_a_row: LossesInARow | None
     notes: tuple[str, ...]
 
@@ -266,6 +255,7 @@ def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> N
         exact=found.exact,
         proof=found.proof,
         rms_error_m=None,
+        almost_sure=None,
         losses_in_a_row=None,
         notes=tuple(text for text in (found.why and f"not judged: {found.why}", found.note) if text),
     )

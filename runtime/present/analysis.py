@@ -159,6 +159,8 @@ def analysis_document(result: Analysis) -> dict[str, Any]:
 def answer_text(found: Answer) -> str:
     """Return what `apc analyze` prints: the analysis, and what stands beside it."""
     parts = [analysis_text(found.analysis), str(found.sensitivities), str(found.margins)]
+    if found.network is not None:
+        parts.insert(0, str(found.network))
     if found.contact_modes is not None:
         parts.append(str(found.contact_modes))
     if found.detailed:
@@ -173,6 +175,7 @@ def answer_text(found: Answer) -> str:
 def answer_document(found: Answer) -> dict[str, Any]:
     """Return what `apc analyze --json` prints: the analysis with more keys."""
     told = found.analysis.to_dict() | {
+        "network": found.network.to_dict() if found.network else None,
         "sensitivities": found.sensitivities.to_dict(),
         "margins": document(found.margins.rows),
         "margins_note": found.margins.note,
