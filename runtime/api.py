@@ -408,6 +408,7 @@ def simulate(
     jit: bool = True,
     seed: int | None = None,
     method: str | None = None,
+    trace_of: Literal["worst"] | None = None,
     error: bool = False,
 ) -> Trajectory:
     """Play a scene in time.
@@ -429,6 +430,8 @@ def simulate(
     method
         "exact", "rk4:STEP", "semi-implicit:STEP" or "cvodes:RTOL", such as "rk4:0.1 ms"; exact where linear
         and by CVODES elsewhere if not given.
+    trace_of
+        "worst": lose packets by the periodic pattern that `analyze` finds to shake the scene.
     error
         Whether to estimate the error, by a second run.
 
@@ -445,8 +448,13 @@ def simulate(
     from apc.simulation import trajectory
     from apc.simulation.settings import DEFAULT, parse_method
 
+    system = _model(model, set)
+    if trace_of is not None:
+        from apc.moments.worst import trace_of_worst
+
+        system = trace_of_worst(system)
     return trajectory.simulate(
-        _model(model, set),
+        system,
         duration=trajectory.parse_duration(duration) if duration is not None else None,
         signals=signals,
         jit=jit,

@@ -77,6 +77,7 @@ HOUSE = (
         contact_modes
         """,
     ),
+    ("apc.moments", "memory mean_loops gains crowd held peak worst almost_sure"),
     (
         "apc.vary",
         """

@@ -84,6 +84,11 @@ if TYPE_CHECKING:
     help="exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL; exact where linear and CVODES elsewhere if "
     "not given.",
 )
+@click.option(
+    "--trace-of",
+    type=click.Choice(["worst"]),
+    help="Lose packets by the periodic pattern that analyze finds to shake the scene.",
+)
 @click.option("--error", is_flag=True, help="Play it a second time, more closely, and say how far off it is.")
 def simulate_command(
     file: str | None,
@@ -99,6 +104,7 @@ def simulate_command(
     runs: int | None,
     jobs: int,
     method: str | None,
+    trace_of: str | None,
     error: bool,
 ) -> None:
     """Play a scene in time.
@@ -126,6 +132,10 @@ def simulate_command(
     asked = parse_duration(duration) if duration is not None else None
     _check_files(out, plot, still)
     system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still})
+    if trace_of is not None:
+        from apc.moments.worst import trace_of_worst
+
+        system = trace_of_worst(system)
     seconds = duration_of(system, asked)
     check_length(system, seconds, runs=runs or 1)
     if still is not None:
