@@ -193,9 +193,7 @@ def critical(
     """
     from apc.vary import critical as crossings
 
-    return crossings.critical(
-        _model(model, set), parameter, lower=lower, upper=upper, criterion=criterion
-    )
+    return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper, criterion=criterion)
 
 
 def judge_network(
@@ -323,6 +321,7 @@ def region(
     *,
     x: str | None = None,
     y: str | None = None,
+    criterion: Criterion | None = None,
     set: Mapping[str, str] | None = None,
 ) -> Region:
     """Find the boundary of the stable region of two parameters, as curves with their errors.
@@ -334,6 +333,8 @@ def region(
     x, y
         A parameter and its range, such as "contact.stiffness=10 N/m:3000 N/m"; those of the scene's
         `studies: region:` if not given.
+    criterion
+        As for `critical`.
 
     Returns
     -------
@@ -349,7 +350,7 @@ def region(
     from apc.regions.axes import parse_axes
 
     system = _model(model, set)
-    return stable_region.region(system, parse_axes(system, x, y))
+    return stable_region.region(system, parse_axes(system, x, y), criterion=criterion)
 
 
 def sweep(
@@ -357,6 +358,7 @@ def sweep(
     over: Mapping[str, str | Sequence[str]],
     *,
     of: str = "analyze",
+    criterion: Criterion | None = None,
     out: str | Path | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
@@ -372,6 +374,8 @@ def sweep(
         Values by parameter: "500 N/m:1500 N/m:11" (lower end, upper end, how many), or a list of quantities.
     of
         "analyze", or "critical:PARAMETER".
+    criterion
+        As for `critical`.
     out
         A .parquet or .csv file; finished parts are kept beside it, and the same call takes up where it ended.
     jobs
@@ -387,7 +391,7 @@ def sweep(
         from apc.inputs import check_outputs
 
         check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out=": path})
-    return points.sweep(system, over, of=of, out=path, jobs=jobs, cluster=cluster)
+    return points.sweep(system, over, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster)
 
 
 def _model(model: CompiledSystem | str | Path, set: Mapping[str, str] | None) -> CompiledSystem:

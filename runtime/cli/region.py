@@ -18,6 +18,7 @@ from apc.cli.options import (
     beside,
     file_argument,
     file_option,
+    in_option,
     json_option,
     print_result,
     set_option,
@@ -63,6 +64,7 @@ from apc.threads import start_single_threaded
     show_default=True,
     help="Cells along each side of the rectangle to begin with.",
 )
+@in_option
 @file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
 @json_option
 def region_command(
@@ -76,6 +78,7 @@ def region_command(
     overlays: tuple[str, ...],
     settings: tuple[str, ...],
     cells: int,
+    criterion: str | None,
     out: Path | None,
     as_json: bool,
 ) -> None:
@@ -104,7 +107,15 @@ def region_command(
     systems = [open_scene(one, settings, {"--out": out}) for one in (file, *compare)]
     with status_line() as told:
         found = compare_regions(
-            systems, x=x, y=y, panels=listed, overlays=overlays, normalize=normalize, cells=cells, told=told
+            systems,
+            x=x,
+            y=y,
+            panels=listed,
+            overlays=overlays,
+            normalize=normalize,
+            cells=cells,
+            criterion=criterion,
+            told=told,
         )
     if out is not None:
         write_panels(out, found)

@@ -20,6 +20,7 @@ from apc.cli.options import (
     beside,
     file_argument,
     file_option,
+    in_option,
     json_option,
     print_result,
     set_option,
@@ -49,6 +50,7 @@ from apc.option_value import option_value
     metavar="WHAT",
     help="What to compute at each point; see below.",
 )
+@in_option
 @set_option
 @click.option("--jobs", type=WholeNumber(min=1), help="Processes to compute with; all cores by default.")
 @click.option(
@@ -68,6 +70,7 @@ def sweep_command(
     over: tuple[str, ...],
     out: Path,
     of: str,
+    criterion: str | None,
     settings: tuple[str, ...],
     jobs: int | None,
     cluster: str | None,
@@ -100,7 +103,15 @@ def sweep_command(
     system = open_scene(file, settings, {"--out": out})
     with _progress(out) as progress:
         result = sweep(
-            system, values, of=of, out=out, jobs=jobs, cluster=cluster, progress=progress, patience=waiting
+            system,
+            values,
+            of=of,
+            criterion=criterion,
+            out=out,
+            jobs=jobs,
+            cluster=cluster,
+            progress=progress,
+            patience=waiting,
         )
     print_result(result, as_json=as_json, err=beside(out))
 

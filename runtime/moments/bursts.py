@@ -76,7 +76,8 @@ def tagged_radius(
         How many tags there are at most, one after another.
     """
     found = frames(
-        *(system, prepared, first), lambda count: np.concatenate([np.zeros((1, count), int), np.eye(count, dtype=int)])
+        *(system, prepared, first),
+        lambda count: np.concatenate([np.zeros((1, count), int), np.eye(count, dtype=int)]),
     )
     affine = _affine(found)
     return [_radius(affine, order) for order in orders]
@@ -251,7 +252,9 @@ class _Tagged:
         self.rows = self._gathered([(place, c, c, factor, one) for place, c, factor, one in rows])
         self.pairs = self._gathered(pairs)
 
-    def _gathered(self, listed: Sequence[tuple[int, int, int, float, Tags]]) -> tuple[Integers, Floats, Integers]:
+    def _gathered(
+        self, listed: Sequence[tuple[int, int, int, float, Tags]]
+    ) -> tuple[Integers, Floats, Integers]:
         """Return where terms belong (place, c, d), their factors, and where they come from (place, c, d, how)."""
         perms: dict[tuple[int, ...], int] = getattr(self, "perms", {})
         self.perms = perms
@@ -290,7 +293,8 @@ class _Tagged:
         to, factors, origin = self.pairs
         squares = np.zeros((len(moments), count, count, width, width))
         np.add.at(
-            squares, (to[:, 0], to[:, 1], to[:, 2]),
+            squares,
+            (to[:, 0], to[:, 1], to[:, 2]),
             factors[:, None, None] * both[origin[:, 0], origin[:, 1], origin[:, 2]],
         )
         enters = of.enters.transpose(1, 0, 2).reshape(n, count * width)

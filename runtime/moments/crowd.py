@@ -206,9 +206,7 @@ def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
     first = [place[int(site.peers[0])] for site in loops[0].sites]
     last = [place[int(site.peers[-1])] for site in loops[0].sites]
     weights = {
-        way: tuple(
-            tuple(rows[g][last[k] if g == h else h] for k, h in enumerate(first)) for g in first
-        )
+        way: tuple(tuple(rows[g][last[k] if g == h else h] for k, h in enumerate(first)) for g in first)
         for way, rows in whole.coupling.items()
     }
     return loops, weights

@@ -36,8 +36,8 @@ Gain = Callable[[float, Arithmetic], Matrix | None]
 # What is left of a sum that is doubled, relative to the whole: far below any rounding.
 NOTHING = 1e-24
 
-# Doublings until a sum counts as endless: 2^60 frames.
-DOUBLINGS = 60
+# Doublings until a sum counts as endless, 2^60 frames; or where what is doubled has grown to this.
+DOUBLINGS, ENDLESS = 60, 1e100
 
 # Steps towards the radius; secants need some six. The first is so near above the means' own growth.
 STEPS, NEAR = 60, 1e-9
@@ -128,7 +128,7 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
         power = numbers.multiply(power, power)
         sums = np.abs(power).sum(axis=-1)
         size = float((sums if numbers is FLOATS else sums.sum(axis=0)).max(initial=0.0))
-        if not np.isfinite(size):
+        if not size < ENDLESS:
             return None
         if size**2 < NOTHING:
             if numbers is not FLOATS:

@@ -204,7 +204,9 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
     q = np.concatenate([plain.q, RADII.multiply(keeping[..., n_m:], plain.d)], axis=-2)
     s = np.concatenate([RADII.multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
     d = RADII.multiply(listed[..., n_m:], plain.d)
-    names = [f"{channel} heard" for (_, channel), many in zip(numbers, counts, strict=True) for _ in range(many)]
+    names = [
+        f"{channel} heard" for (_, channel), many in zip(numbers, counts, strict=True) for _ in range(many)
+    ]
     sent = {one: count + row for one, row in row_of.items()}
     return Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses, sent)
 

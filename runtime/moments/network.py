@@ -21,6 +21,7 @@ from apc.compiler.multiples import common_multiple
 from apc.finite_equations import finite_equations
 from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve
+from apc.moments.almost_sure import AlmostSure, almost_sure, unplayed
 from apc.moments.bursts import tagged_radius
 from apc.moments.crowd import crowd
 from apc.moments.gains import gain, mean_square_radius
@@ -28,6 +29,7 @@ from apc.moments.memory import is_memoryless
 from apc.moments.patterns import MOST_CHANNELS, pattern_radius, patterns
 from apc.moments.stand_in import stand_in
 from apc.moments.traces import trace_radius
+from apc.moments.worst import LossesInARow, worst_case
 from apc.network.channel import LATEST, ChannelLaw, channel_law
 from apc.result import Result
 from apc.threads import single_threaded
@@ -97,7 +99,9 @@ def unreliable(system: CompiledSystem) -> list[tuple[Link, ChannelLaw]]:
     """Return the links that lose packets or delay them by chance, with their laws."""
     timings = resolve(system).timings
     laws = [
-        (link, channel_law(system, link, timings[link.delay])) for link in system.links if link.channel is not None
+        (link, channel_law(system, link, timings[link.delay]))
+        for link in system.links
+        if link.channel is not None
     ]
     return [(link, law) for link, law in laws if law.mean_loss or law.jitter or law.trace is not None]
 
@@ -174,16 +178,18 @@ def _channels(link: Link, peers: int) -> int:
     return peers * (peers - 1) if link.graph.shape == "complete" else len(arcs(link.graph, peers)[0])
 
 
-def _unserved(
-    system: CompiledSystem, prepared: Prepared, lossy: Sequence[tuple[Link, ChannelLaw]]
-) -> str:
+def _unserved(system: CompiledSystem, prepared: Prepared, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
     """Return what of the scene can't be judged, "" if all can."""
     if any(law.trace is not None for _, law in lossy):
         if not all(law.trace is not None for _, law in lossy):
             return "recorded delays beside links whose packets get lost or come late by chance"
         if any(law.trace is not None and not np.isfinite(law.trace).any() for _, law in lossy):
             return "a trace of losses only: nothing is ever heard"
-        if any(link.channel is not None and link.channel.on_loss == "zero" for link, law in lossy if law.mean_loss):
+        if any(
+            link.channel is not None and link.channel.on_loss == "zero"
+            for link, law in lossy
+            if law.mean_loss
+        ):
             return "recorded losses with on_loss: zero"
         return ""
     for link, law in lossy:
@@ -242,20 +248,42 @@ def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> N
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         found = growth(system, prepared)
+        worst = worst_case(system, prepared) if any(law.mean_loss for _, law in unreliable(system)) else None
+        surely, unsure = _almost_sure(system, prepared, found)
     told = bool(np.isfinite(found.radius))
-    verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[found.stable] if told else NOT_JUDGED
-    if told and not found.exact and found.stable is not None:
-        verdict = f"probably {verdict}"
+    notes = (
+        found.why and f"not judged: {found.why}",
+        found.note,
+        unsure,
+        worst.note if worst is not None else "",
+    )
     return NetworkVerdict(
         topology=system.name,
-        verdict=verdict,
+        verdict=verdict_of(found),
         stable=found.stable if told else None,
         mean_square_radius=found.radius if told else None,
         error=max(found.high - found.radius, found.radius - found.low) if told else None,
         exact=found.exact,
         proof=found.proof,
         rms_error_m=None,
-        almost_sure=None,
-        losses_in_a_row=None,
-        notes=tuple(text for text in (found.why and f"not judged: {found.why}", found.note) if text),
+        almost_sure=surely,
+        losses_in_a_row=worst,
+        notes=tuple(text for text in notes if text),
     )
+
+
+def verdict_of(found: Growth) -> str:
+    """Return the verdict in words."""
+    if not np.isfinite(found.radius):
+        return NOT_JUDGED
+    verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[found.stable]
+    return f"probably {verdict}" if not found.exact and found.stable is not None else verdict
+
+
+def _almost_sure(system: CompiledSystem, prepared: Prepared, found: Growth) -> tuple[AlmostSure | None, str]:
+    """Return how a scene settles almost surely where mean squares leave it open, or why that is not told."""
+    if found.why or found.stable:  # what settles in mean square settles almost surely
+        return None, ""
+    if why := unplayed(system, prepared):
+        return None, f"almost surely: {why}"
+    return almost_sure(system, prepared), ""

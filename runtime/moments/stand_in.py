@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -86,9 +85,7 @@ def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
     return nodes, vectors[0] ** 2
 
 
-def stand_in(
-    system: CompiledSystem, prepared: Prepared, first: Fraction
-) -> tuple[tuple[float, float], Gain]:
+def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tuple[tuple[float, float], Gain]:
     """Return bounds on the means' spectral radius and G(λ) of what luck adds, see `gains`.
 
     Parameters
@@ -112,7 +109,9 @@ def stand_in(
     values, heard_now = [], sorted(set(one.memory.heard.values()))
     for site in sites:
         rows = [site.values[one.route, name, value] for name in one.channels for value in heard_now]
-        assert not site.map.d[:, rows].any(), "what is heard was sent after hearing something in the same frame"
+        assert not site.map.d[:, rows].any(), (
+            "what is heard was sent after hearing something in the same frame"
+        )
         values.append(site.map.s[:, rows])
     receivers = []
     for h, rows in enumerate(told.of(common)):
@@ -125,9 +124,7 @@ def stand_in(
         ]
         heard = np.array(list(itertools.product(*(own for own, _ in nodes))))
         weight = np.array([math.prod(listed) for listed in itertools.product(*(own for _, own in nodes))])
-        receivers.append(
-            _receiver(sites[h], h, rows, one, heard_now, values, weights, others, heard, weight)
-        )
+        receivers.append(_receiver(sites[h], h, rows, one, heard_now, values, weights, others, heard, weight))
     return _gains(receivers, counts, sizes, offsets, common, loops)
 
 
@@ -147,8 +144,13 @@ def _receiver(site, h, rows, one, heard_now, values, weights, others, heard, wei
             )
             place = own_places.index(site.sent[own_value(row)])
             gap[:, 0, line, place] = missed
-            gap[:, 1, line, place] = 16 * UNIT * sum(
-                abs(float(weights[row.way][h][g])) * (others[g] + np.abs(heard[:, g])) for g in range(len(others))
+            gap[:, 1, line, place] = (
+                16
+                * UNIT
+                * sum(
+                    abs(float(weights[row.way][h][g])) * (others[g] + np.abs(heard[:, g]))
+                    for g in range(len(others))
+                )
             )
             continue
         value = heard_now.index(one.memory.heard[row.clock, row.tick])
@@ -182,9 +184,7 @@ def _receiver(site, h, rows, one, heard_now, values, weights, others, heard, wei
         shares.append(scaled(shared, number_of(1 / max(others[g], 1), RADII), RADII))
         apart.append(RADII.subtract(alike, shared))
         per_peer.append(RADII.subtract(block, shares[g]))
-    return _Receiver(
-        heard, weight, mean, tuple(shares), np.concatenate(apart, axis=-1), tuple(per_peer)
-    )
+    return _Receiver(heard, weight, mean, tuple(shares), np.concatenate(apart, axis=-1), tuple(per_peer))
 
 
 def _mean(weight: Floats, blocks: Matrix) -> Matrix:
@@ -264,8 +264,10 @@ def _gain(growth, numbers, receivers, counts, offsets, parts) -> Matrix | None:
             into = np.zeros((2, total, sizes[d]))
             into[0, place : place + sizes[d]] = np.eye(sizes[d])
             weights = with_radius(at.weights, at.doubt)
-            into = into[:, at.rest] if not len(at.held) else RADII.subtract(
-                into[:, at.rest], RADII.multiply(weights, into[:, at.held])
+            into = (
+                into[:, at.rest]
+                if not len(at.held)
+                else RADII.subtract(into[:, at.rest], RADII.multiply(weights, into[:, at.held]))
             )
             driven = scaled(around(of_kind(into, numbers), kinds, numbers), shrink, numbers)
             if h is None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem, Link
-from apc.eigen.closing import Loop, close, feedback_of, lay_out_loop, without_packets
+from apc.eigen.closing import Loop, close, feedback_of, lay_out_loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import arrange
 from apc.eigen.peer_group import MOST_STATES
@@ -64,12 +64,21 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> tuple[float, flo
         return f"the recorded delays come again after {frames:,} frames, and {MOST_FRAMES:,} are the most"
     slots = {name: len(instants(told, clocks[link.clock])) for name, link in links.items()}
     depth = {
-        name: max((-(number // slots[name]) for row in rows if row.way.link == name for number in heard[row]), default=0)
+        name: max(
+            (-(number // slots[name]) for row in rows if row.way.link == name for number in heard[row]),
+            default=0,
+        )
         for name in links
     }
     low, high = 0.0, 0.0
     for loop in loops:
-        if sum(len(site.lifted.z_names) + sum(depth[one.link] for one in site.schedule.sent) for site in loop.sites) > MOST_STATES:
+        if (
+            sum(
+                len(site.lifted.z_names) + sum(depth[one.link] for one in site.schedule.sent)
+                for site in loop.sites
+            )
+            > MOST_STATES
+        ):
             return "the recorded delays are longer than can be followed"
         found = _period(loop, told, heard, depth, slots, frames)
         low, high = max(low, found[0]), max(high, found[1])
@@ -95,7 +104,9 @@ def _heard(link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction
             exact = delay if trace is None else Fraction(float(late))
             arrived = sent[slot] + ago * told.frame + exact
             if arrived < tick or (arrived == tick and not told.strictly):
-                rank = number if link.channel is None or link.channel.reorder == "newest" else (arrived, number)
+                rank = (
+                    number if link.channel is None or link.channel.reorder == "newest" else (arrived, number)
+                )
                 if best is None or rank > best[0]:
                     best = rank, number
         assert best is not None
@@ -117,13 +128,18 @@ def _period(
     for frame in range(frames):
         sites = []
         for site in loop.sites:
-            rows = tuple(_packet(row, heard[row][frame % len(heard[row])], slots) for row in told.rows[id(site.schedule)])
+            rows = tuple(
+                _packet(row, heard[row][frame % len(heard[row])], slots)
+                for row in told.rows[id(site.schedule)]
+            )
             depths = tuple(depth[one.link] for one in site.schedule.sent)
             schedule: Schedule = replace(site.schedule, heard=rows, depths=depths)
             sites.append(replace(site, schedule=schedule))
         now = replace(loop, sites=tuple(sites))
         layout = lay_out_loop(now)
-        matrix = close([site.lifted.bounded for site in sites], feedback_of(now, layout), layout, numbers=RADII).matrix
+        matrix = close(
+            [site.lifted.bounded for site in sites], feedback_of(now, layout), layout, numbers=RADII
+        ).matrix
         if at is None:
             at = relative_coordinates(find_rigid_modes(now, with_drifts=False).basis)
         known = replace(at, weights=with_radius(at.weights, at.doubt))

@@ -25,7 +25,9 @@ _WORDS = {
 
 def network_text(found: NetworkVerdict) -> str:
     """Return what becomes of a scene over its network, in words and numbers."""
-    lines = [f"{found.topology}: {found.verdict}{' over its network' if not found.mean_square_radius else ''}"]
+    lines = [
+        f"{found.topology}: {found.verdict}{' over its network' if not found.mean_square_radius else ''}"
+    ]
     lines += ["", *wrapped(_WORDS.get(found.verdict.removeprefix("probably "), ""), "  ", "  ")] * bool(
         found.mean_square_radius
     )
@@ -44,7 +46,9 @@ def network_text(found: NetworkVerdict) -> str:
         )
     if found.almost_sure is not None:
         low, high = found.almost_sure.interval
-        lines.append(f"  almost surely    growth e^{found.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})")
+        lines.append(
+            f"  almost surely    growth e^{found.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
+        )
     if found.losses_in_a_row is not None:
         lines += _losses(found)
     if found.proof:

@@ -108,6 +108,7 @@ def compare_regions(
     overlays: Sequence[str] = (),
     normalize: bool = False,
     cells: int = CELLS,
+    criterion: str | None = None,
     told: Told | None = None,
 ) -> Panels:
     """Find the regions of some scenes with some settings.
@@ -125,7 +126,7 @@ def compare_regions(
     normalize
         Whether y is the effective gain: a scene that sums over its others is given y divided by their number,
         so that its coupling is as strong as that of a scene that takes their mean.
-    cells, told
+    cells, criterion, told
         See `region.region`.
 
     Raises
@@ -148,7 +149,9 @@ def compare_regions(
         jobs.append((", ".join(settings), work, [parse_overlay(work[0][0], text) for text in overlays]))
     found = []
     for title, work, laid in jobs:
-        regions = tuple(region(system, axes, cells=cells, told=told) for system, axes, _ in work)
+        regions = tuple(
+            region(system, axes, cells=cells, criterion=criterion, told=told) for system, axes, _ in work
+        )
         first, axes, gain = work[0]
         lines = tuple((one.label, overlay_points(first, one, *axes) * [1.0, gain]) for one in laid)
         found.append(Panel(title, regions, tuple(gain for _, _, gain in work), lines))

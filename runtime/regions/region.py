@@ -39,6 +39,14 @@ from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_time
 from apc.vary.marginal import marginal_motion, with_rigid
+from apc.vary.mean_square import (
+    MEAN_SQUARE,
+    NOMINAL,
+    MeanSquareEvaluator,
+    criterion_of,
+    growth_at,
+    refuse_time,
+)
 from apc.vary.search import Told
 
 if TYPE_CHECKING:
@@ -57,6 +65,9 @@ FOLD = 0.1
 
 # Points looked at together when they are compared with all curves.
 CHUNK = 1024
+
+
+Source = BatchEvaluator | PointEvaluator | MeanSquareEvaluator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,11 +89,13 @@ class Curve:
     smooth: bool
     knots: Floats
     eigenvalues: NDArray[np.complex128]
-    source: BatchEvaluator | PointEvaluator
+    source: Source
 
     @property
     def mode(self) -> str:
-        """The name of the closed system that makes the boundary here."""
+        """The name of the closed system that makes the boundary here, or the criterion that does."""
+        if isinstance(self.source, MeanSquareEvaluator):
+            return MEAN_SQUARE
         middle = len(self.knots) // 2
         return _identify(self.source, self.knots[middle], complex(self.eigenvalues[middle]))[0]
 
@@ -92,6 +105,8 @@ class Curve:
 
         Both are NaN where it can't be told.
         """
+        if isinstance(self.source, MeanSquareEvaluator):
+            return np.nan, np.nan
         angles = np.abs(np.angle(self.eigenvalues))
         middle = len(self.knots) // 2
         places = {middle} if self.smooth else set(range(len(self.knots)))
@@ -120,7 +135,7 @@ class Region(Result):
     `stable_area` is in the product of the axes' units. `cell` are the sides of the cells the rectangle was
     looked at in, in SI; where values hinted at more, cells down to `finest` of them. `corner` says whether
     the corner of both lower ends is stable, `stepped` that the boundary is right to a cell only, as times
-    vary, `linearized` that the scene is not linear;
+    vary, `linearized` that the scene is not linear; `criterion` what stable means;
     `left_out` says what of the scene the answer does not look at.
     """
 
@@ -137,6 +152,7 @@ class Region(Result):
     corner: bool
     stepped: bool
     linearized: bool
+    criterion: str
     left_out: tuple[str, ...]
     system: CompiledSystem
 
@@ -193,6 +209,7 @@ def region(
     *,
     cells: int = CELLS,
     tolerance: float = TOLERANCE,
+    criterion: str | None = None,
     prepared: Prepared | None = None,
     told: Told | None = None,
 ) -> Region:
@@ -208,6 +225,8 @@ def region(
         Into how many cells each side of the rectangle is divided to begin with.
     tolerance
         Largest distance between curves and boundary, relative to a coordinate.
+    criterion
+        "mean-square" or "nominal", see `critical.critical`.
     prepared
         From `analysis.prepare`, of this system with any numbers.
     told
@@ -226,16 +245,23 @@ def region(
     line from cell edge to cell edge, its error the size of a cell.
     """
     free = tuple(axis.free for axis in axes)
+    meant = criterion_of(system, criterion, PLACE)
     for one in free:
-        refuse_channel_number(system, one, PLACE)
+        if meant == NOMINAL:
+            refuse_channel_number(system, one, PLACE)
+        else:
+            refuse_time(system, one, PLACE)
     rectangle = rectangle_of(*axes)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]
         affine = all(site.affine for site in used)
         times = [place for place, one in enumerate(free) if reaches_time(system, one)]
-        source: BatchEvaluator | PointEvaluator
-        if times:
+        source: Source
+        if meant == MEAN_SQUARE:
+            times = []
+            source = MeanSquareEvaluator(system, free, prepared, PLACE)
+        elif times:
             source = PointEvaluator(system, free, prepared)
         else:
             source = evaluator_of_many(system, free, PLACE, prepared=prepared)
@@ -260,13 +286,14 @@ def region(
         corner=found.corner,
         stepped=stepped,
         linearized=not affine,
-        left_out=left_out(system, linear=affine),
+        criterion=meant,
+        left_out=left_out(system, linear=affine, network=meant == NOMINAL),
         system=system,
     )
 
 
 def _surveyed(
-    source: BatchEvaluator | PointEvaluator,
+    source: Source,
     rectangle: Rectangle,
     timed: bool,
     cells: int,
@@ -297,7 +324,7 @@ def _surveyed(
     return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
 
 
-def _family(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, timed: bool) -> Family:
+def _family(source: Source, rectangle: Rectangle, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
     if isinstance(source, BatchEvaluator):
         return resolve_family(source, rectangle, partial(matrix_errors, source))
@@ -306,9 +333,7 @@ def _family(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, timed
     return resolve_family(source, rectangle, source.errors)
 
 
-def _samples(
-    family: Family, source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, points: Floats
-) -> Floats:
+def _samples(family: Family, source: Source, rectangle: Rectangle, points: Floats) -> Floats:
     """Return the logarithms of the largest magnitudes, or raise what is wrong with a point."""
     matrices = family.matrices(points)
     for one in matrices:
@@ -325,7 +350,7 @@ def _samples(
     return log_magnitudes(matrices, BRANCHES)
 
 
-def _curve(source: BatchEvaluator | PointEvaluator, rectangle: Rectangle, arc: Arc) -> Curve:
+def _curve(source: Source, rectangle: Rectangle, arc: Arc) -> Curve:
     """Return an arc in SI."""
     return Curve(
         points=rectangle.values(arc.points),
@@ -348,9 +373,7 @@ def _relative_error(arc: Arc, offset: Floats) -> float:
     return float((errors / size).max())
 
 
-def _identify(
-    source: BatchEvaluator | PointEvaluator, value: Floats, eigenvalue: complex
-) -> tuple[str, float, float]:
+def _identify(source: Source, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
     found = marginal_motion(with_rigid(source.closed_at(value.tolist())), eigenvalue)
     return found.name, found.turn, found.frame_s
@@ -399,6 +422,9 @@ def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
             Override(axis.free, Fraction(number))
             for axis, number in zip((found.x, found.y), value, strict=True)
         ]
-        answer = analyze(apply(found.system, overrides), prepared=prepared)
-        decided.append(bool(answer.stable))
+        changed = apply(found.system, overrides)
+        if found.criterion == MEAN_SQUARE:
+            decided.append(bool(growth_at(changed, prepared, [], PLACE).stable))
+        else:
+            decided.append(bool(analyze(changed, prepared=prepared).stable))
     return np.array(decided, dtype=bool)

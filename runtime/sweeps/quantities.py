@@ -1,7 +1,8 @@
 """What a sweep can compute at each of its points.
 
 Takes: a `CompiledSystem` and a name such as `analyze` or `critical:coordination.stiffness`.
-Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`.
+Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`; `in_mean_square`,
+`is_in_mean_square`.
 Guarantees: what all points share is prepared once; a row does not depend on the parts computed before; a
 point that can't be computed is a row that says why; a number that isn't finite is left out of a row.
 Does not: choose points, or hold results.
@@ -25,6 +26,9 @@ from apc.tables import Column, Row
 from apc.vary.many import FAULT, ManyAnalyses, Varied, by_matrices, many_analyses
 
 PLACE = Place("sweep")
+
+# How the name of a quantity in mean square begins.
+IN_MEAN_SQUARE = "in mean square: "
 
 VERDICT = Column("verdict", "", "text")
 MESSAGE = Column("message", "", "text")
@@ -58,12 +62,28 @@ def find_quantity(system: CompiledSystem, text: str) -> Quantity:
     ApcError
         E884 no such quantity; what the quantity's own argument can be wrong in.
     """
+    if is_in_mean_square(text):
+        text, by_chance = text.removeprefix(IN_MEAN_SQUARE), True
+    else:
+        by_chance = False
     name, _, argument = text.partition(":")
     make = QUANTITIES.get(name.strip())
     if make is None:
         what = f"{name[:80] or 'an empty name'} is nothing a sweep computes ({', '.join(QUANTITIES)})"
         raise ApcError(Mistake("E884", PLACE, what, hint=nearest(name, QUANTITIES)))
+    if by_chance:
+        make = _BY_CHANCE[name.strip()]
     return make(system, argument.strip())
+
+
+def in_mean_square(text: str) -> str:
+    """Return the name of a quantity in mean square."""
+    return IN_MEAN_SQUARE + text
+
+
+def is_in_mean_square(text: str) -> bool:
+    """Say whether a quantity is one in mean square."""
+    return text.startswith(IN_MEAN_SQUARE)
 
 
 def faulty(columns: tuple[Column, ...], error: ApcError) -> Row:
@@ -112,7 +132,52 @@ def _finite(numbers: NDArray[np.float64]) -> list[float | None]:
     return [finite(number) for number in numbers.tolist()]
 
 
-def _critical(system: CompiledSystem, argument: str) -> Quantity:
+def _growth(system: CompiledSystem, argument: str) -> Quantity:
+    """Return the verdict in mean square and what second moments grow by in a frame."""
+    from apc.analysis.analysis import prepare  # the nominal quantities need none of it
+    from apc.moments.network import growth, verdict_of
+
+    if argument:
+        raise ApcError(Mistake("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
+    columns = (
+        VERDICT,
+        Column("mean_square_radius", "", "number"),
+        Column("mean_square_radius_error", "", "number"),
+        MESSAGE,
+    )
+    prepared = prepare(system)
+
+    def evaluate(changed: CompiledSystem) -> Row:
+        with np.errstate(all="ignore"):
+            found = growth(changed, prepared)
+        error = max(found.high - found.radius, found.radius - found.low)
+        return (verdict_of(found), finite(found.radius), finite(error), found.why or found.note)
+
+    return Quantity(columns, _one_by_one(system, columns, evaluate))
+
+
+def _critical_by_chance(system: CompiledSystem, argument: str) -> Quantity:
+    return _critical(system, argument, "mean-square")
+
+
+def _one_by_one(
+    system: CompiledSystem, columns: tuple[Column, ...], evaluate: Callable[[CompiledSystem], Row]
+) -> Callable[[Grid, Sequence[int]], list[Row]]:
+    """Return what evaluates some points of a grid, each by itself."""
+
+    def rows(grid: Grid, points: Sequence[int]) -> list[Row]:
+        found = []
+        for point in points:
+            try:
+                found.append(evaluate(apply(system, grid.overrides(point))))
+            except ApcError as error:
+                found.append(faulty(columns, error))
+        return found
+
+    return rows
+
+
+def _critical(system: CompiledSystem, argument: str, criterion: str = "nominal") -> Quantity:
     """Return the value at which the verdict changes with one parameter, and on which side it is stable."""
     from apc.vary.critical import critical  # a sweep of verdicts needs none of it
 
@@ -131,26 +196,22 @@ def _critical(system: CompiledSystem, argument: str) -> Quantity:
     )
 
     def evaluate(changed: CompiledSystem) -> Row:
-        found = critical(changed, argument)
+        found = critical(changed, argument, criterion=criterion)
         if found.value is None or found.error is None:
             return (found.verdict, None, None, 0, None, "")
         verdict = f"stable {found.stable_side} the value"
         proof = next(one.proof for one in found.crossings if one.value == found.value)
         return (verdict, finite(found.value), finite(found.error), len(found.crossings), proof, "")
 
-    def rows(grid: Grid, points: Sequence[int]) -> list[Row]:
-        found = []
-        for point in points:
-            try:
-                found.append(evaluate(apply(system, grid.overrides(point))))
-            except ApcError as error:
-                found.append(faulty(columns, error))
-        return found
-
-    return Quantity(columns, rows)
+    return Quantity(columns, _one_by_one(system, columns, evaluate))
 
 
 QUANTITIES: Mapping[str, Callable[[CompiledSystem, str], Quantity]] = {
     "analyze": _analyze,
     "critical": _critical,
+}
+
+_BY_CHANCE: Mapping[str, Callable[[CompiledSystem, str], Quantity]] = {
+    "analyze": _growth,
+    "critical": _critical_by_chance,
 }

@@ -30,10 +30,11 @@ from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
-from apc.sweeps.quantities import VERDICT, find_quantity
+from apc.sweeps.quantities import VERDICT, find_quantity, in_mean_square, is_in_mean_square
 from apc.sweeps.store import Parts, open_parts, remove_parts
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
 from apc.tables import Cell, Column, Row, check_table_path, write_table
+from apc.vary.mean_square import NOMINAL, criterion_of
 
 if TYPE_CHECKING:
     import pandas
@@ -106,6 +107,7 @@ def sweep(
     over: Mapping[str, str | Sequence[str]],
     *,
     of: str = "analyze",
+    criterion: str | None = None,
     out: Path | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
@@ -123,6 +125,8 @@ def sweep(
         `:log` for equal ratios), or a list, `"0,8 ms"` or `["0 ms", "8 ms"]`. The last one turns fastest.
     of
         What to compute, see `quantities.QUANTITIES`: `analyze`, …
+    criterion
+        "mean-square" or "nominal", see `critical.critical`.
     out
         The file to write, .csv or .parquet. Finished parts are kept beside it until all is done, and the
         same sweep takes them up again. Without it the rows are only returned.
@@ -145,9 +149,12 @@ def sweep(
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
     grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
-    quantity = find_quantity(system, of)
+    meant = criterion_of(system, criterion, PLACE)
+    work_of = of if meant == NOMINAL else in_mean_square(of)
+    quantity = find_quantity(system, work_of)
     for axis in grid.axes:
-        refuse_channel_number(system, axis.free, PLACE)
+        if meant == NOMINAL:
+            refuse_channel_number(system, axis.free, PLACE)
         if axis.free.label == of.partition(":")[2].strip():
             what = f"{axis.free.label} is swept: there is nothing to look for at one value of it"
             raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))
@@ -159,7 +166,7 @@ def sweep(
     what = f"{grid.points:,} points of {width} columns"
     needed = grid.points * width * (NUMBER if out else CELL)
     refuse_beyond(needed, "E883", PLACE, what, "fewer values" if out else "fewer values, or out=FILE.parquet")
-    work = Work(model_bytes(system), of, grid, part_points(grid.points, quick=quantity.quick))
+    work = Work(model_bytes(system), work_of, grid, part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
     with _kept(out, made_of) as kept:
         whose = Whose(jobs or cores(), cluster, patience or Patience())
@@ -203,7 +210,13 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
         "topology": system.name,
         "peers": system.peers,
         "of": work.of,
-        "left_out": list(left_out(system, linear=all(jacobians(kind).affine for kind in system.kinds))),
+        "left_out": list(
+            left_out(
+                system,
+                linear=all(jacobians(kind).affine for kind in system.kinds),
+                network=not is_in_mean_square(work.of),
+            )
+        ),
         "points": work.grid.points,
         "over": [
             {

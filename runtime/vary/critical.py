@@ -133,6 +133,7 @@ def critical(
         else:
             low, high = (None if one is None else float(one) for one in limits)
             found = search(system, free, low, high, prepared, told=told)
+
         def stable_now() -> bool | None:
             if by_chance:
                 return growth_at(system, prepared, [], _PLACE).stable

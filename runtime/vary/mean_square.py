@@ -1,7 +1,8 @@
 """The values of one parameter at which a scene becomes stable or unstable in mean square.
 
 Takes: a `CompiledSystem` with unreliable links and the name of a parameter, or of what links lose.
-Gives: `MEAN_SQUARE`, `NOMINAL`, `criterion_of`; `search_mean_square`; `growth_at`.
+Gives: `MEAN_SQUARE`, `NOMINAL`, `criterion_of`; `search_mean_square`; `growth_at`;
+`MeanSquareEvaluator`.
 Guarantees: on either side of a crossing, by its error, bounds on the growth of second moments decide.
 Does not: find two crossings between neighbouring samples; follow a delay, whose pieces are the nominal
 search's (see `delays`).
@@ -10,10 +11,12 @@ search's (see `delays`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
@@ -22,7 +25,13 @@ from apc.frame.names import Free, unit_of
 from apc.frame.overrides import Override, apply
 from apc.moments.network import Growth, growth, unreliable
 from apc.network.nominal import channel_numbers
+from apc.vary.evaluator import reaches_time
 from apc.vary.search import SAMPLES, SPAN, Crossing, Search, Told
+
+Floats = NDArray[np.float64]
+
+# The relative step of a central difference, whose cut-off and rounding are then alike; roots above 0.
+DIFFERENCE, LEAST = 1e-5, 1e-9
 
 MEAN_SQUARE, NOMINAL = "mean-square", "nominal"
 
@@ -30,9 +39,10 @@ MEAN_SQUARE, NOMINAL = "mean-square", "nominal"
 SHARES = 33
 
 # How near a crossing is found at first, relatively, and how far its bounds may be at last.
-NEAR, FAR = 1e-12, 1e-4
+NEAR, FAR = 1e-14, 1e-4
 
-STEPS = 60
+# The first width at which bounds are asked for; steps towards a crossing.
+FIRST, STEPS = 1e-12, 60
 
 
 def criterion_of(system: CompiledSystem, asked: str | None, place: Place) -> str:
@@ -58,6 +68,27 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place) -> str
     return asked or (MEAN_SQUARE if unreliable(system) else NOMINAL)
 
 
+def refuse_time(system: CompiledSystem, free: Free, place: Place) -> None:
+    """Refuse to vary a period, phase or delay in mean square; how much delays vary may.
+
+    Parameters
+    ----------
+    system, free
+        The compiled scene and what is to vary.
+    place
+        Where it was asked for.
+
+    Raises
+    ------
+    ApcError
+        E897 it reaches when something happens.
+    """
+    jitter = {link.channel.jitter for link in system.links if link.channel is not None}
+    if reaches_time(system, free) and free.name not in jitter:
+        what = f"{free.label} can't be varied in mean square: what happens when would change with it"
+        raise ApcError(Mistake("E897", place, what, hint=f"--in {NOMINAL}"))
+
+
 def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Override], place: Place) -> Growth:
     """Return what second moments grow by with other numbers.
 
@@ -81,6 +112,49 @@ def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Overri
         what = f"the scene can't be judged in mean square: {found.why}"
         raise ApcError(Mistake("E897", place, what, hint=f"--in {NOMINAL}"))
     return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeanSquareEvaluator:
+    """An `Evaluator` of one number: the root of what second moments grow by in a frame, as a matrix (1, 1).
+
+    Derivatives are central differences, right to about 1e-9.
+    """
+
+    system: CompiledSystem
+    free: tuple[Free, ...]
+    prepared: Prepared
+    place: Place
+
+    def growth(self, value: Sequence[float]) -> Growth:
+        """Return what second moments grow by at a point (m,)."""
+        overrides = [
+            Override(one, Fraction(float(number))) for one, number in zip(self.free, value, strict=True)
+        ]
+        return growth_at(self.system, self.prepared, overrides, self.place)
+
+    def matrices(self, values: Floats) -> tuple[Floats, ...]:
+        """Return the root (k, 1, 1) at values (k, m)."""
+        return (np.sqrt([self.growth(value).radius for value in values.tolist()])[:, None, None],)
+
+    def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
+        """Return the root (k, 1, 1) and its derivatives along directions (k, m)."""
+        step = (
+            DIFFERENCE
+            * np.min(np.where(along != 0, np.abs(values), np.inf), axis=1)
+            / np.abs(along).max(axis=1)
+        )
+        step = np.where(step > 0, step, DIFFERENCE * DIFFERENCE)
+        moved = step[:, None] * along
+        (here,), (before,), (after,) = (
+            self.matrices(one) for one in (values, values - moved, values + moved)
+        )
+        return ((here, (after - before) / (2 * step[:, None, None])),)
+
+    def errors(self, values: Floats) -> tuple[Floats, ...]:
+        """Return bounds (k, 1, 1) on the errors of the root at values (k, m)."""
+        found = [self.growth(value) for value in values.tolist()]
+        return (np.array([(one.high - one.low) / max(one.radius, LEAST) for one in found])[:, None, None],)
 
 
 def search_mean_square(
@@ -117,9 +191,7 @@ def search_mean_square(
     ApcError
         E897 the network can't be judged, or a delay is to vary.
     """
-    if any(timing.name == free.name for timing in system.timings) and free.name not in channel_numbers(system):
-        what = f"{free.label} can't be varied in mean square: packets would come in another order"
-        raise ApcError(Mistake("E897", place, what, hint=f"--in {NOMINAL}"))
+    refuse_time(system, free, place)
     samples = _samples(system, free, low, high, present)
     known: dict[float, Growth] = {}
 
@@ -185,7 +257,7 @@ def _crossing(at: Callable[[float], Growth], low: float, high: float, *, stable_
             low, at_low, at_high = middle, found, at_high / 2
         else:
             high, at_high, at_low = middle, found, at_low / 2
-    width = NEAR * max(abs(value), 1e-300)
+    width = FIRST * max(abs(value), 1e-300)
     while width <= FAR * max(abs(value), 1e-300):
         below, above = at(value - width).stable, at(value + width).stable
         if None not in (below, above) and below != above:
