@@ -79,7 +79,7 @@ def test_exponents_are_those_of_frames_multiplied_by_hand(loss: str) -> None:
         [[own.matrix(np.array([one, other])) for other in (0.0, 1.0)] for one in (0.0, 1.0)]
     )
     p, r = (0.1, 0.9) if loss == "10 %" else (0.05, 0.2)
-    courses, frames_each = 300, 3000
+    courses, frames_each = 200, 1700
     # The translation of all, and what every channel holds of it, is taken out.
     values, vectors = np.linalg.eig(heard_and_lost[1, 1])
     rigid = vectors[:, np.argmin(np.abs(values - 1))].real
