@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups, timed
 from apc.compiler.compiled import CompiledSystem, Link
-from apc.compiler.errors import ApcError
 from apc.eigen.closing import (
     Feedback,
     Loop,
@@ -38,7 +37,7 @@ from apc.eigen.closing import (
     feedback_of,
     lay_out_loop,
 )
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peer_group import MOST_STATES, PeerGroup
 from apc.eigen.relative import relative_coordinates
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
@@ -48,9 +47,6 @@ from apc.frame.schedule import Heard, Schedule
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
-
-# The refusal of more different peers than are worth an object each.
-TOO_MANY = "E804"
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +86,7 @@ class HeldLoop:
 
 @dataclass(frozen=True, slots=True)
 class HeldScene:
-    """A scene whose receivers hold what they heard last: its peers, its links, and those that lose packets."""
+    """A scene whose receivers hold what they heard last; `lossy` are the links that lose packets."""
 
     groups: tuple[PeerGroup, ...]
     exchange: Exchange
@@ -107,19 +103,23 @@ def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene | str:
     prepared
         From `analysis.prepare`, of this system with any numbers.
     """
-    at = timed(system, prepared, resolve(system))
+    numbers = resolve(system)
+    at = timed(system, prepared, numbers)
     lossy = [link for link in system.links if link.channel is not None]
     if not lossy:
         return "every link is reliable"
     for link in lossy:
         if why := _unheld(link, at.schedules):
             return why
-    try:
-        groups, exchange = lifted_groups(system, prepared=at)
-    except ApcError as refused:
-        if refused.mistakes[0].code != TOO_MANY:
-            raise
-        return refused.mistakes[0].what
+    different = {
+        (group.kind, vector.tobytes())
+        for group, vectors in zip(system.groups, numbers.parameters, strict=True)
+        for vector in vectors
+    }
+    states = sum(len(system.kinds[kind].states) for kind, _ in different)
+    if states > MOST_STATES:
+        return f"{len(different):,} different peers have {states:,} states, and {MOST_STATES:,} are the most"
+    groups, exchange = lifted_groups(system, prepared=at)
     return HeldScene(groups, exchange, frozenset(link.name for link in lossy))
 
 

@@ -133,7 +133,10 @@ def worst_case(system: CompiledSystem, prepared: Prepared) -> LossesInARow:
     certified = harmless(found)
     if certified == MANY:
         return LossesInARow(MANY, None, None, f"{MANY:,} losses in a row are harmless, where counting ends")
-    return LossesInARow(certified, *shaking(found, known=certified or 0))
+    pattern, growth, note = shaking(found, known=certified or 0)
+    if certified is None and pattern is None:
+        note = f"the scene is not proved to settle with no packet lost; {note}"
+    return LossesInARow(certified, pattern, growth, note)
 
 
 def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
