@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.compiled import CompiledSystem
 from tests.bruteforce import Scene, frame_matrix
+from tests.topologies import compiled
 
 Floats = NDArray[np.float64]
 
@@ -39,6 +42,12 @@ couplers:
 links:
   lan: {{clock: network, delay: {delay}, loss: {loss}{more}}}
 """
+
+
+@cache
+def system_of(text: str) -> CompiledSystem:
+    """Return a scene compiled, once."""
+    return compiled(text)
 
 
 @dataclass(frozen=True)

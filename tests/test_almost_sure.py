@@ -12,9 +12,8 @@ from apc.analysis.analysis import prepare
 from apc.frame.radius import RADII, value_of
 from apc.moments.almost_sure import AlmostSure, Chance, almost_sure, every_channel, exponent, unplayed
 from apc.moments.held import HeldLoop
-from tests.held_scenes import frames, growth, scene
+from tests.held_scenes import frames, growth, scene, system_of
 from tests.lossy import BURSTS, RELIABLE
-from tests.topologies import compiled
 
 # Of an independent program, for the paper's users at 10 % loss: peers, stiffness, exponent per frame and half
 # of its 95 % interval.
@@ -29,7 +28,7 @@ REFERENCE = (
 
 
 def estimate(text: str, *, seed: int = 0) -> AlmostSure | None:
-    system = compiled(text)
+    system = system_of(text)
     return almost_sure(system, prepare(system), seed=seed)
 
 
@@ -47,7 +46,7 @@ def test_intervals_hold_the_exponent_of_one_number_95_times_in_a_hundred(law: st
     known = (1 - share) * math.log(heard) + share * math.log(lost)
     inside = 0
     for seed in range(100):
-        found = exponent(number(heard, lost), [Chance(chance, (0,))], seed=seed, courses=40, frames=400)
+        found = exponent(number(heard, lost), [Chance(chance, (0,))], seed=seed, courses=40, frames=240)
         inside += found.interval[0] <= known <= found.interval[1]
     # 95 of 100 give or take three standard deviations of such a count
     assert 88 <= inside <= 100
@@ -79,7 +78,7 @@ def test_exponents_are_those_of_frames_multiplied_by_hand(loss: str) -> None:
         [[own.matrix(np.array([one, other])) for other in (0.0, 1.0)] for one in (0.0, 1.0)]
     )
     p, r = (0.1, 0.9) if loss == "10 %" else (0.05, 0.2)
-    courses, frames_each = 300, 3000
+    courses, frames_each = 200, 1700
     # The translation of all, and what every channel holds of it, is taken out.
     values, vectors = np.linalg.eig(heard_and_lost[1, 1])
     rigid = vectors[:, np.argmin(np.abs(values - 1))].real
@@ -132,7 +131,7 @@ def test_without_chance_the_exponent_is_that_of_a_radius(loss: str, radius: floa
     ],
 )
 def test_what_is_not_estimated_is_named(text: str, why: str) -> None:
-    system = compiled(text)
+    system = system_of(text)
     prepared = prepare(system)
     assert almost_sure(system, prepared) is None
     assert unplayed(system, prepared) == why
@@ -150,7 +149,7 @@ def test_what_is_not_estimated_is_named(text: str, why: str) -> None:
 def test_frames_that_lose_packets_are_those_made_by_hand(
     peers: int, stiffness: float, damping: float, coupler: str, operator: str
 ) -> None:
-    system = compiled(scene(peers, stiffness, damping=damping, coupler=coupler))
+    system = system_of(scene(peers, stiffness, damping=damping, coupler=coupler))
     found = every_channel(system, prepare(system))
     assert not isinstance(found, str)
     held, chances = found

@@ -21,14 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, timed
+from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import dense_loop
-from apc.frame.parameters import resolve
 from apc.frame.radius import RADII, radius_of, value_of
-from apc.moments.held import Ear, HeldLoop, held_loop, lossy_rows, unheld
+from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
 from apc.moments.memory import is_memoryless
 from apc.network.channel import ChannelLaw, channel_law
 
@@ -106,27 +105,29 @@ def every_channel(system: CompiledSystem, prepared: Prepared) -> tuple[HeldLoop,
     system, prepared
         As for `almost_sure`.
     """
-    numbers = resolve(system)
-    at = timed(system, prepared, numbers)
-    if why := unheld(system, at.schedules):
-        return why
-    links = {link.name: link for link in system.links if link.channel is not None}
-    peers = sum(group.count for group in system.groups)
+    scene = held_scene(system, prepared)
+    if isinstance(scene, str):
+        return scene
+    peers = scene.exchange.peers
     if peers > MOST_STATES:
         return f"{peers:,} peers don't fit in one matrix of {MOST_STATES} states"
-    groups, exchange = lifted_groups(system, prepared=at)
-    loop = dense_loop(groups, exchange)
-    ears, ways = _ears(loop, frozenset(links))
+    loop = dense_loop(scene.groups, scene.exchange)
+    ears, ways = _ears(loop, scene.lossy)
     states = sum(len(site.lifted.z_names) for site in loop.sites) + len(ears)
     if states > MOST_STATES:
         return f"{peers:,} peers and their channels have {states:,} states, and {MOST_STATES} are the most"
-    held = held_loop(loop, ears, frozenset(links))
+    held = held_loop(loop, ears, scene.lossy)
     if held is None:
         return "a packet follows from another one of its frame"
     of_way: dict[tuple[str, int, int], list[int]] = {}
     for place, way in enumerate(ways):
         of_way.setdefault(way, []).append(place)
-    laws = {name: channel_law(system, link, numbers.timings[link.delay]) for name, link in links.items()}
+    timings = {timing.name: timing.value for timing in system.timings}
+    laws = {
+        link.name: channel_law(system, link, timings[link.delay])
+        for link in system.links
+        if link.channel is not None
+    }
     return held, [Chance(laws[link], tuple(places)) for (link, *_), places in of_way.items()]
 
 

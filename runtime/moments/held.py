@@ -1,7 +1,7 @@
 """A loop whose receivers go on with what they heard last: what a frame does where packets get lost.
 
 Takes: a loop of `eigen.modes`, and what its receivers hear apart from the loop's own packets.
-Gives: `Ear`, `HeldLoop`, `held_loop`; `lossy_rows`; `unheld`.
+Gives: `Ear`, `HeldLoop`, `held_loop`; `lossy_rows`; `HeldScene`, `held_scene`.
 Guarantees: every matrix comes with the radius of its rounding, those of the sites' frames included; rigid
 motions are taken out, which no loss moves.
 Does not: say which packets get lost (see `worst`, `almost_sure`); serve delays that vary, or receivers that
@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem
+from apc.analysis.analysis import Prepared, lifted_groups, timed
+from apc.compiler.compiled import CompiledSystem, Link
 from apc.eigen.closing import (
     Feedback,
     Loop,
@@ -36,9 +37,11 @@ from apc.eigen.closing import (
     feedback_of,
     lay_out_loop,
 )
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peer_group import MOST_STATES, PeerGroup
 from apc.eigen.relative import relative_coordinates
 from apc.eigen.rigid import find_rigid_modes
+from apc.frame.exchange import Exchange
+from apc.frame.parameters import resolve
 from apc.frame.radius import RADII, with_radius
 from apc.frame.schedule import Heard, Schedule
 
@@ -81,33 +84,62 @@ class HeldLoop:
         return RADII.add(self.f, RADII.multiply(self.g[..., : heard.shape[-2]], heard))
 
 
-def unheld(system: CompiledSystem, schedules: Sequence[Schedule]) -> str:
-    """Say why receivers of a scene don't simply hold what they heard last, "" where they do.
+@dataclass(frozen=True, slots=True)
+class HeldScene:
+    """A scene whose receivers hold what they heard last; `lossy` are the links that lose packets."""
+
+    groups: tuple[PeerGroup, ...]
+    exchange: Exchange
+    lossy: frozenset[str]
+
+
+def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene | str:
+    """Return a scene whose receivers hold what they heard last, or say why they don't simply do so.
 
     Parameters
     ----------
     system
-        The compiled scene.
-    schedules
-        Of its groups, of the nominal network.
+        The compiled scene, with the numbers to analyse.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
     """
-    for link in system.links:
-        channel = link.channel
-        if channel is None:
-            continue
-        if channel.trace is not None:
-            return f"{link.name} plays a trace"
-        if channel.jitter is not None:
-            return f"{link.name} has jitter"
-        if channel.on_loss != "hold":
-            return f"{link.name} takes no difference where a packet is missed (on_loss: {channel.on_loss})"
-        for schedule in schedules:
-            if any(one.link == link.name and one.slot for one in schedule.sent):
-                return f"{link.name} sends more than one packet in a frame of {float(schedule.frame_s):g} s"
-            used = {one.way.operator for one in schedule.heard if one.way.link == link.name}
-            if not used <= {"mean", "sum"}:
-                return f"more than means and sums are taken over {link.name}"
-    return "" if any(link.channel is not None for link in system.links) else "every link is reliable"
+    numbers = resolve(system)
+    at = timed(system, prepared, numbers)
+    lossy = [link for link in system.links if link.channel is not None]
+    if not lossy:
+        return "every link is reliable"
+    for link in lossy:
+        if why := _unheld(link, at.schedules):
+            return why
+    different = {
+        (group.kind, vector.tobytes())
+        for group, vectors in zip(system.groups, numbers.parameters, strict=True)
+        for vector in vectors
+    }
+    states = sum(len(system.kinds[kind].states) for kind, _ in different)
+    if states > MOST_STATES:
+        return f"{len(different):,} different peers have {states:,} states, and {MOST_STATES:,} are the most"
+    groups, exchange = lifted_groups(system, prepared=at)
+    return HeldScene(groups, exchange, frozenset(link.name for link in lossy))
+
+
+def _unheld(link: Link, schedules: Sequence[Schedule]) -> str:
+    """Say why the receivers of a link don't simply hold what they heard last, "" where they do."""
+    channel = link.channel
+    assert channel is not None, f"{link.name} is reliable"
+    if channel.trace is not None:
+        return f"{link.name} plays a trace"
+    if channel.jitter is not None:
+        return f"{link.name} has jitter"
+    if channel.on_loss != "hold":
+        return f"{link.name} takes no difference where a packet is missed (on_loss: {channel.on_loss})"
+    for schedule in schedules:
+        if any(one.link == link.name and one.slot for one in schedule.sent):
+            return f"{link.name} sends more than one packet in a frame of {float(schedule.frame_s):g} s"
+        used = {one.way.operator for one in schedule.heard if one.way.link == link.name}
+        if not used <= {"mean", "sum"}:
+            return f"more than means and sums are taken over {link.name}"
+    return ""
 
 
 def lossy_rows(group: PeerGroup, lossy: frozenset[str]) -> list[tuple[int, Heard]]:
@@ -151,9 +183,10 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
         for place, ear in enumerate(ears):
             for (site, line), weight in ear.weights.items():
                 if site == g:
-                    lag = loop.sites[g].schedule.heard[line].lag
-                    at = states + place if lag == 0 else starts[place] + lag - 1
-                    before[:, line, at] = bounded_weight(weight, 0.0)
+                    heard = loop.sites[g].schedule.heard[line]
+                    at = states + place if heard.lag == 0 else starts[place] + heard.lag - 1
+                    doubt = 0.0 if ear.sender is None else loop.doubts.get(heard.way, 0.0)
+                    before[:, line, at] = bounded_weight(weight, doubt)
         feedback.append(Feedback(one.now, before))
     closed = close([group.lifted.bounded for group in own.sites], feedback, layout, numbers=RADII)
     firsts = np.cumsum([0] + [len(group.schedule.sent) for group in own.sites]).tolist()

@@ -30,22 +30,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, prepare, timed
+from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
 from apc.eigen.enclosure import enclose_eigenvalues
-from apc.eigen.modes import complete_loops, dense_loop, split_exchangeable
+from apc.eigen.modes import arrange, complete_loops, dense_loop, split_exchangeable
 from apc.eigen.peer_group import PeerGroup, used_ways
 from apc.frame.discretize import UNIT
-from apc.frame.parameters import resolve
+from apc.frame.exchange import Exchange
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way
-from apc.moments.held import Ear, HeldLoop, held_loop, lossy_rows, unheld
+from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
 from apc.moments.peak import peak_gain, proves_gain
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
+
+# How much the movement of a peer counts beside those of others, by link and site.
+Sizes = Mapping[tuple[str, str], float]
 
 # What each channel of a link counts in the one number that receivers combine them into, by link and channel.
 Ratios = Mapping[tuple[str, str], Fraction]
@@ -56,7 +59,13 @@ ONE = Fraction(1)
 MOST_STATES = 120
 
 # Losses in a row that are not worth telling from any number.
-MANY = 1_000_000
+MANY = 1000
+
+# Parts of the losses in a row that a gain allows for which a proof is tried, where one is not found for all.
+PARTS = (1.0, 0.9, 0.5, 0.1)
+
+# The least of a peer's unit beside the largest.
+LEAST_UNIT = 1e-6
 
 # Roundings of a norm of few weights, and of what a gain is compared with.
 NORM_ROUNDINGS = 1000
@@ -64,8 +73,9 @@ NORM_ROUNDINGS = 1000
 # Words tried: all of so many frames; of so few gaps of up to so many frames; one long gap after a few short.
 FRAMES, GAPS, LONGEST, LONE, SHORT = 14, 4, 9, 40, 6
 
-# Work on words, in cubes of the states of their loops: some thousands of the smallest.
-WORK, LEAST_STATES = 10_000 * 16**3, 16
+# Work on the words of so many losses in a row, in cubes of the states of their loops: all words of two small
+# loops; a few of any.
+WORK, LEAST_STATES, FEWEST = 1500 * 16**3, 16, 6
 
 # A growth in floats that is worth proving to be above 1.
 ABOVE = 1 + 1e-12
@@ -122,8 +132,11 @@ def worst_case(system: CompiledSystem, prepared: Prepared) -> LossesInARow:
         return LossesInARow(None, None, None, f"losses in a row are left open: {found}")
     certified = harmless(found)
     if certified == MANY:
-        return LossesInARow(MANY, None, None, "any number of losses in a row is harmless")
-    return LossesInARow(certified, *shaking(found, known=certified or 0))
+        return LossesInARow(MANY, None, None, f"{MANY:,} losses in a row are harmless, where counting ends")
+    pattern, growth, note = shaking(found, known=certified or 0)
+    if certified is None and pattern is None:
+        note = f"the scene is not proved to settle with no packet lost; {note}"
+    return LossesInARow(certified, pattern, growth, note)
 
 
 def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
@@ -168,43 +181,57 @@ def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts | str:
     system, prepared
         As for `worst_case`.
     """
-    at = timed(system, prepared, resolve(system))
-    if why := unheld(system, at.schedules):
-        return why
-    lossy = frozenset(link.name for link in system.links if link.channel is not None)
-    groups, exchange = lifted_groups(system, prepared=at)
-    ways = used_ways(group.schedule for group in groups)
-    if all(exchange.is_complete(way.link) for way in ways):
-        loops = complete_loops(groups, exchange)
-        whole = loops[0]
-    else:
-        count = sum(group.count for group in groups)
-        if count > MOST_STATES:
-            return f"{count:,} peers on a graph that is not complete are too many: {MOST_STATES} states fit"
-        whole = dense_loop(groups, exchange)
-        loops = split_exchangeable(whole, exchange)
-    parts, ratios = [], _ratios(whole.sites, lossy)
+    scene = held_scene(system, prepared)
+    loops = scene if isinstance(scene, str) else _loops(scene.groups, scene.exchange)
+    if isinstance(scene, str) or isinstance(loops, str):
+        return str(loops)
+    lossy = scene.lossy
+    parts, ratios = [], _ratios(loops[0].sites, lossy)
+    weight, sizes = _weight(loops, lossy)
     for loop in loops:
         if loop.states > MOST_STATES:
             return f"peers make one system of {loop.states:,} states, and {MOST_STATES} are the most"
-        part = _part(loop, lossy, ratios)
+        part = _part(loop, lossy, ratios, sizes)
         if part is None:
             return "a packet follows from another one of its frame"
         parts.append(part)
-    return HeldParts(tuple(parts), _weight(whole, lossy))
+    return HeldParts(tuple(parts), weight)
 
 
-def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios) -> HeldPart | None:
+def _loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...] | str:
+    """Split a scene into loops at right angles to one another, all peers alike the first, or say why not."""
+    graphs = {way.link for way in used_ways(group.schedule for group in groups)}
+    graphs = {link for link in graphs if not exchange.is_complete(link)}
+    if not graphs:
+        return complete_loops(groups, exchange)
+    count = sum(group.count for group in groups)
+    if count > MOST_STATES:
+        return f"{count:,} peers on a graph that is not complete are too many: {MOST_STATES} are the most"
+    if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
+        found = arrange(groups, exchange)
+        if found.method == "modes":
+            return found.loops
+    return split_exchangeable(dense_loop(groups, exchange), exchange)
+
+
+def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> HeldPart | None:
     """Make a mode of a scene, None where packets depend on one another within a frame."""
+
+    def size(site: int, link: str) -> float:
+        """Return how far n peers of a site that move alike by 1 move together: √n, or as they are weighed."""
+        return math.sqrt(loop.sites[site].count) * sizes.get((link, loop.sites[site].name), 1.0)
+
     listened = [lossy_rows(site, lossy) for site in loop.sites]
-    ears, outside = [], []
+    ears: list[Ear] = []
+    outside: list[Ear] = []
+    shares: list[float] = []
     for h, site in enumerate(loop.sites):
         for row, sent in enumerate(site.schedule.sent):
             weights = {
                 (g, line): loop.coupling[one.way][g][h]
                 for g, rows in enumerate(listened)
                 for line, one in rows
-                if one.sent == sent and loop.coupling[one.way][g][h]
+                if one.sent == sent and (loop.coupling[one.way][g][h] or loop.doubts.get(one.way))
             }
             if weights:
                 ears.append(Ear(weights, h, row))
@@ -214,30 +241,26 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios) -> HeldPart | None:
             if ratios.get((sent.link, sent.channel), ONE) == ONE:
                 places = [line for line, one in rows if (one.way, one.sent) == (way, sent)]
                 outside.append(Ear(dict.fromkeys(((g, line) for line in places), ONE)))
+                shares.append(1 / size(g, sent.link))
     heard, whole = held_loop(loop, ears, lossy), held_loop(loop, [*ears, *outside], lossy)
     if heard is None or whole is None:
         return None
-    # Coordinates of unit length: n peers that move alike by 1 each move by √n.
-    counts = [math.sqrt(loop.sites[next(iter(ear.weights))[0]].count) for ear in outside]
+    roundings = [8 * UNIT * share if share != 1 else 0.0 for share in shares]
     sums: dict[tuple[int, str, str], Floats] = {}
     for place, ear in enumerate(ears):
         assert ear.sender is not None
-        site = loop.sites[ear.sender]
-        sent = site.schedule.sent[ear.row]
+        sent = loop.sites[ear.sender].schedule.sent[ear.row]
         ratio = ratios.get((sent.link, sent.channel))
         number = (ear.sender, sent.link, sent.channel if ratio is None else "")
         combined = sums.setdefault(number, np.zeros((2, len(ears))))
-        combined[:, place] = _scaled(float(ratio or ONE), math.sqrt(site.count))
+        combined[:, place] = _scaled(float(ratio or ONE), size(ear.sender, sent.link))
     adding = np.stack(list(sums.values()), axis=1) if sums else np.zeros((2, 0, len(ears)))
-    shares = np.zeros((2, len(outside), len(outside)))
-    for place, count in enumerate(counts):
-        shares[:, place, place] = _scaled(1.0, 1 / count)
     return HeldPart(
         loop.name,
         heard,
         (
             whole.frame(lost=False),
-            RADII.multiply(whole.g[..., len(ears) :], shares),
+            RADII.multiply(whole.g[..., len(ears) :], np.stack([np.diag(shares), np.diag(roundings)])),
             RADII.multiply(adding, whole.step),
             np.zeros((2, adding.shape[-2], len(outside))),
         ),
@@ -284,21 +307,48 @@ def _ratios(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
     return found
 
 
-def _weight(whole: Loop, lossy: frozenset[str]) -> float:
-    """Return ‖|W|‖₂, rounded up, of the loop in which all peers are, alike where they are equal."""
+def _weight(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Sizes]:
+    """Return ‖|W|‖₂, rounded up, and the sizes of peers by which it is as small as can be.
+
+    Notes
+    -----
+    Of loops at right angles |W| is largest on the first, where all peers of a site move alike; of loops of
+    one site each, where its eigenvalue is. Each peer may be measured by a unit of its own, as what a channel
+    does to a number it does to any multiple: by √(v/u), u and v the vectors of Perron of |W| and |W|ᵀ, the
+    norm becomes the spectral radius (Stoer and Witzgall, 1962).
+    """
     largest = 0.0
-    for link in lossy:
-        rows = [
-            [
-                abs(float(weight)) * math.sqrt(receiver.count / sender.count)
-                for weight, sender in zip(whole.coupling[way][g], whole.sites, strict=True)
+    sizes: dict[tuple[str, str], float] = {}
+    for link in sorted(lossy):
+        own = frozenset([link])
+        used = {one.way for loop in loops for site in loop.sites for _, one in lossy_rows(site, own)}
+        for loop in loops if len(loops[0].sites) == 1 else loops[:1]:
+            count = np.array([site.count for site in loop.sites], np.float64)
+            blocks = [
+                (np.abs(np.array(rows, np.float64)) + loop.doubts.get(way, 0.0))
+                * np.sqrt(count[:, None] / count)
+                for way, rows in loop.coupling.items()
+                if way in used
             ]
-            for g, receiver in enumerate(whole.sites)
-            for way in dict.fromkeys(one.way for _, one in lossy_rows(receiver, frozenset([link])))
-        ]
-        if rows:
-            largest = max(largest, float(np.linalg.norm(np.array(rows), 2)))
-    return largest * (1 + NORM_ROUNDINGS * UNIT)
+            if not blocks:
+                continue
+            units = _units(np.sum(blocks, axis=0))
+            sizes |= {(link, site.name): unit for site, unit in zip(loop.sites, units.tolist(), strict=True)}
+            turned = np.concatenate([units[:, None] * block / units for block in blocks])
+            largest = max(largest, float(np.linalg.norm(turned, 2)))
+    return largest * (1 + NORM_ROUNDINGS * UNIT), sizes
+
+
+def _units(weights: Floats) -> Floats:
+    """Return units by which a matrix of weights has the smallest norm; 1 where some peers hear nobody."""
+    found = []
+    for matrix in (weights, weights.T):
+        values, vectors = np.linalg.eig(matrix)
+        found.append(np.abs(vectors[:, int(np.argmax(values.real))]))
+    if min(float(one.min() / one.max()) for one in found) < LEAST_UNIT:
+        return np.ones(len(weights))
+    units = np.sqrt(found[1] / found[0])
+    return np.asarray(units / units.max())
 
 
 def harmless(of: HeldParts) -> int | None:
@@ -318,8 +368,8 @@ def harmless(of: HeldParts) -> int | None:
     most = MANY
     if gain > math.pi / (4 * MANY):
         most = min(MANY, math.ceil((math.pi / math.asin(gain / 2) - 2) / 4) - 1)
-    # Where the last one is too near to prove it, that before is far enough.
-    for losses in range(most, max(most - 2, 0), -1):
+    # Where the last one is too near to prove it, that before is far enough, or some part of it.
+    for losses in sorted({most, *(int(part * (most - 1)) for part in PARTS)} - {0, -1}, reverse=True):
         level = 2 * math.sin(math.pi / (4 * losses + 2)) * (1 - 8 * UNIT) / max(of.weight, UNIT)
         if all(proves_gain(*part.off, level) for part in of.parts):
             return losses
@@ -408,25 +458,32 @@ def shaking(of: HeldParts, *, known: int = 0) -> tuple[tuple[bool, ...] | None, 
     tuple
         A period of the pattern, its growth per frame, and what else there is to say.
     """
-    left = WORK // sum(max(part.heard.f.shape[-1], LEAST_STATES) ** 3 for part in of.parts)
-    for losses in [0, *range(known + 1, LONE)]:
-        tried = words(losses)[:left]
-        left -= len(tried)
+    cost = sum(max(part.heard.f.shape[-1], LEAST_STATES) ** 3 for part in of.parts)
+    most = max(FEWEST, WORK // cost)
+    listed = [losses for losses in range(LONE) if losses == 0 or losses > known]
+    # So few words are left of many losses that they are tried together.
+    batches = [[losses] for losses in listed if losses < LONGEST]
+    batches.append([losses for losses in listed if losses >= LONGEST])
+    for batch in batches:
+        tried = [word for losses in batch for word in words(losses)[:most]]
         if not tried:
-            return None, None, f"no pattern tried of fewer than {losses} losses in a row shakes the scene"
+            continue
         found = np.stack([growths(part, tried) for part in of.parts])
-        for place in np.lexsort((-found.max(axis=0), [sum(word) for word in tried])).tolist():
+        growth, longest = found.max(axis=0), [max(word) for word in tried]
+        for place in np.lexsort((-growth, [sum(word) for word in tried], longest)).tolist():
             part = of.parts[int(np.argmax(found[:, place]))]
-            if found[:, place].max() > ABOVE and _is_proved(part, tried[place]):
-                worst = int(np.argmax(found.max(axis=0)))
-                how = "all packets lost at once shake" if losses else "with no packet lost grows"
-                note = f"{how} the {part.name} mode"
-                if found[:, worst].max() > found[:, place].max():
+            if growth[place] > ABOVE and _is_proved(part, tried[place]):
+                note = f"the {part.name} mode grows where all peers lose the same packets"
+                if longest[place] == 1:
+                    note = f"the {part.name} mode grows with no packet lost"
+                alike = np.flatnonzero(np.array(longest) == longest[place])
+                worst = alike[int(np.argmax(growth[alike]))]
+                if growth[worst] > growth[place] * (2 - 1 / ABOVE):
                     note += (
-                        f"; of {losses} in a row, the most met is {found[:, worst].max():.8g} a frame, by "
-                        f"{spelled(pattern_of(tried[worst]))}"
+                        f"; of at most {longest[place] - 1} losses in a row, the most met is "
+                        f"{growth[worst]:.8g} a frame, by {spelled(pattern_of(tried[worst]))}"
                     )
-                return pattern_of(tried[place]), float(found[:, place].max()), note
+                return pattern_of(tried[place]), float(growth[place]), note
     return None, None, f"no pattern tried of fewer than {LONE} losses in a row shakes the scene"
 
 
