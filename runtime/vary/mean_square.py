@@ -10,6 +10,7 @@ search's (see `delays`).
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.names import Free, unit_of
+from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
 from apc.moments.network import Growth, growth, unreliable
 from apc.network.nominal import channel_numbers
@@ -30,7 +31,7 @@ from apc.vary.search import SAMPLES, SPAN, Crossing, Search, Told
 
 Floats = NDArray[np.float64]
 
-# The relative step of a central difference, whose cut-off and rounding are then alike; roots above 0.
+# The step of a difference, of a direction, whose cut-off and rounding are then alike; roots above 0.
 DIFFERENCE, LEAST = 1e-5, 1e-9
 
 MEAN_SQUARE, NOMINAL = "mean-square", "nominal"
@@ -60,11 +61,11 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place) -> str
     Raises
     ------
     ApcError
-        E897 no such criterion.
+        E898 no such criterion.
     """
     if asked not in (None, MEAN_SQUARE, NOMINAL):
         what = f"{str(asked)[:40]} is no criterion ({MEAN_SQUARE}, {NOMINAL})"
-        raise ApcError(Mistake("E897", place, what, hint=f"--in {MEAN_SQUARE}"))
+        raise ApcError(Mistake("E898", place, what, hint=f"--in {MEAN_SQUARE}"))
     return asked or (MEAN_SQUARE if unreliable(system) else NOMINAL)
 
 
@@ -81,12 +82,12 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place) -> None:
     Raises
     ------
     ApcError
-        E897 it reaches when something happens.
+        E898 it reaches when something happens.
     """
     jitter = {link.channel.jitter for link in system.links if link.channel is not None}
     if reaches_time(system, free) and free.name not in jitter:
         what = f"{free.label} can't be varied in mean square: what happens when would change with it"
-        raise ApcError(Mistake("E897", place, what, hint=f"--in {NOMINAL}"))
+        raise ApcError(Mistake("E898", place, what, hint=f"--in {NOMINAL}"))
 
 
 def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Override], place: Place) -> Growth:
@@ -104,13 +105,13 @@ def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Overri
     Raises
     ------
     ApcError
-        E897 the network can't be judged with these numbers, by name.
+        E898 the network can't be judged with these numbers, by name.
     """
     changed = apply(system, overrides)
     found = growth(changed, prepared)
     if found.why:
         what = f"the scene can't be judged in mean square: {found.why}"
-        raise ApcError(Mistake("E897", place, what, hint=f"--in {NOMINAL}"))
+        raise ApcError(Mistake("E898", place, what, hint=f"--in {NOMINAL}"))
     return found
 
 
@@ -118,7 +119,7 @@ def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Overri
 class MeanSquareEvaluator:
     """An `Evaluator` of one number: the root of what second moments grow by in a frame, as a matrix (1, 1).
 
-    Derivatives are central differences, right to about 1e-9.
+    Derivatives are differences over a small part of the directions, right to about 1e-9 of them.
     """
 
     system: CompiledSystem
@@ -139,22 +140,39 @@ class MeanSquareEvaluator:
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return the root (k, 1, 1) and its derivatives along directions (k, m)."""
-        step = (
-            DIFFERENCE
-            * np.min(np.where(along != 0, np.abs(values), np.inf), axis=1)
-            / np.abs(along).max(axis=1)
-        )
-        step = np.where(step > 0, step, DIFFERENCE * DIFFERENCE)
-        moved = step[:, None] * along
-        (here,), (before,), (after,) = (
-            self.matrices(one) for one in (values, values - moved, values + moved)
-        )
-        return ((here, (after - before) / (2 * step[:, None, None])),)
+        moved = DIFFERENCE * along
+        # At an end of what a parameter may be, the parabola through two points further inside.
+        at_end = ~(self._allowed(values - moved) & self._allowed(values + moved))[:, None]
+        way = np.where(self._allowed(values + 2 * moved), 1.0, -1.0)[:, None]
+        one = values + np.where(at_end, way, -1.0) * moved
+        other = values + np.where(at_end, 2 * way, 1.0) * moved
+        (here,), (first,), (second,) = (self.matrices(points) for points in (values, one, other))
+        inside = (4 * first - 3 * here - second) * way[:, None] / (2 * DIFFERENCE)
+        return ((here, np.where(at_end[:, None], inside, (second - first) / (2 * DIFFERENCE))),)
+
+    def _allowed(self, values: Floats) -> NDArray[np.bool_]:
+        """Say which values (k, m) are within what each parameter may be."""
+        found = np.ones(len(values), dtype=bool)
+        for own, one in zip(values.T, self.free, strict=True):
+            least, most = _bounds(self.system, one)
+            found &= (own >= least) & (own <= most)
+        return found
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, 1, 1) on the errors of the root at values (k, m)."""
         found = [self.growth(value) for value in values.tolist()]
         return (np.array([(one.high - one.low) / max(one.radius, LEAST) for one in found])[:, None, None],)
+
+
+def _bounds(system: CompiledSystem, free: Free) -> tuple[float, float]:
+    """Return between which values a parameter may be."""
+    if any(timing.name == free.name for timing in system.timings):
+        return 0.0, math.inf
+    one = parameter_of(system, free)
+    return (
+        -math.inf if one.minimum is None else one.minimum,
+        math.inf if one.maximum is None else one.maximum,
+    )
 
 
 def search_mean_square(
@@ -189,7 +207,7 @@ def search_mean_square(
     Raises
     ------
     ApcError
-        E897 the network can't be judged, or a delay is to vary.
+        E898 the network can't be judged, or a delay is to vary.
     """
     refuse_time(system, free, place)
     samples = _samples(system, free, low, high, present)
@@ -206,7 +224,7 @@ def search_mean_square(
         at(value)
     verdicts = [known[value].radius < 1 for value in samples]
     edges, stable = [], [verdicts[0]]
-    for place_of, (one, other) in enumerate(zip(samples, samples[1:], strict=False)):
+    for place_of, (one, other) in enumerate(itertools.pairwise(samples)):
         if verdicts[place_of] != verdicts[place_of + 1]:
             edges.append(_crossing(at, one, other, stable_below=verdicts[place_of]))
             stable.append(verdicts[place_of + 1])
