@@ -1,8 +1,8 @@
 """What commands have in common: FILE, the options `--set` and `--json`, and how a result is printed.
 
 Takes: a result.
-Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `in_option`, `json_option`, `WholeNumber`;
-`print_result`, `tell`, `beside`.
+Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `in_option`, `json_option`,
+`WholeNumber`; `print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
@@ -37,8 +37,8 @@ in_option = click.option(
     "--in",
     "criterion",
     type=click.Choice(("mean-square", "nominal")),
-    help="What stable means. mean-square: second moments die out over the network as it is, the default where "
-    "a link loses or delays packets; nominal: every packet takes its nominal delay.",
+    help="What stable means. mean-square: second moments die out over the network as it is, the default where a "
+    "link is unreliable; nominal: motions die out if every packet takes its nominal delay.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 

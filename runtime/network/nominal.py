@@ -64,8 +64,8 @@ def channel_numbers(system: CompiledSystem) -> frozenset[str]:
     return frozenset(scope_of(system).needed(found))
 
 
-def refuse_channel_number(system: CompiledSystem, free: Free, place: Place) -> None:
-    """Refuse to vary a number of an unreliable link.
+def refuse_channel_number(system: CompiledSystem, free: Free, place: Place, *, instead: str = "") -> None:
+    """Refuse to vary a number of an unreliable link where every packet counts as on time.
 
     Parameters
     ----------
@@ -75,16 +75,19 @@ def refuse_channel_number(system: CompiledSystem, free: Free, place: Place) -> N
         What is to vary.
     place
         Where it was asked for.
+    instead
+        What to write; the simulation of one value if not given.
 
     Raises
     ------
     ApcError
-        E896 lost or late packets depend on it, and every verdict is of the nominal network.
+        E896 lost or late packets depend on it, and the verdict is of the nominal network.
     """
     if free.name in channel_numbers(system):
         what = (
-            f"{free.label} can't be varied: verdicts are of the nominal network, in which no packet is lost, "
+            f"{free.label} can't be varied: this verdict is of the nominal network, in which no packet is lost "
             "and all take their nominal delay"
         )
         value = "2 ms" if unit_of(system, free.name) == "s" else "5 %"
-        raise ApcError(Mistake("E896", place, what, hint=f'apc simulate --set {free.label}="{value}"'))
+        hint = instead or f'apc simulate --set {free.label}="{value}"'
+        raise ApcError(Mistake("E896", place, what, hint=hint))

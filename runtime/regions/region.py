@@ -248,7 +248,7 @@ def region(
     meant = criterion_of(system, criterion, PLACE)
     for one in free:
         if meant == NOMINAL:
-            refuse_channel_number(system, one, PLACE)
+            refuse_channel_number(system, one, PLACE, instead=f"--in {MEAN_SQUARE}")
         else:
             refuse_time(system, one, PLACE)
     rectangle = rectangle_of(*axes)

@@ -34,7 +34,7 @@ from apc.sweeps.quantities import VERDICT, find_quantity, in_mean_square, is_in_
 from apc.sweeps.store import Parts, open_parts, remove_parts
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
 from apc.tables import Cell, Column, Row, check_table_path, write_table
-from apc.vary.mean_square import NOMINAL, criterion_of
+from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, criterion_of
 
 if TYPE_CHECKING:
     import pandas
@@ -154,7 +154,7 @@ def sweep(
     quantity = find_quantity(system, work_of)
     for axis in grid.axes:
         if meant == NOMINAL:
-            refuse_channel_number(system, axis.free, PLACE)
+            refuse_channel_number(system, axis.free, PLACE, instead=f"--in {MEAN_SQUARE}")
         if axis.free.label == of.partition(":")[2].strip():
             what = f"{axis.free.label} is swept: there is nothing to look for at one value of it"
             raise ApcError(Mistake("E884", PLACE, what, hint="--of critical:PATH with another parameter"))

@@ -115,7 +115,7 @@ def critical(
     chosen_criterion = criterion_of(system, criterion, _PLACE)
     by_chance = chosen_criterion == MEAN_SQUARE
     if not by_chance:
-        refuse_channel_number(system, free, _PLACE)
+        refuse_channel_number(system, free, _PLACE, instead=f"--in {MEAN_SQUARE}")
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         timed = reaches_time(system, free)
         unit = unit_of(system, free.name)
