@@ -194,6 +194,8 @@ def _unserved(system: CompiledSystem, prepared: Prepared, lossy: Sequence[tuple[
         return ""
     for link, law in lossy:
         assert link.channel is not None
+        if law.r == 0 and law.p and not is_memoryless(law):
+            return f"bursts of {link.name} that never end (r = 0): in the long run everything is lost"
         if law.mean_loss >= 1:
             return f"{link.name} loses everything: nothing is ever heard, and what is held never changes"
         if law.jitter and law.mean_loss and link.channel.on_loss == "zero":
@@ -202,8 +204,6 @@ def _unserved(system: CompiledSystem, prepared: Prepared, lossy: Sequence[tuple[
             return f"jitter and bursts of {link.name} together"
         if law.jitter and link.channel.reorder == "all" and _overtakes(system, link, law):
             return f"packets of {link.name} that are overtaken and count all the same (reorder: all)"
-        if not is_memoryless(law) and law.r == 0:
-            return f"bursts of {link.name} that never end (r = 0)"
     return ""
 
 
