@@ -123,7 +123,7 @@ def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
     )
 
 
-def crowd(system: CompiledSystem, prepared: Prepared) -> Moments:
+def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = None) -> Moments:
     """Make the mean loops of a scene and the luck that drives them.
 
     Parameters
@@ -132,8 +132,10 @@ def crowd(system: CompiledSystem, prepared: Prepared) -> Moments:
         The compiled scene, with the numbers to analyse.
     prepared
         From `analysis.prepare`, of this system with any numbers.
+    told
+        Its peers, where they are not those of `hearing`.
     """
-    told = hearing(system, prepared)
+    told = told or hearing(system, prepared)
     loops, weights = peer_classes(told)
     common = loops[0]
     remembered = {one.route: one for one in remembered_of(system, told, common)}

@@ -2,7 +2,7 @@
 
 Takes: the mean loops of a scene and what the luck of its channels does to them.
 Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `stein`, `around`, `scaled`,
-`of_kind`, `number_of`.
+`of_kind`, `number_of`, `units_of`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd`).
 
@@ -162,7 +162,7 @@ def gain(of: Moments, growth: float, numbers: Arithmetic = FLOATS) -> Matrix | N
     for part in of.parts:
         for d, channel in part.channels.items():
             kind = of.luck[d]
-            covariances = of_kind(RADII.exact(_units(kind)), numbers)
+            covariances = of_kind(RADII.exact(units_of(kind)), numbers)
             driven = scaled(around(of_kind(channel.driven, numbers), covariances, numbers), shrink, numbers)
             moments = stein(scaled(of_kind(channel.matrix, numbers), root, numbers), driven, numbers)
             if moments is None:
@@ -211,7 +211,7 @@ class _Answer:
         return numbers.add(late, around(left[..., n:], self.covariances, numbers, right[..., n:]))
 
 
-def _units(kind: Luck) -> Floats:
+def units_of(kind: Luck) -> Floats:
     """Return a unit of each entry of its covariances, over the luck of all slots (b, k, k)."""
     sizes = [spread.shape[-1] for spread in kind.spreads]
     starts = np.cumsum([0, *sizes])

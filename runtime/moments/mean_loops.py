@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.relative import relative_coordinates
+from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
@@ -83,11 +83,18 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class MeanLoop:
-    """A loop of means in relative coordinates: its `matrix` (2, n, n) with its radius."""
+    """A loop of means in relative coordinates: its `matrix` (2, n, n) with its radius.
+
+    `at` are these, of states that begin at `offsets`, site by site; `misses` as those of a `Channel`, over the
+    loop's own states (2, k_slot, n).
+    """
 
     name: str
     multiplicity: int
     matrix: Matrix
+    at: Relative
+    offsets: tuple[int, ...]
+    misses: Mapping[tuple[int, Route, int], Matrix]
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,6 +311,14 @@ def mean_loop(
     if len(at.held):
         weights = with_radius(at.weights, at.doubt)
         moved = RADII.subtract(moved, RADII.multiply(weights, closed.matrix[:, at.held]))
+
+    def missed(columns: NDArray[np.intp]) -> dict[tuple[int, Route, int], Matrix]:
+        return {
+            (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
+            for h, site in enumerate(sites)
+            for which, rows in site.misses.items()
+        }
+
     found = []
     for channel, own, first, last in zip(listened, apart, firsts, firsts[1:], strict=False):
         states = len(own.kept[0])
@@ -311,15 +326,11 @@ def mean_loop(
         matrix[:, :n, :n], matrix[:, :n, n:] = moved[..., rest], moved[..., first : first + states]
         matrix[:, n:, n:] = own.kept[..., :states]
         driven = np.concatenate([moved[..., first + states : last], own.kept[..., states:]], axis=-2)
-        columns = np.concatenate([rest, np.arange(first, last)])
-        misses = {
-            (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
-            for h, site in enumerate(sites)
-            for which, rows in site.misses.items()
-        }
+        misses = missed(np.concatenate([rest, np.arange(first, last)]))
         within = [np.concatenate([np.zeros((2, rows.shape[-2], n)), rows], axis=-1) for rows in own.misses]
         found.append(Channel(channel, matrix, driven, misses, tuple(within)))
-    return MeanLoop(loop.name, loop.multiplicity, moved[..., rest]), found
+    mean = MeanLoop(loop.name, loop.multiplicity, moved[..., rest], at, tuple(offsets), missed(rest))
+    return mean, found
 
 
 def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequence[int]) -> Floats:

@@ -1,0 +1,255 @@
+"""How far copies are from each other while hands push at random, over the network as it is.
+
+Takes: a scene that is stable in mean square, and how its second moments move (`crowd`, `patterns`).
+Gives: `crowd_error`, `pattern_error`.
+Guarantees: a value whose digits rounding leaves in doubt is none.
+Does not: say whether the scene is stable (see `network`).
+
+Every device is pushed by a force of its own of variance 1 N², drawn anew at each tick of the fastest clock; the
+error of a copy is its position less the mean of the others', as frames begin. Pushes have moments X that the
+loops of means make of them, and with these go the luck of channels, V₀; as luck drives itself, V = V₀ + G(1) V
+(see `gains`), and the moments of positions are X and what the loops make of V.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared
+from apc.compiler.compiled import CompiledSystem
+from apc.eigen.relative import Relative
+from apc.frame.discretize import UNIT
+from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
+from apc.moments.crowd import crowd, hearing, peer_classes
+from apc.moments.gains import Moments, Part, around, gain, number_of, scaled, stein, units_of
+from apc.moments.hands import Copy, Peer, forced
+
+Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
+
+# How far rounding may put a variance in doubt, relatively.
+DOUBT = 1e-6
+
+# How far a motion that nothing holds back may move copies apart: those of rational weights are rounded.
+APART = 1e-9
+
+NO_COPIES = "no position of a mass is told to others"
+IN_DOUBT = "rounding leaves its digits in doubt"
+DRIFTING = "nothing holds the copies together: what they differ by grows for ever"
+
+
+# The value in m and no reason, or None and the reason.
+Told = tuple[float | None, str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Class:
+    """Equal peers: how many, and what of their z they got."""
+
+    count: int
+    got: Peer
+
+
+@dataclass(frozen=True, slots=True)
+class _Spread:
+    """Second moments (2, n, n) of all classes' means, or (`apart`) of one class's peers apart from their mean.
+
+    They are over the relative coordinates `at` of states that begin at `offsets`, class by class.
+    """
+
+    apart: int | None
+    at: Relative
+    offsets: tuple[int, ...]
+    moments: Matrix
+
+
+@dataclass(frozen=True, slots=True)
+class _Error:
+    """The error of a copy of a peer of class `of`: its own position by `own`, those of all means by `means`."""
+
+    of: int
+    copy: Copy
+    own: Fraction
+    means: tuple[Fraction, ...]
+
+
+def crowd_error(system: CompiledSystem, prepared: Prepared) -> Told:
+    """Return the largest error of copies, or why there is none: what is missed is held, packet by packet.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, stable in mean square, with the numbers to analyse.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
+    """
+    pushed = forced(system, hearing(system, prepared))
+    if isinstance(pushed, str):
+        return None, pushed
+    loops, _ = peer_classes(pushed.told)
+    classes = [_Class(site.count, pushed.peers[id(site.schedule)]) for site in loops[0].sites]
+    of = crowd(system, prepared, told=pushed.told)
+    spreads = [_pushed(part.loop.matrix, part.apart, part.loop.at, part.loop.offsets, classes) for part in of.parts]
+    known = [one for one in spreads if one is not None]
+    if len(known) == len(spreads) and of.luck:
+        known = _with_luck(of, known) or []
+    return _largest(known, classes) if known else (None, IN_DOUBT)
+
+
+def _pushed(
+    matrix: Matrix, apart: int | None, at: Relative, offsets: Sequence[int], classes: Sequence[_Class]
+) -> _Spread | None:
+    """Return the moments that pushes make of a loop of means (2, n, n), None where they have no bound."""
+    place = {state: number for number, state in enumerate(at.rest.tolist())}
+    drawn = np.zeros((2, len(place), len(place)))
+    for g, one in enumerate(classes):
+        if apart not in (None, g):
+            continue
+        start = offsets[g] if apart is None else 0
+        variance = Fraction(1, one.count)
+        for state in one.got.drawn:
+            drawn[:, place[start + state], place[start + state]] = _rounded(variance if apart is None else 1 - variance)
+    moments = stein(matrix, drawn[None], RADII)
+    return None if moments is None else _Spread(apart, at, tuple(offsets), moments[0])
+
+
+def _rounded(number: Fraction) -> tuple[float, float]:
+    """Return a number as a float, and what that may be off by."""
+    value = float(number)
+    return value, UNIT * abs(value) if value != number else 0.0
+
+
+def _with_luck(of: Moments, spreads: Sequence[_Spread]) -> list[_Spread] | None:
+    """Return moments with what the luck of channels adds, None where rounding leaves them open."""
+    matrix = gain(of, 1.0, RADII)
+    if matrix is None:
+        return None
+    first = _first_luck(of, spreads)
+    squares = []
+    for listed in (slot for kind in of.luck for slot in kind.entries):
+        own = {entry: len(squares) + number for number, entry in enumerate(listed)}
+        squares += [(own[a, a], own[b, b]) for a, b in listed]
+    found = _solved(matrix, first, squares)
+    if found is None:
+        return None
+    result, starts = [], np.cumsum([0] + [sum(map(len, kind.entries)) for kind in of.luck])
+    for part, spread in zip(of.parts, spreads, strict=True):
+        total, n = spread.moments, spread.moments.shape[-1]
+        for d, channel in part.channels.items():
+            kind = of.luck[d]
+            units = RADII.exact(units_of(kind).reshape(starts[d + 1] - starts[d], -1).T)
+            k = channel.driven.shape[-1]
+            covariance = RADII.multiply(units, found[:, starts[d] : starts[d + 1], None]).reshape(2, k, k)
+            moved = stein(channel.matrix, around(channel.driven, covariance, RADII)[None], RADII)
+            if moved is None:
+                return None
+            alone = 1 / kind.receivers
+            share = kind.heard * (alone if part.apart is None else 1 - alone)
+            total = RADII.add(total, scaled(moved[0][:, :n, :n], number_of(share, RADII), RADII))
+        result.append(_Spread(spread.apart, spread.at, spread.offsets, total))
+    return result
+
+
+def _first_luck(of: Moments, spreads: Sequence[_Spread]) -> Matrix:
+    """Return V₀ (2, entries): the covariances of luck for moments that pushes make."""
+    found = []
+    for kind in of.luck:
+        for slot, listed in enumerate(kind.entries):
+            total = np.zeros_like(kind.spreads[slot])
+            for part, spread in zip(of.parts, spreads, strict=True):
+                for site, sender in enumerate(part.classes):
+                    rows = part.loop.misses.get((site, kind.route, slot))
+                    if sender == kind.sender and rows is not None:
+                        total = RADII.add(total, around(rows, spread.moments, RADII))
+            total = scaled(total, kind.spreads[slot], RADII)
+            found += [total[:, a, b] for a, b in listed]
+    return np.array(found).reshape(-1, 2).T
+
+
+def _solved(matrix: Matrix, known: Matrix, squares: Sequence[tuple[int, int]]) -> Matrix | None:
+    """Return V of (1 − G) V = V₀ with its radius (2, n), None where rounding leaves open whether there is one.
+
+    Notes
+    -----
+    With an inverse Y in floats, x = Y V₀ and r = V₀ − (1 − G) x, what x is off by is (1 − F)⁻¹ Y r, where
+    F = 1 − Y (1 − G): at most |Y r| and a part f/(1 − f) of the largest, f = ‖F‖. Sizes are relative to those
+    of a covariance, √(V_aa V_bb): `squares` says where each entry's are.
+    """
+    n = len(squares)
+    unit = RADII.exact(np.eye(n))
+    left = RADII.subtract(unit, matrix)
+    inverse = np.linalg.inv(value_of(left))
+    found = inverse @ known[0]
+    off = RADII.subtract(known[..., None], RADII.multiply(left, RADII.exact(found[:, None])))
+    reached = RADII.multiply(RADII.exact(inverse), off)
+    wrong = RADII.subtract(unit, RADII.multiply(RADII.exact(inverse), left))
+    a, b = np.array(squares).T
+    size = np.sqrt(np.abs(found[a] * found[b]))
+    size = np.maximum(size, np.finfo(np.float64).eps * size.max(initial=0.0))
+    if not size.all():  # nothing is ever missed that differs
+        return with_radius(found[:, None], np.abs(reached).sum(axis=0))[..., 0] if not known.any() else None
+    most = float((np.abs(wrong).sum(axis=0) * size / size[:, None]).sum(axis=1).max())
+    if not most < 1 / 2:
+        return None
+    radius = np.abs(reached).sum(axis=0)[:, 0]
+    radius = radius + 2 * most * size * float((radius / size).max())
+    return np.stack([found, radius * (1 + 8 * UNIT)])
+
+
+def _largest(spreads: Sequence[_Spread], classes: Sequence[_Class]) -> Told:
+    """Return the root of the largest variance of an error, or why there is none."""
+    forms = _errors(classes)
+    if not forms:
+        return None, NO_COPIES
+    largest = 0.0
+    for form in forms:
+        total = np.zeros((2, 1, 1))
+        for one in spreads:
+            row = _over(one, form, classes)
+            if row is None:
+                return None, DRIFTING
+            total = RADII.add(total, around(row, one.moments, RADII))
+        variance, radius = total[:, 0, 0].tolist()
+        if not radius <= DOUBT * variance and radius:
+            return None, IN_DOUBT
+        largest = max(largest, variance)
+    return math.sqrt(largest), ""
+
+
+def _errors(classes: Sequence[_Class]) -> list[_Error]:
+    """Return the error of a copy of each class that has others: x_i − (Σ_j x_j − x_i)/(N − 1)."""
+    found = []
+    for copy in dict.fromkeys(copy for one in classes for copy in one.got.copies):
+        counts = [one.count if copy in one.got.copies else 0 for one in classes]
+        others = sum(counts) - 1
+        if others:
+            means = tuple(Fraction(-count, others) for count in counts)
+            of = [place for place, count in enumerate(counts) if count]
+            found += [_Error(place, copy, 1 + Fraction(1, others), means) for place in of]
+    return found
+
+
+def _over(spread: _Spread, form: _Error, classes: Sequence[_Class]) -> Matrix | None:
+    """Return an error (2, 1, n) over the coordinates of a spread; None where standing motions move it."""
+    row: dict[int, Fraction] = {}
+    if spread.apart is None:
+        for g, weight in enumerate(form.means):
+            if weight:
+                own = weight + (form.own if g == form.of else 0)
+                row[spread.offsets[g] + classes[g].got.copies[form.copy]] = own
+    elif spread.apart == form.of:
+        row[classes[form.of].got.copies[form.copy]] = form.own
+    whole = np.zeros(len(spread.at.held) + len(spread.at.rest))
+    for place, weight in row.items():
+        whole[place] = float(weight)
+    moved = whole[spread.at.held] + whole[spread.at.rest] @ spread.at.weights
+    if np.abs(moved).max(initial=0.0) > APART * np.abs(whole).max(initial=0.0):
+        return None
+    return rounded(whole[spread.at.rest][None])
