@@ -1,7 +1,7 @@
 """How far copies are from each other while hands push at random, over the network as it is.
 
 Takes: a scene that is stable in mean square, and how its second moments move (`crowd`, `patterns`).
-Gives: `crowd_error`, `pattern_error`.
+Gives: `crowd_error`, `standing_error`, `pattern_error`.
 Guarantees: a value whose digits rounding leaves in doubt is none.
 Does not: say whether the scene is stable (see `network`).
 
@@ -24,18 +24,30 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
+from apc.eigen.modes import dense_loop
 from apc.eigen.relative import Relative
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
 from apc.moments.crowd import crowd, hearing, peer_classes
 from apc.moments.gains import Moments, Part, around, gain, number_of, scaled, stein, units_of
 from apc.moments.hands import Copy, Peer, forced
+from apc.moments.patterns import every_pattern, frames, of_all, resting_moments
+from apc.moments.stand_in import entries_of, luck_of_luck, spread_of, standing_in_for
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 
 # How far rounding may put a variance in doubt, relatively.
 DOUBT = 1e-6
+
+# Frames after which the sizes of covariances are known well enough to measure errors by.
+SIZED = 40
+
+# By what factor of its rounding a covariance that vanishes is taken to be there.
+VANISHING = 1e3
+
+# How often a bound is put into itself: some entries have one far better than the largest.
+SHARPENED = 4
 
 # How far a motion that nothing holds back may move copies apart: those of rational weights are rounded.
 APART = 1e-9
@@ -103,6 +115,80 @@ def crowd_error(system: CompiledSystem, prepared: Prepared) -> Told:
     return _largest(known, classes) if known else (None, IN_DOUBT)
 
 
+def standing_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Told:
+    """Return the largest error of copies, or why there is none: own values stand in for missed ones.
+
+    Parameters
+    ----------
+    system, prepared
+        As for `crowd_error`.
+    first
+        When frames begin: all packets that may be lost are due then.
+    """
+    pushed = forced(system, hearing(system, prepared, first=first, stand_in=True), first)
+    if isinstance(pushed, str):
+        return None, pushed
+    loops, _ = peer_classes(pushed.told)
+    classes = [_Class(site.count, pushed.peers[id(site.schedule)]) for site in loops[0].sites]
+    of = standing_in_for(system, prepared, first, told=pushed.told)
+    entries = entries_of(of)
+    # What a peer gets in a frame beside what moves it on the mean: its pushes, and Ω by luck.
+    known = [
+        with_radius(np.array([[float(a == b and a in one.got.drawn)] for a, b in listed]), np.zeros(1))[..., 0]
+        for one, listed in zip(classes, entries, strict=True)
+    ]
+    matrix = luck_of_luck(of, 1.0, RADII)
+    found = None if matrix is None else _solved(matrix, np.concatenate(known, axis=-1), _squares(entries))
+    if found is None:
+        return None, IN_DOUBT
+    totals: dict[int | None, Matrix] = {}
+    start = 0
+    for d, listed in enumerate(entries):
+        own, size = found[:, start : start + len(listed)], of.offsets[d + 1] - of.offsets[d]
+        start += len(listed)
+        rows, columns = np.array(listed, np.intp).T
+        added = np.zeros((2, size, size))
+        added[:, rows, columns] = added[:, columns, rows] = own
+        spread = spread_of(of, d, added[None], 1.0, RADII)
+        if spread is None:
+            return None, IN_DOUBT
+        for apart, (moments,) in spread.items():
+            more = moments
+            if apart is not None:
+                more = scaled(moments, number_of(1 - 1 / of.counts[d], RADII), RADII)
+            totals[apart] = RADII.add(totals[apart], more) if apart in totals else more
+    spreads = [
+        _Spread(apart, at, of.offsets, totals[apart][:, at.rest[:, None], at.rest]) for apart, _, at in of.parts
+    ]
+    return _largest(spreads, classes)
+
+
+def pattern_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Told:
+    """Return the largest error of copies, or why there is none, pattern by pattern of lost packets.
+
+    It is right to what an iteration and rounding leave, of which there is no bound.
+
+    Parameters
+    ----------
+    system, prepared, first
+        As for `standing_error`.
+    """
+    pushed = forced(system, hearing(system, prepared, first=first, stand_in=True), first)
+    if isinstance(pushed, str):
+        return None, pushed
+    peers = dense_loop(pushed.told.groups, pushed.told.exchange).sites
+    classes = [_Class(1, pushed.peers[id(site.schedule)]) for site in peers]
+    found = frames(system, prepared, first, every_pattern, told=pushed.told)
+    of = of_all(found)
+    drawn = np.zeros(len(of.at.held) + len(of.at.rest))
+    for start, one in zip(found.sites, classes, strict=False):
+        drawn[start + np.array(one.got.drawn, np.intp)] = 1.0
+    moments = resting_moments(of, np.diag(drawn[of.at.rest]))
+    if moments is None:
+        return None, "its iteration did not come to an end"
+    return _largest([_Spread(None, of.at, found.sites, RADII.exact(moments))], classes)
+
+
 def _pushed(
     matrix: Matrix, apart: int | None, at: Relative, offsets: Sequence[int], classes: Sequence[_Class]
 ) -> _Spread | None:
@@ -132,11 +218,7 @@ def _with_luck(of: Moments, spreads: Sequence[_Spread]) -> list[_Spread] | None:
     if matrix is None:
         return None
     first = _first_luck(of, spreads)
-    squares = []
-    for listed in (slot for kind in of.luck for slot in kind.entries):
-        own = {entry: len(squares) + number for number, entry in enumerate(listed)}
-        squares += [(own[a, a], own[b, b]) for a, b in listed]
-    found = _solved(matrix, first, squares)
+    found = _solved(matrix, first, _squares([slot for kind in of.luck for slot in kind.entries]))
     if found is None:
         return None
     result, starts = [], np.cumsum([0] + [sum(map(len, kind.entries)) for kind in of.luck])
@@ -173,34 +255,55 @@ def _first_luck(of: Moments, spreads: Sequence[_Spread]) -> Matrix:
     return np.array(found).reshape(-1, 2).T
 
 
+def _squares(entries: Sequence[Sequence[tuple[int, int]]]) -> list[tuple[int, int]]:
+    """Return where the entries (a, a) and (b, b) of the same matrix are, of the entries (a, b) of several."""
+    found: list[tuple[int, int]] = []
+    for listed in entries:
+        own = {entry: len(found) + number for number, entry in enumerate(listed)}
+        found += [(own[a, a], own[b, b]) for a, b in listed]
+    return found
+
+
 def _solved(matrix: Matrix, known: Matrix, squares: Sequence[tuple[int, int]]) -> Matrix | None:
-    """Return V of (1 − G) V = V₀ with its radius (2, n), None where rounding leaves open whether there is one.
+    """Return V of V = V₀ + G V with its radius (2, n), None where rounding leaves open whether there is one.
 
     Notes
     -----
-    With an inverse Y in floats, x = Y V₀ and r = V₀ − (1 − G) x, what x is off by is (1 − F)⁻¹ Y r, where
-    F = 1 − Y (1 − G): at most |Y r| and a part f/(1 − f) of the largest, f = ‖F‖. Sizes are relative to those
-    of a covariance, √(V_aa V_bb): `squares` says where each entry's are.
+    With an inverse Y in floats, x = Y V₀ and r = V₀ − (1 − G) x, what x is off by is e = Y r + F e, where
+    F = 1 − Y (1 − G): at most twice the largest of |Y r| if ‖F‖ < 1/2, and then |Y r| + |F| e again. Sizes are
+    those of covariances, √(V_aa V_bb), of a few frames: `squares` says where each entry's a and b are.
     """
-    n = len(squares)
-    unit = RADII.exact(np.eye(n))
-    left = RADII.subtract(unit, matrix)
-    inverse = np.linalg.inv(value_of(left))
-    found = inverse @ known[0]
-    off = RADII.subtract(known[..., None], RADII.multiply(left, RADII.exact(found[:, None])))
-    reached = RADII.multiply(RADII.exact(inverse), off)
-    wrong = RADII.subtract(unit, RADII.multiply(RADII.exact(inverse), left))
     a, b = np.array(squares).T
-    size = np.sqrt(np.abs(found[a] * found[b]))
-    size = np.maximum(size, np.finfo(np.float64).eps * size.max(initial=0.0))
-    if not size.all():  # nothing is ever missed that differs
-        return with_radius(found[:, None], np.abs(reached).sum(axis=0))[..., 0] if not known.any() else None
-    most = float((np.abs(wrong).sum(axis=0) * size / size[:, None]).sum(axis=1).max())
+    few = known[0]
+    for _ in range(SIZED):
+        few = known[0] + value_of(matrix) @ few
+    size = np.sqrt(np.maximum(few[a], 0.0)) * np.sqrt(np.maximum(few[b], 0.0))
+    few = np.maximum(few, VANISHING * (radius_of(matrix) @ size))  # where it would vanish but for rounding
+    size = np.sqrt(np.maximum(few[a], 0.0)) * np.sqrt(np.maximum(few[b], 0.0))
+    kept = np.flatnonzero(size)
+    if known[:, size == 0].any() or matrix[:, size == 0].any():
+        return None
+    found, size = np.zeros_like(known), size[kept]
+    inner = matrix[:, kept[:, None], kept] / size[:, None] * size
+    inner[1] += 4 * UNIT * np.abs(inner[0])
+    of = known[:, kept] / size
+    of[1] += 2 * UNIT * np.abs(of[0])
+    unit = RADII.exact(np.eye(len(kept)))
+    left = RADII.subtract(unit, inner)
+    inverse = np.linalg.inv(value_of(left))
+    guess = inverse @ of[0]
+    off = RADII.subtract(of[..., None], RADII.multiply(left, RADII.exact(guess[:, None])))
+    reached = np.abs(RADII.multiply(RADII.exact(inverse), off)).sum(axis=0)[:, 0]
+    wrong = np.abs(RADII.subtract(unit, RADII.multiply(RADII.exact(inverse), left))).sum(axis=0)
+    most = float(wrong.sum(axis=1).max(initial=0.0))
     if not most < 1 / 2:
         return None
-    radius = np.abs(reached).sum(axis=0)[:, 0]
-    radius = radius + 2 * most * size * float((radius / size).max())
-    return np.stack([found, radius * (1 + 8 * UNIT)])
+    radius = np.full(len(kept), 2 * reached.max(initial=0.0))
+    for _ in range(SHARPENED):
+        radius = (reached + wrong @ radius) * (1 + len(kept) * UNIT)
+    radius += 2 * UNIT * np.abs(guess)
+    found[:, kept] = np.stack([guess, radius * (1 + 8 * UNIT)]) * size
+    return found
 
 
 def _largest(spreads: Sequence[_Spread], classes: Sequence[_Class]) -> Told:

@@ -1,7 +1,7 @@
 """Second moments where a receiver puts its own value in the place of a missing one.
 
 Takes: a scene whose packets are due at the same instant of each frame, lost independently of each other.
-Gives: `stand_in`.
+Gives: `stand_in`; `StandIn`, `standing_in_for`, `luck_of_luck`, `entries_of`, `spread_of`.
 Guarantees: equal peers cost the same, however many they are.
 Does not: serve bursts (see `patterns`), jitter, or several unreliable links.
 
@@ -17,6 +17,7 @@ mean over all a is a Gauss quadrature of the binomial distribution, exact with a
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, Arithmetic, radius_of, value_of, with_radius
-from apc.moments.crowd import hearing, own_value, peer_classes, remembered_of, standing_motions
+from apc.moments.crowd import Hearing, hearing, own_value, peer_classes, remembered_of, standing_motions
 from apc.moments.gains import Gain, around, number_of, of_kind, scaled, stein
 from apc.moments.mean_loops import standing_state, with_memory
 from apc.network.channel import channel_law
@@ -85,8 +86,31 @@ def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
     return nodes, vectors[0] ** 2
 
 
+@dataclass(frozen=True, slots=True)
+class StandIn:
+    """How peers of some classes move, `counts` of each, their states beginning at `offsets`.
+
+    `parts` are the loops of means (2, n, n) in relative coordinates: of all classes, then (class) of peers
+    apart from those of their class. `means` are bounds on the spectral radius of these.
+    """
+
+    receivers: tuple[_Receiver, ...]
+    counts: tuple[int, ...]
+    offsets: tuple[int, ...]
+    parts: tuple[tuple[int | None, Matrix, Relative], ...]
+    means: tuple[float, float]
+
+
 def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tuple[tuple[float, float], Gain]:
-    """Return bounds on the means' spectral radius and G(λ) of what luck adds, see `gains`.
+    """Return bounds on the means' spectral radius and G(λ) of what luck adds; parameters as `standing_in_for`."""
+    found = standing_in_for(system, prepared, first)
+    return found.means, functools.partial(luck_of_luck, found)
+
+
+def standing_in_for(
+    system: CompiledSystem, prepared: Prepared, first: Fraction, *, told: Hearing | None = None
+) -> StandIn:
+    """Return how peers move that put their own values in the place of missing ones.
 
     Parameters
     ----------
@@ -94,8 +118,10 @@ def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tup
         The compiled scene, and what `analysis.prepare` made of it.
     first
         When frames begin: all packets that may be lost are due then.
+    told
+        Its peers, where they are not those of `hearing` with what stands in.
     """
-    told = hearing(system, prepared, first=first, stand_in=True)
+    told = told or hearing(system, prepared, first=first, stand_in=True)
     loops, weights = peer_classes(told)
     common = loops[0]
     remembered = remembered_of(system, told, common, perfect=True)
@@ -125,7 +151,7 @@ def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tup
         heard = np.array(list(itertools.product(*(own for own, _ in nodes))))
         weight = np.array([math.prod(listed) for listed in itertools.product(*(own for _, own in nodes))])
         receivers.append(_receiver(sites[h], h, rows, one, heard_now, values, weights, others, heard, weight))
-    return _gains(receivers, counts, sizes, offsets, common, loops)
+    return _closed(receivers, counts, sizes, offsets, common, loops)
 
 
 def _receiver(site, h, rows, one, heard_now, values, weights, others, heard, weight) -> _Receiver:
@@ -198,7 +224,7 @@ def _mean(weight: Floats, blocks: Matrix) -> Matrix:
 NODE_ROUNDINGS = 16
 
 
-def _gains(receivers, counts, sizes, offsets, common, loops) -> tuple[tuple[float, float], Gain]:
+def _closed(receivers, counts, sizes, offsets, common, loops) -> StandIn:
     classes = range(len(counts))
     n = offsets[-1]
     whole = np.zeros((2, n, n))
@@ -218,10 +244,7 @@ def _gains(receivers, counts, sizes, offsets, common, loops) -> tuple[tuple[floa
     bounds = [enclose_eigenvalues(value_of(matrix), radius_of(matrix))[1] for _, matrix, _ in parts]
     low, high = max(one.low for one in bounds), max(one.high for one in bounds)
 
-    def gain(growth: float, numbers: Arithmetic) -> Matrix | None:
-        return _gain(growth, numbers, receivers, counts, offsets, parts)
-
-    return (low, high), gain
+    return StandIn(tuple(receivers), tuple(counts), tuple(offsets), tuple(parts), (low, high))
 
 
 def _each(blocks: Matrix, by: Floats) -> Matrix:
@@ -241,50 +264,67 @@ def _reduced(matrix: Matrix, at: Relative) -> Matrix:
     return RADII.subtract(inner, RADII.multiply(weights, matrix[:, at.held[:, None], at.rest]))
 
 
-def _gain(growth, numbers, receivers, counts, offsets, parts) -> Matrix | None:
-    """Return G(λ) over the entries of each class's Ω."""
-    classes = range(len(counts))
-    sizes = [offsets[h + 1] - offsets[h] for h in classes]
-    entries = [[(a, b) for a in range(n) for b in range(a, n)] for n in sizes]
-    firsts = np.cumsum([0] + [len(one) for one in entries]).tolist()
+def luck_of_luck(of: StandIn, growth: float, numbers: Arithmetic) -> Matrix | None:
+    """Return G(λ) over the entries of each class's Ω, as `gains.Gain`."""
+    listed = [np.array(one, np.intp).T for one in entries_of(of)]
+    firsts = np.cumsum([0] + [one.shape[1] for one in listed]).tolist()
     found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
-    root, shrink = number_of(growth**-0.5, numbers), number_of(1 / growth, numbers)
-    for d in classes:
-        units = np.zeros((len(entries[d]), sizes[d], sizes[d]))
-        for number, (a, b) in enumerate(entries[d]):
-            units[number, a, b] = units[number, b, a] = 1.0
-        kinds = of_kind(RADII.exact(units), numbers)
-        spread: dict[int | None, Matrix] = {}
-        for h, matrix, at in parts:
-            if h not in (None, d):
-                continue
-            # What luck adds to a peer, in relative coordinates; of all peers' mean, a peer is one in n.
-            place = offsets[d] if h is None else 0
-            total = offsets[-1] if h is None else sizes[d]
-            into = np.zeros((2, total, sizes[d]))
-            into[0, place : place + sizes[d]] = np.eye(sizes[d])
-            weights = with_radius(at.weights, at.doubt)
-            into = (
-                into[:, at.rest]
-                if not len(at.held)
-                else RADII.subtract(into[:, at.rest], RADII.multiply(weights, into[:, at.held]))
-            )
-            driven = scaled(around(of_kind(into, numbers), kinds, numbers), shrink, numbers)
-            if h is None:
-                driven = scaled(driven, number_of(1 / counts[d], numbers), numbers)
-            moments = stein(scaled(of_kind(matrix, numbers), root, numbers), driven, numbers)
-            if moments is None:
-                return None
-            whole = np.zeros((*moments.shape[:-2], total, total))
-            whole[..., at.rest[:, None], at.rest] = moments
-            spread[h] = whole
-        for h in classes:
-            added = _added(h, d, receivers[h], counts, offsets, spread, numbers)
-            listed = np.array(entries[h], np.intp).T
-            block = np.moveaxis(added[..., listed[0], listed[1]], 0, -1)
+    for d, (rows, columns) in enumerate(listed):
+        size = of.offsets[d + 1] - of.offsets[d]
+        units = np.zeros((len(rows), size, size))
+        units[np.arange(len(rows)), rows, columns] = units[np.arange(len(rows)), columns, rows] = 1.0
+        spread = spread_of(of, d, of_kind(RADII.exact(units), numbers), growth, numbers)
+        if spread is None:
+            return None
+        for h, (a, b) in enumerate(listed):
+            added = _added(h, d, of.receivers[h], of.counts, of.offsets, spread, numbers)
+            block = np.moveaxis(added[..., a, b], 0, -1)
             place = np.s_[..., firsts[h] : firsts[h + 1], firsts[d] : firsts[d + 1]]
             found[place] = numbers.add(found[place], block)
     return found
+
+
+def entries_of(of: StandIn) -> list[list[tuple[int, int]]]:
+    """Return the entries (a, b) of each class's Ω, a ≤ b."""
+    sizes = np.diff(of.offsets).tolist()
+    return [[(a, b) for a in range(n) for b in range(a, n)] for n in sizes]
+
+
+def spread_of(
+    of: StandIn, d: int, added: Matrix, growth: float, numbers: Arithmetic
+) -> dict[int | None, Matrix] | None:
+    """Return the moments that peers of a class make who each get Ω (b, n, n) more a frame; None if they grow.
+
+    They are those of all classes' means (None), and those of class d by which a peer differs from its like:
+    of n such peers, 1 − 1/n of it.
+    """
+    spread: dict[int | None, Matrix] = {}
+    root, shrink = number_of(growth**-0.5, numbers), number_of(1 / growth, numbers)
+    size = of.offsets[d + 1] - of.offsets[d]
+    for h, matrix, at in of.parts:
+        if h not in (None, d):
+            continue
+        # What luck adds to a peer, in relative coordinates; of all peers' mean, a peer is one in n.
+        place = of.offsets[d] if h is None else 0
+        total = of.offsets[-1] if h is None else size
+        into = np.zeros((2, total, size))
+        into[0, place : place + size] = np.eye(size)
+        weights = with_radius(at.weights, at.doubt)
+        into = (
+            into[:, at.rest]
+            if not len(at.held)
+            else RADII.subtract(into[:, at.rest], RADII.multiply(weights, into[:, at.held]))
+        )
+        driven = scaled(around(of_kind(into, numbers), added, numbers), shrink, numbers)
+        if h is None:
+            driven = scaled(driven, number_of(1 / of.counts[d], numbers), numbers)
+        moments = stein(scaled(of_kind(matrix, numbers), root, numbers), driven, numbers)
+        if moments is None:
+            return None
+        whole = np.zeros((*moments.shape[:-2], total, total))
+        whole[..., at.rest[:, None], at.rest] = moments
+        spread[h] = whole
+    return spread
 
 
 def _added(h, d, one, counts, offsets, spread, numbers) -> Matrix:
