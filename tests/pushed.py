@@ -1,4 +1,4 @@
-"""Copies of the paper's scene while hands push at random and packets get lost: in NumPy, none of `apc.moments`.
+"""Copies in the paper's scene while hands push at random and packets get lost: none of `apc.moments`.
 
 Takes: the numbers of each peer, how likely a packet is lost, what stands in for a missed one.
 Gives: `User`, `Table`: second moments over every pattern of lost packets, and the same played by chance.
@@ -31,23 +31,34 @@ class User:
     device: float = 0.1
     contact: float = 1000.0
 
+    @property
+    def moved(self) -> Floats:
+        """What a tick makes of both motions, of both forces that act and of a push (4, 7)."""
+        rate = np.zeros((7, 7))
+        rate[0, 1] = rate[2, 3] = 1
+        rate[1, [1, 4, 6]] = -5 / self.device, -1 / self.device, 1 / self.device
+        rate[3, [3, 4, 5]] = -5 / self.copy, 1 / self.copy, -1 / self.copy
+        return np.asarray(scipy.linalg.expm(rate * TICK)[:4])
+
 
 @dataclass(frozen=True, slots=True)
 class Table:
     """Users who follow the mean of the others, and how packets get lost: bad, good and bad again.
 
-    A way turns bad with `p` after a packet, good with `r`; while bad it loses all.
+    A way turns bad with `p` after a packet, good with `r`; while bad it loses all. `ways` (receiver, sender)
+    are all there are, unless given.
     """
 
     users: tuple[User, ...]
     p: float
     r: float
     zero: bool = False
+    ways: tuple[tuple[int, int], ...] = ()
 
     @property
     def channels(self) -> list[tuple[int, int]]:
         """The ways (receiver, sender)."""
-        return list(itertools.permutations(range(len(self.users)), 2))
+        return list(self.ways or itertools.permutations(range(len(self.users)), 2))
 
     @property
     def states(self) -> int:
@@ -55,7 +66,7 @@ class Table:
         return OWN * len(self.users) + len(self.channels)
 
     def frame(self, lost: Floats) -> tuple[Floats, Floats]:
-        """Return what a frame does to the state (n, n) and what pushes do (n, N · 8), lost packets being 1."""
+        """Return what a frame does to the state (n, n) and what pushes do (n, N · 8); lost packets are 1."""
         count = len(self.users)
         whole = np.eye(self.states)
         for c, (_, j) in enumerate(self.channels):
@@ -68,11 +79,7 @@ class Table:
             step = np.eye(self.states)
             force = np.zeros((self.states, count * TICKS))
             for i, user in enumerate(self.users):
-                rate = np.zeros((4, 4 + 3))
-                rate[0, 1] = rate[2, 3] = 1
-                rate[1, [1, 4, 6]] = -5 / user.device, -1 / user.device, 1 / user.device
-                rate[3, [3, 4, 5]] = -5 / user.copy, 1 / user.copy, -1 / user.copy
-                moved = scipy.linalg.expm(np.vstack([rate, np.zeros((3, 7))]) * TICK)[:4]
+                moved = user.moved
                 own = OWN * i
                 step[own : own + 4, own : own + 6] = moved[:, :6]
                 force[own : own + 4, i * TICKS + tick] = moved[:, 6]
@@ -83,7 +90,7 @@ class Table:
                     if receiver != i:
                         continue
                     missed = lost[c] if self.zero else 0.0
-                    share = user.stiffness / (count - 1)
+                    share = user.stiffness / sum(other == i for other, _ in self.channels)
                     step[own + COORDINATION, own + CUBE] -= missed * share
                     step[own + COORDINATION, OWN * count + c] -= (1 - missed) * share
             whole, pushes = step @ whole, step @ pushes + force
@@ -145,4 +152,39 @@ class Table:
             lost = np.where(lost, luck >= self.r, luck < self.p)
             if number >= skipped:
                 total += (state @ self.error(0)) ** 2
+        return total / frames
+
+    def played_late(self, jitter: float, frames: int, runs: int, seed: int) -> Floats:
+        """Return what `played` does where no packet is lost, but each late or early by at most `jitter`.
+
+        Of what was sent in this frame, the one before, and the one before that, which is there for sure, the
+        newest is heard that has come.
+        """
+        random = np.random.default_rng(seed)
+        count, receivers, senders = len(self.users), *np.array(self.channels).T
+        moved = np.array([user.moved for user in self.users])
+        contact = np.array([user.contact for user in self.users])
+        share = np.array([user.stiffness for user in self.users]) / (count - 1)
+        state = np.zeros((runs, count, 7))
+        sent = np.zeros((3, runs, count))
+        late = np.zeros((2, runs, len(receivers)))
+        total, skipped = np.zeros(runs), frames // 10
+        for frame in range(frames + skipped):
+            sent = np.concatenate([state[None, :, :, CUBE], sent[:2]])
+            drawn = TICKS * TICK + jitter * random.uniform(-1, 1, late[0].shape)
+            late = np.concatenate([drawn[None], late[:1]])
+            if frame >= skipped:
+                total += (state[:, 0, CUBE] - np.delete(state[..., CUBE], 0, axis=1).mean(axis=1)) ** 2
+            for tick in range(TICKS):
+                come = late <= np.array([tick, TICKS + tick])[:, None, None] * TICK
+                heard = np.where(
+                    come[0], sent[0][:, senders], np.where(come[1], sent[1][:, senders], sent[2][:, senders])
+                )
+                forces = np.zeros((runs, count))
+                for c, receiver in enumerate(receivers):
+                    forces[:, receiver] += share[receiver] * (state[:, receiver, CUBE] - heard[:, c])
+                pressed = contact * (state[..., DEVICE] - state[..., CUBE])
+                state[..., 6] = random.standard_normal((runs, count))
+                state[..., :4] = np.einsum("cij,rcj->rci", moved, state)
+                state[..., CONTACT], state[..., COORDINATION] = pressed, forces
         return total / frames

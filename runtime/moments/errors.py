@@ -1,14 +1,14 @@
 """How far copies are from each other while hands push at random, over the network as it is.
 
 Takes: a scene that is stable in mean square, and how its second moments move (`crowd`, `patterns`).
-Gives: `crowd_error`, `standing_error`, `pattern_error`.
+Gives: `Told`; `crowd_error`, `standing_error`, `pattern_error`.
 Guarantees: a value whose digits rounding leaves in doubt is none.
 Does not: say whether the scene is stable (see `network`).
 
-Every device is pushed by a force of its own of variance 1 N², drawn anew at each tick of the fastest clock; the
-error of a copy is its position less the mean of the others', as frames begin. Pushes have moments X that the
-loops of means make of them, and with these go the luck of channels, V₀; as luck drives itself, V = V₀ + G(1) V
-(see `gains`), and the moments of positions are X and what the loops make of V.
+Every device is pushed by a force of its own of variance 1 N², drawn anew at each tick of the fastest clock;
+the error of a copy is its position less the mean of the others', as frames begin. Of pushes the loops of
+means make moments X, and of these come covariances V₀ of the luck of channels; luck drives itself,
+V = V₀ + G(1) V (see `gains`), and the moments of positions are X and what the loops make of V.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from apc.eigen.relative import Relative
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
 from apc.moments.crowd import crowd, hearing, peer_classes
-from apc.moments.gains import Moments, Part, around, gain, number_of, scaled, stein, units_of
+from apc.moments.gains import Moments, around, gain, number_of, scaled, stein, units_of
 from apc.moments.hands import Copy, Peer, forced
 from apc.moments.patterns import every_pattern, frames, of_all, resting_moments
 from apc.moments.stand_in import entries_of, luck_of_luck, spread_of, standing_in_for
@@ -57,8 +57,12 @@ IN_DOUBT = "rounding leaves its digits in doubt"
 DRIFTING = "nothing holds the copies together: what they differ by grows for ever"
 
 
-# The value in m and no reason, or None and the reason.
-Told = tuple[float | None, str]
+@dataclass(frozen=True, slots=True)
+class Told:
+    """The largest error of copies in m; or None, and `why`."""
+
+    metres: float | None
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +75,7 @@ class _Class:
 
 @dataclass(frozen=True, slots=True)
 class _Spread:
-    """Second moments (2, n, n) of all classes' means, or (`apart`) of one class's peers apart from their mean.
+    """Second moments (2, n, n) of all classes' means, or of peers of class `apart` less the mean of these.
 
     They are over the relative coordinates `at` of states that begin at `offsets`, class by class.
     """
@@ -84,7 +88,7 @@ class _Spread:
 
 @dataclass(frozen=True, slots=True)
 class _Error:
-    """The error of a copy of a peer of class `of`: its own position by `own`, those of all means by `means`."""
+    """The error of a copy of a peer of class `of`: `own` times its position, `means` times those of all."""
 
     of: int
     copy: Copy
@@ -104,15 +108,17 @@ def crowd_error(system: CompiledSystem, prepared: Prepared) -> Told:
     """
     pushed = forced(system, hearing(system, prepared))
     if isinstance(pushed, str):
-        return None, pushed
+        return Told(None, pushed)
     loops, _ = peer_classes(pushed.told)
     classes = [_Class(site.count, pushed.peers[id(site.schedule)]) for site in loops[0].sites]
     of = crowd(system, prepared, told=pushed.told)
-    spreads = [_pushed(part.loop.matrix, part.apart, part.loop.at, part.loop.offsets, classes) for part in of.parts]
+    spreads = [
+        _pushed(part.loop.matrix, part.apart, part.loop.at, part.loop.offsets, classes) for part in of.parts
+    ]
     known = [one for one in spreads if one is not None]
     if len(known) == len(spreads) and of.luck:
         known = _with_luck(of, known) or []
-    return _largest(known, classes) if known else (None, IN_DOUBT)
+    return _largest(known, classes) if known else Told(None, IN_DOUBT)
 
 
 def standing_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Told:
@@ -127,20 +133,22 @@ def standing_error(system: CompiledSystem, prepared: Prepared, first: Fraction) 
     """
     pushed = forced(system, hearing(system, prepared, first=first, stand_in=True), first)
     if isinstance(pushed, str):
-        return None, pushed
+        return Told(None, pushed)
     loops, _ = peer_classes(pushed.told)
     classes = [_Class(site.count, pushed.peers[id(site.schedule)]) for site in loops[0].sites]
     of = standing_in_for(system, prepared, first, told=pushed.told)
     entries = entries_of(of)
     # What a peer gets in a frame beside what moves it on the mean: its pushes, and Ω by luck.
     known = [
-        with_radius(np.array([[float(a == b and a in one.got.drawn)] for a, b in listed]), np.zeros(1))[..., 0]
+        with_radius(np.array([[float(a == b and a in one.got.drawn)] for a, b in listed]), np.zeros(1))[
+            ..., 0
+        ]
         for one, listed in zip(classes, entries, strict=True)
     ]
     matrix = luck_of_luck(of, 1.0, RADII)
     found = None if matrix is None else _solved(matrix, np.concatenate(known, axis=-1), _squares(entries))
     if found is None:
-        return None, IN_DOUBT
+        return Told(None, IN_DOUBT)
     totals: dict[int | None, Matrix] = {}
     start = 0
     for d, listed in enumerate(entries):
@@ -151,14 +159,15 @@ def standing_error(system: CompiledSystem, prepared: Prepared, first: Fraction) 
         added[:, rows, columns] = added[:, columns, rows] = own
         spread = spread_of(of, d, added[None], 1.0, RADII)
         if spread is None:
-            return None, IN_DOUBT
+            return Told(None, IN_DOUBT)
         for apart, (moments,) in spread.items():
             more = moments
             if apart is not None:
                 more = scaled(moments, number_of(1 - 1 / of.counts[d], RADII), RADII)
             totals[apart] = RADII.add(totals[apart], more) if apart in totals else more
     spreads = [
-        _Spread(apart, at, of.offsets, totals[apart][:, at.rest[:, None], at.rest]) for apart, _, at in of.parts
+        _Spread(apart, at, of.offsets, totals[apart][:, at.rest[:, None], at.rest])
+        for apart, _, at in of.parts
     ]
     return _largest(spreads, classes)
 
@@ -175,7 +184,7 @@ def pattern_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -
     """
     pushed = forced(system, hearing(system, prepared, first=first, stand_in=True), first)
     if isinstance(pushed, str):
-        return None, pushed
+        return Told(None, pushed)
     peers = dense_loop(pushed.told.groups, pushed.told.exchange).sites
     classes = [_Class(1, pushed.peers[id(site.schedule)]) for site in peers]
     found = frames(system, prepared, first, every_pattern, told=pushed.told)
@@ -185,7 +194,7 @@ def pattern_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -
         drawn[start + np.array(one.got.drawn, np.intp)] = 1.0
     moments = resting_moments(of, np.diag(drawn[of.at.rest]))
     if moments is None:
-        return None, "its iteration did not come to an end"
+        return Told(None, "its iteration did not come to an end")
     return _largest([_Spread(None, of.at, found.sites, RADII.exact(moments))], classes)
 
 
@@ -201,7 +210,9 @@ def _pushed(
         start = offsets[g] if apart is None else 0
         variance = Fraction(1, one.count)
         for state in one.got.drawn:
-            drawn[:, place[start + state], place[start + state]] = _rounded(variance if apart is None else 1 - variance)
+            drawn[:, place[start + state], place[start + state]] = _rounded(
+                variance if apart is None else 1 - variance
+            )
     moments = stein(matrix, drawn[None], RADII)
     return None if moments is None else _Spread(apart, at, tuple(offsets), moments[0])
 
@@ -270,8 +281,8 @@ def _solved(matrix: Matrix, known: Matrix, squares: Sequence[tuple[int, int]]) -
     Notes
     -----
     With an inverse Y in floats, x = Y V₀ and r = V₀ − (1 − G) x, what x is off by is e = Y r + F e, where
-    F = 1 − Y (1 − G): at most twice the largest of |Y r| if ‖F‖ < 1/2, and then |Y r| + |F| e again. Sizes are
-    those of covariances, √(V_aa V_bb), of a few frames: `squares` says where each entry's a and b are.
+    F = 1 − Y (1 − G): at most twice the largest of |Y r| if ‖F‖ < 1/2, and then |Y r| + |F| e again. Sizes
+    are those of covariances, √(V_aa V_bb), of a few frames: `squares` says where each entry's a and b are.
     """
     a, b = np.array(squares).T
     few = known[0]
@@ -310,20 +321,20 @@ def _largest(spreads: Sequence[_Spread], classes: Sequence[_Class]) -> Told:
     """Return the root of the largest variance of an error, or why there is none."""
     forms = _errors(classes)
     if not forms:
-        return None, NO_COPIES
+        return Told(None, NO_COPIES)
     largest = 0.0
     for form in forms:
         total = np.zeros((2, 1, 1))
         for one in spreads:
             row = _over(one, form, classes)
             if row is None:
-                return None, DRIFTING
+                return Told(None, DRIFTING)
             total = RADII.add(total, around(row, one.moments, RADII))
         variance, radius = total[:, 0, 0].tolist()
         if not radius <= DOUBT * variance and radius:
-            return None, IN_DOUBT
+            return Told(None, IN_DOUBT)
         largest = max(largest, variance)
-    return math.sqrt(largest), ""
+    return Told(math.sqrt(largest))
 
 
 def _errors(classes: Sequence[_Class]) -> list[_Error]:

@@ -2,13 +2,13 @@
 
 Takes: a `CompiledSystem` and its peers (`crowd.Hearing`).
 Gives: `Forced`, `Peer`, `forced`.
-Guarantees: the peers move as before, and are pushed besides; positions are exact, those at the start of a frame
-whenever frames are said to begin.
+Guarantees: the peers move as before, and are pushed besides; positions are those at the start of a frame of
+the scene, whenever frames are said to begin.
 Does not: compute moments (see `errors`).
 
-A device is what a peer moves and does not tell others about: what it tells them of is a copy of what all hold.
-With m v' = f + …, a slope of v' over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at that
-place does, whatever is rigidly connected with it.
+A device is what a peer moves and does not tell others about: what it tells them of is a copy of what all
+hold. With m v' = f + …, a slope of v' over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at
+that place does, whatever is rigidly connected with it.
 
 Each force is drawn as the frame begins, acts from one tick of the fastest clock to the next, and is gone when
 the frame ends: a value of a clock of its own, as `schedule` has them.
@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import ClockPartition, CompiledSystem, Hold, Kind
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.exact import evaluate_exact
-from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import lift
 from apc.frame.parameters import exact_numbers
 from apc.frame.schedule import Act, Event, Propagate, Schedule, Tick, Value
@@ -49,7 +48,7 @@ Copy = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """What of z a peer got: `drawn` are forces of variance 1 N² as a frame begins, `copies` positions in m."""
+    """What of z a peer got: `drawn` are forces in N as a frame begins, `copies` positions in m."""
 
     drawn: range
     copies: Mapping[Copy, int]
@@ -78,7 +77,9 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
     unit_of = {one.name: one.unit for one in system.parameters}
     used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
     periods = {clock.name: told.timings[clock.period] for clock in system.clocks if clock.name in used}
-    fastest = next(clock for clock in system.clocks if clock.name == min(periods, key=lambda name: periods[name]))
+    fastest = next(
+        clock for clock in system.clocks if clock.name == min(periods, key=lambda name: periods[name])
+    )
     ticks = instants(told, fastest)
     groups, rows, peers, built = [], {}, {}, {}
     pushed = False
@@ -91,8 +92,16 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
             pushed = pushed or inverse is not None
             built[key] = _pushed(group, inverse, ticks, -first % told.frame)
         found, own = built[key]
-        groups.append(replace(group, jacobians=found.jacobians, site=found.site, exact=found.exact,
-                              schedule=found.schedule, lifted=found.lifted))
+        groups.append(
+            replace(
+                group,
+                jacobians=found.jacobians,
+                site=found.site,
+                exact=found.exact,
+                schedule=found.schedule,
+                lifted=found.lifted,
+            )
+        )
         rows[id(found.schedule)] = told.rows[id(group.schedule)]
         peers[id(found.schedule)] = own
     if not pushed:
@@ -101,30 +110,33 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
 
 
 def _inverse_inertia(group: PeerGroup, unit_of: Mapping[str, str]) -> tuple[int, Fraction] | str | None:
-    """Return which state a force on a peer's device drives and by how much, None without a device; or why not."""
+    """Return which state a force on a device drives and by how much, None without a device; or why not."""
     site, kind = group.jacobians, group.jacobians.kind
-    told_of = {_part(kind.states[place].name) for place in np.flatnonzero(_told(site.pattern, kind).any(axis=0))}
-    found: dict[str, tuple[int, int]] = {}
+    told_of = {
+        _part(kind.states[place].name) for place in np.flatnonzero(_told(site.pattern, kind).any(axis=0))
+    }
+    masses = tuple(place for place, name in enumerate(kind.parameters) if unit_of.get(name) == "kg")
+    if not (site.walkable and kind.derivative.is_a("SXFunction")):
+        return f"{kind.name} has a nonlinear loop"
+    x, u, _, _, p, t = start_arguments(site, exact_numbers(kind, group.parameters), Fraction, group.listening)
+    found: dict[str, tuple[int, set[Fraction]]] = {}
     for place, state in enumerate(kind.states):
         driven = np.flatnonzero(site.pattern.a[place])
         part = _part(state.name)
         if state.unit != "m" or part in told_of or len(driven) != 1 or site.pattern.b[place].any():
             continue
-        for number, name in enumerate(kind.parameters):
-            if unit_of.get(name) == "kg" and _part(name) == part:
-                found.setdefault(part, (int(driven[0]), number))
+        slopes, *changes = evaluate_exact(_slopes(kind, int(driven[0]), masses), [x, u, p, t])
+        moved = [one for one in changes if any(one)]
+        if moved:
+            inverses = {-a / b for one in moved for a, b in zip(one, slopes, strict=True) if a or b}
+            found[part] = int(driven[0]), inverses
     if not found:
         return None
     if len(found) > 1:
         return f"a hand may hold any of {', '.join(found)} ({kind.name})"
-    ((part, (velocity, mass)),) = found.items()
-    if not (site.walkable and kind.derivative.is_a("SXFunction")):
-        return f"{part} is part of a nonlinear loop"
-    x, u, _, _, p, t = start_arguments(site, exact_numbers(kind, group.parameters), Fraction, group.listening)
-    slopes, changes = evaluate_exact(_slopes(kind, velocity, mass), [x, u, p, t])
-    inverses = {-change / slope for slope, change in zip(slopes, changes, strict=True) if slope}
+    ((part, (velocity, inverses)),) = found.items()
     if len(inverses) != 1:
-        return f"what a force does to {part} does not follow from {kind.parameters[mass]}"
+        return f"{part} moves with masses that move otherwise, and a hand may hold any of them ({kind.name})"
     return velocity, inverses.pop()
 
 
@@ -145,13 +157,13 @@ def _told(site: LinearSite, kind: Kind) -> Matrix:
 
 
 @functools.lru_cache(maxsize=64)
-def _slopes(kind: Kind, velocity: int, mass: int) -> Any:
-    """Return the slopes of a velocity's rate over states and holds, and how they change with a mass."""
+def _slopes(kind: Kind, velocity: int, masses: tuple[int, ...]) -> Any:
+    """Return the slopes of a velocity's rate over states and holds, and how they change with each mass."""
     x, u, p, t = kind.derivative.sx_in()
     rate = kind.derivative(x, u, p, t)[velocity]
     slopes = casadi.jacobian(rate, casadi.vertcat(x, u)).T
-    changes = casadi.jacobian(slopes, p[mass])
-    return casadi.Function("slopes", [x, u, p, t], [casadi.densify(slopes), casadi.densify(changes)])
+    columns = [slopes, *(casadi.jacobian(slopes, p[mass]) for mass in masses)]
+    return casadi.Function("slopes", [x, u, p, t], [casadi.densify(one) for one in columns])
 
 
 def _pushed(
@@ -222,11 +234,13 @@ def _pushed(
         lifted=lift(site, full, exact=exact),
     )
     behind = first + count + len(before)
-    return own, Peer(range(first, first + count), {copy: behind + number for number, copy in enumerate(copies)})
+    return own, Peer(
+        range(first, first + count), {copy: behind + number for number, copy in enumerate(copies)}
+    )
 
 
 def _stopping(schedule: Schedule, at: set[int]) -> list[tuple[int, Event]]:
-    """Return a frame's events, each with its instant in quanta, so that propagation stops where it is told to."""
+    """Return a frame's events, each with its instant in quanta, so that propagation stops at some."""
     found: list[tuple[int, Event]] = []
     now = 0
     for event in schedule.events:
@@ -251,7 +265,11 @@ def _with_push(site: LinearSite, kind: Kind, force: tuple[int, Fraction] | None)
     if force is not None:
         b[force[0], -1] = force[1] if b.dtype == object else float(force[1])
     n_x, n_u = b.shape
-    nothing = np.full((2, n_x), zero, b.dtype), np.full((2, n_u), zero, b.dtype), np.full((2, 0), zero, b.dtype)
+    nothing = (
+        np.full((2, n_x), zero, b.dtype),
+        np.full((2, n_u), zero, b.dtype),
+        np.full((2, 0), zero, b.dtype),
+    )
     nothing[1][ACTING, -1] += 1
     told = _told(site, kind)
     held = np.array(

@@ -290,8 +290,8 @@ def mean_loop(
         now, before = np.zeros((2, len(rows), starts[-1])), np.zeros((2, len(rows), firsts[-1]))
         for line, row in enumerate(rows):
             one = of_route.get((row.way.link, row.way.delay))
-            if one is None or row.channel not in one.channels:
-                continue
+            if one is None or row.gap or row.channel not in one.channels:
+                continue  # what is missed is held, and nothing stands in for it
             value = one.memory.heard[row.clock, row.tick]
             for h, weight in enumerate(loop.coupling[row.way][g]):
                 if weight:

@@ -1,7 +1,8 @@
 """Second moments of a few peers, pattern by pattern of which packets are lost: bursts, and what stands in.
 
 Takes: a scene of few channels, all of whose packets are due at the same instant of each frame.
-Gives: `Frames`, `frames`; `Patterns`, `patterns`; `every_pattern`, `of_all`; `pattern_radius`, `resting_moments`.
+Gives: `Frames`, `frames`; `Patterns`, `patterns`; `every_pattern`, `of_all`; `pattern_radius`,
+`resting_moments`.
 Guarantees: exact but for rounding: every pattern of lost packets is looked at.
 Does not: bound its rounding; serve jitter, or packets due at different instants.
 
@@ -246,15 +247,15 @@ def resting_moments(of: Patterns, drawn: Floats) -> Floats | None:
     drawn
         The covariance (n, n) of what is added at the end of each frame, by chance of its own.
     """
-    likely = np.ones(1)
+    likely: Floats = np.ones(1)
     for law in of.laws:
-        likely = np.kron([1 - law.bad, law.bad], likely)
+        likely = np.asarray(np.kron([1 - law.bad, law.bad], likely))
     scale = np.outer(of.scale, of.scale)
     added = np.multiply.outer(likely, drawn / scale)
     after = a_frame_later(of)(added.reshape(-1)).reshape(added.shape)
     # What is drawn anew is there for a frame: all that lasts is over the other states.
     rest = np.flatnonzero(of.matrices.any(axis=(0, 2)))
-    inner = np.ix_(range(len(added)), rest, rest)
+    inner = np.ix_(np.arange(len(added)), rest, rest)
     step = a_frame_later(replace(of, matrices=of.matrices[inner]))
     linalg = load_pool("scipy.sparse.linalg")
     size = after[inner].size
