@@ -141,7 +141,7 @@ def test_by_chance_it_is_as_it_is_on_the_mean() -> None:
 
 def test_under_jitter_it_is_what_a_play_of_late_packets_finds() -> None:
     found = metres(crowd_error(*pushed("jitter: 6 ms", count=3, stiffness=700)))
-    standing = crowd_error(*pushed("jitter: 6 ms, on_loss: zero", count=3, stiffness=700))
+    standing = crowd_error(*pushed("loss: 0 %, jitter: 6 ms, on_loss: zero", count=3, stiffness=700))
     assert metres(standing) == pytest.approx(found, rel=1e-12)  # nothing is missed
     squares = Table(users(3, 700), 0.0, 1.0).played_late(0.006, frames=200, runs=400, seed=1)
     assert abs(squares.mean() - found**2) < 4 * squares.std() / np.sqrt(len(squares))
