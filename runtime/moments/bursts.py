@@ -29,7 +29,7 @@ from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import relative_places
-from apc.moments.patterns import Frames, frames
+from apc.moments.patterns import Frames, frames, largest
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
@@ -38,9 +38,6 @@ Integers = NDArray[np.intp]
 # An arc of who hears whom: (receiver, sender).
 Arc = tuple[int, int]
 Tags = tuple[Arc, ...]
-
-# Up to so many numbers, a matrix of moments is written out.
-FEW = 400
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,13 +134,7 @@ def _radius(of: _Affine, order: int) -> float:
     """Return the largest eigenvalue of all moments of so many tags at most."""
     tags = _Tagged(of, min(order, len(of.arcs)))
     start = tags.shortened(np.stack([np.eye(len(of.mean)) * (not one) for one in tags.sets]))
-    if tags.size <= FEW:
-        matrix = np.array([tags.step(column) for column in np.eye(tags.size)]).T
-        return float(np.linalg.eigvals(matrix).real.max())
-    linalg = load_pool("scipy.sparse.linalg")
-    operator = linalg.LinearOperator((tags.size, tags.size), matvec=tags.step, dtype=np.float64)
-    values = linalg.eigs(operator, k=1, which="LR", v0=start, return_eigenvectors=False, tol=1e-13, ncv=40)
-    return float(values.real.max())
+    return largest(tags.step, start)
 
 
 class _Tagged:

@@ -131,12 +131,14 @@ def growth(system: CompiledSystem, prepared: Prepared) -> Growth:
             inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None)
             return Growth(inner.radius, inner.low, inner.high, True)
         first, why = _due(system, lossy)
-        if not why and len(lossy) == 1 and len(system.links) == 1:
+        if not why and len(system.links) == 1 and not system.links[0].delays:
             means, adds = stand_in(system, prepared, first)
             inner = mean_square_radius(means, adds)
             return Growth(inner.radius, inner.low, inner.high, True)
     else:
         first, why = _due(system, lossy)
+    if not why and any(law.jitter for _, law in lossy):
+        why = "jitter of one link beside losses of another that come in bursts or with on_loss: zero"
     if why:
         return Growth(np.nan, 0.0, np.inf, False, why)
     return _by_patterns(system, prepared, first, lossy, holding)

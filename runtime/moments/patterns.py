@@ -1,7 +1,7 @@
 """Second moments of a few peers, pattern by pattern of which packets are lost: bursts, and what stands in.
 
 Takes: a scene of few channels, all of whose packets are due at the same instant of each frame.
-Gives: `Frames`, `frames`; `Patterns`, `patterns`; `pattern_radius`.
+Gives: `Frames`, `frames`; `Patterns`, `patterns`; `pattern_radius`; `largest`.
 Guarantees: exact but for rounding: every pattern of lost packets is looked at.
 Does not: bound its rounding; serve jitter, or packets due at different instants.
 
@@ -39,6 +39,12 @@ Matrix = NDArray[Any]
 
 # Channels whose patterns are all looked at: 64 matrices, of three peers.
 MOST_CHANNELS = 6
+
+# Up to so many numbers, a map of moments is written out.
+FEW = 400
+
+# Of larger ones, eigenvalues that are found, and the vectors they are found in.
+FOUND, TRIED = 6, 60
 
 # What the frame of a motion that stands still may be off by, in floats.
 STANDING = 1e-12
@@ -202,15 +208,32 @@ def pattern_radius(of: Patterns) -> float:
         moved = (moved + moved.transpose(0, 2, 1)) / 2
         return _changed(moved.reshape((2,) * count + (n * n,)), laws).reshape(-1)
 
-    start = np.broadcast_to(np.eye(n), (k, n, n)).reshape(-1).copy()
-    size = k * n * n
-    if size <= 400:
-        matrix = np.array([step(column) for column in np.eye(size)]).T
-        return float(np.abs(np.linalg.eigvals(matrix)).max())
+    return largest(step, np.broadcast_to(np.eye(n), (k, n, n)).reshape(-1).copy())
+
+
+def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
+    """Return the largest eigenvalue of a map that leaves a cone of moments invariant, in floats.
+
+    Parameters
+    ----------
+    step
+        The map of vectors (n,).
+    start
+        Moments (n,) inside the cone.
+
+    Notes
+    -----
+    The eigenvalue is real, and no other is larger in magnitude. A few are asked for: alone, the first that an
+    iteration finds may be one near to it.
+    """
+    if start.size <= FEW:
+        return float(np.linalg.eigvals(np.array([step(column) for column in np.eye(start.size)])).real.max())
     linalg = load_pool("scipy.sparse.linalg")
-    operator = linalg.LinearOperator((size, size), matvec=step, dtype=np.float64)
-    values = linalg.eigs(operator, k=1, which="LR", v0=start, return_eigenvectors=False, tol=1e-13, ncv=40)
-    return float(np.abs(values).max())
+    operator = linalg.LinearOperator((start.size, start.size), matvec=step, dtype=np.float64)
+    values = linalg.eigs(
+        *(operator, FOUND), which="LR", v0=start, ncv=TRIED, tol=1e-13, return_eigenvectors=False
+    )
+    return float(values.real.max())
 
 
 def _changed(moved: Floats, laws: Sequence[ChannelLaw]) -> Floats:
