@@ -172,11 +172,11 @@ def check(one: Draw, library: Library, tally: Tally) -> None:
     """Judge a scene and compare."""
     try:
         system = compiled(one.text, library)
+        told = judge_network(system)
     except ApcError as error:
         tally.beyond += 1
-        tally.unserved[f"{error}".splitlines()[0][:90]] += 1
+        tally.unserved[f"{error}".splitlines()[0].partition(": ")[2]] += 1
         return
-    told = judge_network(system)
     if told is None or told.mean_square_radius is None:
         tally.unserved["reliable" if told is None else told.notes[0]] += 1
         return

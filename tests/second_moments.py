@@ -28,8 +28,8 @@ from tests.fifty_digits.truth import _common_whom, _everybody
 
 Floats = NDArray[np.float64]
 
-# Numbers of all second moments: an iteration of some seconds.
-MOST = 3_000_000
+# Numbers of all second moments: some seconds.
+MOST = 400_000
 
 # What stands still in every draw, in floats.
 STANDING = 1e-9
@@ -104,10 +104,14 @@ def second_moment_radius(system: CompiledSystem, laws: Mapping[str, Law]) -> flo
         start = step(start)
         start = start / np.abs(start).max()
     operator = scipy.sparse.linalg.LinearOperator((start.size, start.size), matvec=step, dtype=np.float64)
-    value = scipy.sparse.linalg.eigs(
-        operator, k=6, which="LM", v0=start, ncv=min(60, start.size - 1), tol=1e-13, return_eigenvectors=False
-    )
-    return float(np.abs(value).max())
+    try:
+        values = scipy.sparse.linalg.eigs(
+            *(operator, 4), which="LM", v0=start, ncv=min(60, start.size - 1), maxiter=30, tol=1e-13,
+            return_eigenvectors=False,
+        )  # fmt: skip
+    except scipy.sparse.linalg.ArpackNoConvergence as slow:  # the largest come first
+        values = slow.eigenvalues
+    return float(np.abs(values).max())
 
 
 class _Played:

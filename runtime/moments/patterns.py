@@ -43,8 +43,8 @@ MOST_CHANNELS = 6
 # Up to so many numbers, a map of moments is written out.
 FEW = 400
 
-# Of larger ones, eigenvalues that are found, and the vectors they are found in.
-FOUND, TRIED = 6, 60
+# Of larger ones, eigenvalues that are found, the vectors they are found in, and how often from the start.
+FOUND, TRIED, RESTARTS = 4, 60, 40
 
 # What the frame of a motion that stands still may be off by, in floats.
 STANDING = 1e-12
@@ -93,7 +93,7 @@ def frames(
         for route in remembered
         if links[route[0]].channel is not None
     }
-    channels = sorted(
+    channels: list[tuple[str, str, int, int]] = sorted(
         {
             (way.link, way.delay, g, h)
             for way, rows in loop.coupling.items()
@@ -108,18 +108,19 @@ def frames(
     offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
     held: dict[int, range] = {}
     n = offsets[-1]
-    for place, one in enumerate(channels):
-        channel = links[one[0]].channel
+    for place, (name, delay, *_) in enumerate(channels):
+        channel = links[name].channel
         if channel is not None and channel.on_loss == "hold":
-            held[place] = range(n, n + len(remembered[one[0], one[1]].channels))
+            held[place] = range(n, n + len(remembered[name, delay].channels))
             n = held[place].stop
     names = tuple(name for one in sites for name in one.names)
     layout = StateLayout(tuple(offsets[:-1]), (*names, *["held"] * (n - offsets[-1])), {})
-    number = {one: place for place, one in enumerate(channels)}
+    number = {which: place for place, which in enumerate(channels)}
     gone = lost(len(channels))
     feedback = []
     for g, rows in enumerate(told.of(loop)):
-        now, before = np.zeros((len(gone), len(rows), starts[-1])), np.zeros((len(gone), len(rows), n))
+        now: Matrix = np.zeros((len(gone), len(rows), starts[-1]))
+        before: Matrix = np.zeros((len(gone), len(rows), n))
         for line, row in enumerate(rows):
             route = row.way.link, row.way.delay
             one = remembered.get(route)
@@ -145,13 +146,13 @@ def frames(
     closed = close(maps, feedback, layout)
     matrix = closed.matrix
     for place, states in held.items():
-        link, delay, _, h = channels[place]
-        one, missed = remembered[link, delay], gone[:, place, None]
-        value = one.memory.heard[min(one.memory.heard)]
-        for state, name in zip(states, one.channels, strict=True):
-            arrived = closed.sent[:, starts[h] + sites[h].values[one.route, name, value]]
-            matrix[:, state] = arrived * (1 - missed)
-            matrix[:, state, state] += missed[:, 0]
+        name, delay, _, h = channels[place]
+        of, lost_now = remembered[name, delay], gone[:, place, None]
+        value = of.memory.heard[min(of.memory.heard)]
+        for state, what in zip(states, of.channels, strict=True):
+            arrived = closed.sent[:, starts[h] + sites[h].values[of.route, what, value]]
+            matrix[:, state] = arrived * (1 - lost_now)
+            matrix[:, state, state] += lost_now[:, 0]
     known = RADII.exact(matrix[0])
     known[1] = STANDING
     basis = standing_state(known, standing_motions(loop), loop, [*offsets[:-1], n])
@@ -230,10 +231,20 @@ def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
         return float(np.linalg.eigvals(np.array([step(column) for column in np.eye(start.size)])).real.max())
     linalg = load_pool("scipy.sparse.linalg")
     operator = linalg.LinearOperator((start.size, start.size), matvec=step, dtype=np.float64)
-    values = linalg.eigs(
-        *(operator, FOUND), which="LR", v0=start, ncv=TRIED, tol=1e-13, return_eigenvectors=False
-    )
-    return float(values.real.max())
+    try:
+        values = linalg.eigs(
+            operator,
+            FOUND,
+            which="LR",
+            v0=start,
+            ncv=TRIED,
+            maxiter=RESTARTS,
+            tol=1e-13,
+            return_eigenvectors=False,
+        )
+    except linalg.ArpackNoConvergence as slow:  # the largest come first
+        values = slow.eigenvalues
+    return float(values.real.max(initial=-np.inf))
 
 
 def _changed(moved: Floats, laws: Sequence[ChannelLaw]) -> Floats:
