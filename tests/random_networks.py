@@ -103,15 +103,21 @@ def draw(generator: random.Random, *, quick: bool = False) -> Draw:
         pairs = f", delays: {{one: {{two: {generator.choice(late)}}}}}"
         if laws["lan"].jitter:
             pairs = ""
-    links = f"links:\n  lan: {{clock: network, delay: {late_now}{graph}{pairs}{_said(laws['lan'], generator)}}}\n"
+    links = (
+        f"links:\n  lan: {{clock: network, delay: {late_now}{graph}{pairs}{_said(laws['lan'], generator)}}}\n"
+    )
     if generator.random() < 0.2:
         laws["wan"] = _law(generator, network, haptic, plain=True) if generator.random() < 0.6 else Law()
         second = generator.choice(["network", "network", "haptic"]) if "8 ms" not in network else "network"
         couplers += f"  second: {{type: FullMesh, object: device, stiffness: {generator.uniform(20, 150):.1f} N/m, clock: haptic, delay: 0 s, link: wan}}\n"
-        links += f"  wan: {{clock: {second}, delay: {generator.choice(late)}{_said(laws['wan'], generator)}}}\n"
+        links += (
+            f"  wan: {{clock: {second}, delay: {generator.choice(late)}{_said(laws['wan'], generator)}}}\n"
+        )
     hands = ""
     if generator.random() < 0.25:
-        hands = "hands:\n  arm: {type: SpringDamperArm, flange: device, stiffness: 80 N/m, damping: 1 N*s/m}\n"
+        hands = (
+            "hands:\n  arm: {type: SpringDamperArm, flange: device, stiffness: 80 N/m, damping: 1 N*s/m}\n"
+        )
     return Draw(f"topology: network\n{clocks}peers:\n  {groups}\n{masses}{couplers}{links}{hands}", laws)
 
 
@@ -194,7 +200,9 @@ def check(one: Draw, library: Library, tally: Tally) -> None:
     off = apart > told.error + doubt if told.exact else apart > 1e-4
     wrong = told.stable is not None and abs(truth - 1) > doubt and told.stable != (truth < 1)
     if off or wrong:
-        tally.wrong.append(f"{told.mean_square_radius} ± {told.error}, {told.verdict}; truth {truth}\n{one.text}")
+        tally.wrong.append(
+            f"{told.mean_square_radius} ± {told.error}, {told.verdict}; truth {truth}\n{one.text}"
+        )
 
 
 def _size(system: CompiledSystem, laws: dict[str, Law]) -> int:

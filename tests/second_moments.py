@@ -164,7 +164,9 @@ class _Played:
                     self.ways.append(
                         _Way(
                             *(link, i, j, law, delay, scene.clocks[scene.clock_of[link]][1], len(queue)),
-                            states=len(queue) + 1 if law.jitter else (1 if law.independent else 2) * (1 + law.zero),
+                            states=len(queue) + 1
+                            if law.jitter
+                            else (1 if law.independent else 2) * (1 + law.zero),
                             register=places(width),
                             queue=slice(queue[0].start, queue[-1].stop),
                         )
@@ -206,7 +208,9 @@ class _Played:
         """Add a map of the state; one that depends on the chains is a function of their states."""
         if callable(of):
             shape = [way.states for way in self.ways]
-            whole = np.array([of(modes) for modes in np.ndindex(*shape)]).reshape(*shape, self.size, self.size)
+            whole = np.array([of(modes) for modes in np.ndindex(*shape)]).reshape(
+                *shape, self.size, self.size
+            )
             self.record.append(("map", lambda modes: whole[tuple(modes)]))
             self.acts.append(lambda moments: whole @ moments @ np.swapaxes(whole, -1, -2))
         else:
@@ -255,7 +259,8 @@ class _Played:
                     if scene._ticks_now(scene.clock_of[send.link], now):
                         pending = self._sent(i, send.link, rule, now) @ pending
                         ways = [
-                            place for place, way in enumerate(self.ways)
+                            place
+                            for place, way in enumerate(self.ways)
                             if (way.link, way.sender) == (send.link, i) and way.law.jitter
                         ]
                         if ways:
@@ -374,11 +379,14 @@ class _Played:
         found = np.zeros(self.size)
         for j, weight in self.scene.whom(receive.link, receive.operator, i):
             place, way = next(
-                (place, way) for place, way in enumerate(self.ways)
+                (place, way)
+                for place, way in enumerate(self.ways)
                 if (way.link, way.receiver, way.sender) == (receive.link, i, j)
             )
             if way.law.zero and not way.law.jitter and modes[place] % 2:
-                number = next(n for n, send in enumerate(self.sites[i].kind.sends) if send.link == receive.link)
+                number = next(
+                    n for n, send in enumerate(self.sites[i].kind.sends) if send.link == receive.link
+                )
                 found += float(weight) * self._own(i, self.sites[i].sends[number], now)[receive.channel]
             else:
                 found[way.register.start + receive.channel] += float(weight)
@@ -388,7 +396,9 @@ class _Played:
         found = np.eye(self.size)
         for i, site in enumerate(self.sites):
             held = self._held(i, now, before=False)
-            found[self.x[i]] = _flow(site, following - now) @ np.concatenate([np.eye(self.size)[self.x[i]], held])
+            found[self.x[i]] = _flow(site, following - now) @ np.concatenate(
+                [np.eye(self.size)[self.x[i]], held]
+            )
         return found
 
 

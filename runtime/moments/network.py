@@ -132,8 +132,10 @@ def growth(system: CompiledSystem, prepared: Prepared) -> Growth:
             return Growth(inner.radius, inner.low, inner.high, True)
         first, why = _due(system, lossy)
         if not why and len(system.links) == 1 and not system.links[0].delays:
-            means, adds = stand_in(system, prepared, first)
-            inner = mean_square_radius(means, adds)
+            closed = stand_in(system, prepared, first)
+            if isinstance(closed, str):
+                return Growth(np.nan, 0.0, np.inf, False, closed)
+            inner = mean_square_radius(*closed)
             return Growth(inner.radius, inner.low, inner.high, True)
     else:
         first, why = _due(system, lossy)
