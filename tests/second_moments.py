@@ -204,22 +204,18 @@ class _Played:
             found[way.register, source] = np.eye(source.stop - source.start)
         return found
 
-    def _map(self, of: Callable[[Sequence[int]], Floats] | Floats) -> None:
-        """Add a map of the state; one that depends on the chains is a function of their states."""
-        if callable(of):
-            shape = [way.states for way in self.ways]
-            whole = np.array([of(modes) for modes in np.ndindex(*shape)]).reshape(
-                *shape, self.size, self.size
-            )
-            self.record.append(("map", lambda modes: whole[tuple(modes)]))
-            self.acts.append(lambda moments: whole @ moments @ np.swapaxes(whole, -1, -2))
-        else:
-            fixed = of
-            self.record.append(("map", lambda _: fixed))
-            self.acts.append(lambda moments: fixed @ moments @ fixed.T)
+    def _flush(self) -> None:
+        """Add all that happened since luck was last drawn, one map for every state of the chains or for all."""
+        whole, alike = self.pending, self.pending.ndim == 2
+        self.pending = np.eye(self.size)
+        self.record.append(("map", lambda modes: whole if alike else whole[tuple(modes)]))
+        self.acts.append(lambda moments: whole @ moments @ np.swapaxes(whole, -1, -2))
 
     def _luck(self, place: int, steps: Sequence[Step]) -> None:
         """Add a step of one way's chain."""
+        if all(before == after and taken is None for before, after, chance, taken in steps if chance):
+            return
+        self._flush()
         self.record.append(("luck", place, steps))
         way = self.ways[place]
 
@@ -252,37 +248,31 @@ class _Played:
                 for one in ticks_between(*scene.clocks[clock.clock], Fraction(0), scene.frame)
             }
         )
-        pending: Floats = np.eye(self.size)
+        self.pending: Floats = np.eye(self.size)
+        zero = any(way.law.zero and not way.law.jitter for way in self.ways)
+        shape = [way.states for way in self.ways]
         for now, following in zip(times, times[1:], strict=False):
             for i, site in enumerate(self.sites):
                 for send, rule in zip(site.kind.sends, site.sends, strict=True):
-                    if scene._ticks_now(scene.clock_of[send.link], now):
-                        pending = self._sent(i, send.link, rule, now) @ pending
-                        ways = [
-                            place
-                            for place, way in enumerate(self.ways)
-                            if (way.link, way.sender) == (send.link, i) and way.law.jitter
-                        ]
-                        if ways:
-                            self._map(pending)
-                            pending = np.eye(self.size)
-                        for place in ways:
-                            depth = self.ways[place].depth
-                            self._luck(place, [(k, min(k + 1, depth), 1.0, None) for k in range(depth + 1)])
+                    if not scene._ticks_now(scene.clock_of[send.link], now):
+                        continue
+                    self.pending = self._sent(i, send.link, rule, now) @ self.pending
+                    for place, way in enumerate(self.ways):
+                        if (way.link, way.sender) == (send.link, i) and way.law.jitter:
+                            older = [(k, min(k + 1, way.depth), 1.0, None) for k in range(way.depth + 1)]
+                            self._luck(place, older)
             if now in ticks:
                 earlier = [one for one in ticks if one < now]
                 before = earlier[-1] if earlier else ticks[-1] - scene.frame
-                self._map(pending)
-                pending = np.eye(self.size)
                 for place, way in enumerate(self.ways):
                     self._delivered(place, way, before, now)
-                depends = any(way.law.zero and not way.law.jitter for way in self.ways)
-                if depends:
-                    self._map(lambda modes, now=now: self._ticked(now, modes))
+                if zero:
+                    every = np.array([self._ticked(now, modes) for modes in np.ndindex(*shape)])
+                    self.pending = every.reshape(*shape, self.size, self.size) @ self.pending
                 else:
-                    pending = self._ticked(now, [0] * len(self.ways))
-            pending = self._moved(now, following) @ pending
-        self._map(pending)
+                    self.pending = self._ticked(now, [0] * len(self.ways)) @ self.pending
+            self.pending = self._moved(now, following) @ self.pending
+        self._flush()
 
     def _delivered(self, place: int, way: _Way, before: Fraction, now: Fraction) -> None:
         """Let what has arrived since the tick before count."""
