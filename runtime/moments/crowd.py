@@ -37,6 +37,7 @@ from apc.network.channel import ChannelLaw, channel_law
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
+Flags = NDArray[np.bool_]
 
 # A link on which every packet takes the nominal delay.
 PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
@@ -230,7 +231,7 @@ def remembered_of(
     """
     heard: dict[Route, list[Selected]] = {}
     for site, rows in zip(common.sites, told.of(common), strict=True):
-        felt = site.lifted.q.any(axis=0) | site.lifted.d.any(axis=0)
+        felt: Flags = np.any(site.lifted.q, axis=0) | np.any(site.lifted.d, axis=0)
         for place, row in enumerate(rows):
             if felt[place] and not row.gap:
                 heard.setdefault((row.way.link, row.way.delay), []).append(row)

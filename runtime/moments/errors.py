@@ -32,7 +32,7 @@ from apc.moments.crowd import crowd, hearing, peer_classes
 from apc.moments.gains import Moments, around, gain, number_of, scaled, stein, units_of
 from apc.moments.hands import Copy, Peer, forced
 from apc.moments.patterns import every_pattern, frames, of_all, resting_moments
-from apc.moments.stand_in import entries_of, luck_of_luck, spread_of, standing_in_for
+from apc.moments.stand_in import entries_of, luck_of_luck, spread_of, standing_in
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -136,7 +136,9 @@ def standing_error(system: CompiledSystem, prepared: Prepared, first: Fraction) 
         return Told(None, pushed)
     loops, _ = peer_classes(pushed.told)
     classes = [_Class(site.count, pushed.peers[id(site.schedule)]) for site in loops[0].sites]
-    of = standing_in_for(system, prepared, first, told=pushed.told)
+    of = standing_in(system, prepared, first, told=pushed.told)
+    if isinstance(of, str):
+        return Told(None, of)
     entries = entries_of(of)
     # What a peer gets in a frame beside what moves it on the mean: its pushes, and Ω by luck.
     known = [

@@ -194,9 +194,9 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
                 if other is not one:
                     continue
                 held = over_all(one.followed.before[slot], place)
-                sent = np.zeros_like(held)
-                sent[0, :, n_m + row_of[Sent(one.route[0], channel, slot)]] = 1.0
-                rows.append(RADII.subtract(sent, held))
+                packet = np.zeros_like(held)
+                packet[0, :, n_m + row_of[Sent(one.route[0], channel, slot)]] = 1.0
+                rows.append(RADII.subtract(packet, held))
                 count += held.shape[-2]
             misses[one.route, slot] = slice(start, count)
     plainly = np.zeros((2, n_s, n_m + n_s))
@@ -214,14 +214,16 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
     names = [
         f"{channel} heard" for (_, channel), many in zip(numbers, counts, strict=True) for _ in range(many)
     ]
-    sent = {one: count + row for one, row in row_of.items()}
+    sent: dict[Sent, int] = {one: count + row for one, row in row_of.items()}
     return Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses, sent)
 
 
 @dataclass(frozen=True, slots=True)
 class _Apart:
-    """What a channel's memory is apart from its mean, over [δ, ξ]: `values`, by number and value; `kept`
-    those of the next frame; `misses` of each slot."""
+    """What a channel's memory is apart from its mean, over [δ, ξ].
+
+    `values` are by number and value, `kept` those of the next frame; `misses` are of each slot.
+    """
 
     values: Matrix
     kept: Matrix
@@ -300,9 +302,9 @@ def mean_loop(
             place = one.channels.index(row.channel) * len(one.memory.old) + value
             for channel, own, first in zip(listened, apart, firsts, strict=False):
                 if channel.site == g and channel.route == one.route and channel.weights.get(row.way):
-                    weight = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
+                    by = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
                     span = slice(first, first + own.values.shape[-1])
-                    before[:, line, span] = RADII.multiply(weight, own.values[:, place, None])[:, 0]
+                    before[:, line, span] = RADII.multiply(by, own.values[:, place, None])[:, 0]
         feedback.append(Feedback(now, before))
     closed = close([one.map for one in sites], feedback, layout, numbers=RADII)
     at = relative_coordinates(standing_state(closed.matrix[..., : offsets[-1]], standing, loop, offsets))

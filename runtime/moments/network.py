@@ -135,13 +135,17 @@ def growth(system: CompiledSystem, prepared: Prepared) -> Growth:
             errors = partial(crowd_error, system, prepared)
             return Growth(inner.radius, inner.low, inner.high, True, errors=errors)
         first, why = _due(system, lossy)
-        if not why and len(lossy) == 1 and len(system.links) == 1:
-            means, adds = stand_in(system, prepared, first)
-            inner = mean_square_radius(means, adds)
+        if not why and len(system.links) == 1 and not system.links[0].delays:
+            closed = stand_in(system, prepared, first)
+            if isinstance(closed, str):
+                return Growth(np.nan, 0.0, np.inf, False, closed)
+            inner = mean_square_radius(*closed)
             errors = partial(standing_error, system, prepared, first)
             return Growth(inner.radius, inner.low, inner.high, True, errors=errors)
     else:
         first, why = _due(system, lossy)
+    if not why and any(law.jitter for _, law in lossy):
+        why = "jitter of one link beside losses of another that come in bursts or with on_loss: zero"
     if why:
         return Growth(np.nan, 0.0, np.inf, False, why)
     return _by_patterns(system, prepared, first, lossy, holding)

@@ -2,7 +2,7 @@
 
 Takes: a scene of few channels, all of whose packets are due at the same instant of each frame.
 Gives: `Frames`, `frames`; `Patterns`, `patterns`; `every_pattern`, `of_all`; `pattern_radius`,
-`resting_moments`.
+`resting_moments`; `largest`, `settled`.
 Guarantees: exact but for rounding: every pattern of lost packets is looked at.
 Does not: bound its rounding; serve jitter, or packets due at different instants.
 
@@ -41,8 +41,14 @@ Matrix = NDArray[Any]
 # Channels whose patterns are all looked at: 64 matrices, of three peers.
 MOST_CHANNELS = 6
 
-# Of a system of equations an iteration leaves so much, with so many vectors at a time and so many times.
-LEFT, VECTORS, RESTARTS = 1e-13, 60, 40
+# Up to so many numbers, a map of moments is written out.
+FEW = 400
+
+# Of larger ones, eigenvalues that are found, the vectors they are found in, and how often from the start.
+FOUND, TRIED, RESTARTS = 4, 60, 40
+
+# What is left of a system of equations that is solved in as many vectors, relatively.
+LEFT = 1e-13
 
 # What the frame of a motion that stands still may be off by, in floats.
 STANDING = 1e-12
@@ -95,7 +101,7 @@ def frames(
         for route in remembered
         if links[route[0]].channel is not None
     }
-    channels = sorted(
+    channels: list[tuple[str, str, int, int]] = sorted(
         {
             (way.link, way.delay, g, h)
             for way, rows in loop.coupling.items()
@@ -110,18 +116,19 @@ def frames(
     offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
     held: dict[int, range] = {}
     n = offsets[-1]
-    for place, one in enumerate(channels):
-        channel = links[one[0]].channel
+    for place, (name, delay, *_) in enumerate(channels):
+        channel = links[name].channel
         if channel is not None and channel.on_loss == "hold":
-            held[place] = range(n, n + len(remembered[one[0], one[1]].channels))
+            held[place] = range(n, n + len(remembered[name, delay].channels))
             n = held[place].stop
     names = tuple(name for one in sites for name in one.names)
     layout = StateLayout(tuple(offsets[:-1]), (*names, *["held"] * (n - offsets[-1])), {})
-    number = {one: place for place, one in enumerate(channels)}
+    number = {which: place for place, which in enumerate(channels)}
     gone = lost(len(channels))
     feedback = []
     for g, rows in enumerate(told.of(loop)):
-        now, before = np.zeros((len(gone), len(rows), starts[-1])), np.zeros((len(gone), len(rows), n))
+        now: Matrix = np.zeros((len(gone), len(rows), starts[-1]))
+        before: Matrix = np.zeros((len(gone), len(rows), n))
         for line, row in enumerate(rows):
             route = row.way.link, row.way.delay
             one = remembered.get(route)
@@ -147,13 +154,13 @@ def frames(
     closed = close(maps, feedback, layout)
     matrix = closed.matrix
     for place, states in held.items():
-        link, delay, _, h = channels[place]
-        one, missed = remembered[link, delay], gone[:, place, None]
-        value = one.memory.heard[min(one.memory.heard)]
-        for state, name in zip(states, one.channels, strict=True):
-            arrived = closed.sent[:, starts[h] + sites[h].values[one.route, name, value]]
-            matrix[:, state] = arrived * (1 - missed)
-            matrix[:, state, state] += missed[:, 0]
+        name, delay, _, h = channels[place]
+        of, lost_now = remembered[name, delay], gone[:, place, None]
+        value = of.memory.heard[min(of.memory.heard)]
+        for state, what in zip(states, of.channels, strict=True):
+            arrived = closed.sent[:, starts[h] + sites[h].values[of.route, what, value]]
+            matrix[:, state] = arrived * (1 - lost_now)
+            matrix[:, state, state] += lost_now[:, 0]
     known = RADII.exact(matrix[0])
     known[1] = STANDING
     basis = standing_state(known, standing_motions(loop), loop, [*offsets[:-1], n])
@@ -204,16 +211,7 @@ def pattern_radius(of: Patterns) -> float:
         The frames of all patterns.
     """
     k, n = of.matrices.shape[:2]
-    step = a_frame_later(of)
-    start = np.broadcast_to(np.eye(n), (k, n, n)).reshape(-1).copy()
-    size = k * n * n
-    if size <= 400:
-        matrix = np.array([step(column) for column in np.eye(size)]).T
-        return float(np.abs(np.linalg.eigvals(matrix)).max())
-    linalg = load_pool("scipy.sparse.linalg")
-    operator = linalg.LinearOperator((size, size), matvec=step, dtype=np.float64)
-    values = linalg.eigs(operator, k=1, which="LR", v0=start, return_eigenvectors=False, tol=1e-13, ncv=40)
-    return float(np.abs(values).max())
+    return largest(a_frame_later(of), np.broadcast_to(np.eye(n), (k, n, n)).reshape(-1).copy())
 
 
 def a_frame_later(of: Patterns) -> Callable[[Floats], Floats]:
@@ -257,15 +255,62 @@ def resting_moments(of: Patterns, drawn: Floats) -> Floats | None:
     rest = np.flatnonzero(of.matrices.any(axis=(0, 2)))
     inner = np.ix_(np.arange(len(added)), rest, rest)
     step = a_frame_later(replace(of, matrices=of.matrices[inner]))
-    linalg = load_pool("scipy.sparse.linalg")
-    size = after[inner].size
-    operator = linalg.LinearOperator((size, size), matvec=lambda x: x - step(x), dtype=np.float64)
-    known = after[inner].reshape(-1)
-    found, open_end = linalg.gmres(operator, known, rtol=LEFT, atol=0.0, restart=VECTORS, maxiter=RESTARTS)
-    if open_end:
+    found = settled(step, after[inner].reshape(-1))
+    if found is None:
         return None
     added[inner] += found.reshape(after[inner].shape)
     return np.asarray(added.sum(axis=0) * scale)
+
+
+def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
+    """Return the largest eigenvalue of a map that leaves a cone of moments invariant, in floats.
+
+    Parameters
+    ----------
+    step
+        The map of vectors (n,).
+    start
+        Moments (n,) inside the cone.
+
+    Notes
+    -----
+    The eigenvalue is real, and no other is larger in magnitude. A few are asked for: alone, the first that an
+    iteration finds may be one near to it.
+    """
+    if start.size <= FEW:
+        return float(np.linalg.eigvals(np.array([step(column) for column in np.eye(start.size)])).real.max())
+    linalg = load_pool("scipy.sparse.linalg")
+    operator = linalg.LinearOperator((start.size, start.size), matvec=step, dtype=np.float64)
+    try:
+        values = linalg.eigs(
+            operator,
+            FOUND,
+            which="LR",
+            v0=start,
+            ncv=TRIED,
+            maxiter=RESTARTS,
+            tol=1e-13,
+            return_eigenvectors=False,
+        )
+    except linalg.ArpackNoConvergence as slow:  # the largest come first
+        values = slow.eigenvalues
+    return float(values.real.max(initial=-np.inf))
+
+
+def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats | None:
+    """Return the sum of all that `step` makes of what is added once a frame (n,), None where it isn't found.
+
+    Parameters
+    ----------
+    step
+        The map of vectors (n,), of a spectral radius below 1.
+    added
+        What is added (n,).
+    """
+    linalg = load_pool("scipy.sparse.linalg")
+    operator = linalg.LinearOperator((added.size,) * 2, matvec=lambda x: x - step(x), dtype=np.float64)
+    found, open_end = linalg.gmres(operator, added, rtol=LEFT, atol=0.0, restart=TRIED, maxiter=RESTARTS)
+    return None if open_end else np.asarray(found)
 
 
 def _changed(moved: Floats, laws: Sequence[ChannelLaw]) -> Floats:
