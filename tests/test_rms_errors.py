@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.moments.errors import DRIFTING, Told, crowd_error, pattern_error, standing_error
+from apc.moments.errors import DRIFTING, Told, crowd_error, pattern_error, standing_error, tagged_error
 from apc.moments.network import judge_network
 from tests.pushed import Table, User
 from tests.topologies import compiled, replaced
@@ -102,6 +103,27 @@ def test_under_bursts_it_is_that_of_all_patterns_one_by_one(count: int, zero: bo
     found = pattern_error(*pushed(text, count=count), NOW)
     expected = Table(users(count, 500), 0.03, 0.3, zero).rms()
     assert metres(found) == pytest.approx(expected[0], rel=1e-10)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_under_bursts_between_equal_peers_all_tags_tell_the_same(count: int) -> None:
+    system, prepared = pushed("loss: {p: 0.03, r: 0.3}", count=count)
+    expected = Table(users(count, 500), 0.03, 0.3).rms()
+    found = tagged_error(system, prepared, NOW, (count * (count - 1),))
+    assert found.why == ""
+    assert metres(found) == pytest.approx(expected[0], rel=1e-10)
+
+
+def test_fewer_tags_than_channels_tell_an_estimate_that_is_called_one() -> None:
+    system, prepared = pushed("loss: {p: 0.03, r: 0.3}")
+    exact = metres(tagged_error(system, prepared, NOW, (6,)))
+    rough, near = (metres(tagged_error(system, prepared, NOW, (order,))) for order in (1, 2))
+    assert 1e-4 * exact > abs(rough - exact) > 10 * abs(near - exact)
+    both = tagged_error(system, prepared, NOW, (1, 2))
+    assert both.metres == near
+    assert both.why == (
+        f"an estimate: moments of at most 2 channels' states together; with 1 it is {rough:.9g} m"
+    )
 
 
 @pytest.mark.parametrize("zero", [False, True])
@@ -198,7 +220,11 @@ def test_a_verdict_tells_the_error_or_why_there_is_none() -> None:
     assert shaking is not None
     assert shaking.rms_error_m is None
     assert "root mean square error of copies: only where second moments die out" in shaking.notes
-    bursts = judge_network(pushed("loss: {p: 0.02, r: 0.3}", count=4, stiffness=300)[0])
-    assert bursts is not None
-    assert bursts.rms_error_m is None
-    assert any(note.startswith("root mean square error of copies: ") for note in bursts.notes)
+    (link,) = pushed("loss: 10 %")[0].links
+    assert link.channel is not None
+    recorded = replace(link, channel=replace(link.channel, loss=None, trace=np.array([0.008, 0.009])))
+    played = judge_network(replace(pushed("loss: 10 %")[0], links=(recorded,)))
+    assert played is not None
+    assert played.stable
+    assert played.rms_error_m is None
+    assert "root mean square error of copies: it is not worked out over recorded delays" in played.notes

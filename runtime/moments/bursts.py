@@ -1,7 +1,7 @@
 """Second moments under bursts of losses, tag by tag: exact for few channels, an estimate for many.
 
 Takes: a scene of equal peers that all hear each other, or any few, whose receivers hold what they miss.
-Gives: `tagged_radius`.
+Gives: `tagged_radius`, `tagged_moments`.
 Guarantees: with as many tags as there are channels it is exact but for rounding; with fewer, an estimate.
 Does not: bound its rounding, or what fewer tags leave out.
 
@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -31,7 +31,8 @@ from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import relative_places
-from apc.moments.patterns import Frames, frames, largest
+from apc.moments.crowd import Hearing
+from apc.moments.patterns import Frames, frames, largest, settled
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
@@ -47,7 +48,8 @@ Terms = list[tuple[float, Tags]]
 class _Affine:
     """A frame as it is affine in the channels' states: A, and U_c F_c of each (C, n, m), (C, m, n).
 
-    `chance` is that of a bad state, `last` how much of it is left a frame later.
+    `chance` is that of a bad state, `last` how much of it is left a frame later. States are divided by
+    `scale` (n,).
     """
 
     mean: Floats
@@ -59,6 +61,7 @@ class _Affine:
     peers: int
     sites: tuple[int, ...]
     held: tuple[range, ...]
+    scale: Floats
 
 
 def tagged_radius(
@@ -75,12 +78,64 @@ def tagged_radius(
     orders
         How many tags there are at most, one after another.
     """
-    found = frames(
-        *(system, prepared, first),
-        lambda count: np.concatenate([np.zeros((1, count), int), np.eye(count, dtype=int)]),
-    )
+    found = frames(*(system, prepared, first), _alone)
     affine = _affine(found)
     return [_radius(affine, order) for order in orders]
+
+
+def tagged_moments(
+    system: CompiledSystem, prepared: Prepared, first: Fraction, order: int, *, told: Hearing, drawn: range
+) -> tuple[Frames, Floats] | None:
+    """Return the second moments (n, n) of a long run, motions that nothing holds back projected out.
+
+    They come with the frames whose states they are of; None where they are not found.
+
+    Parameters
+    ----------
+    system, prepared, first
+        As for `tagged_radius`.
+    order
+        How many tags there are at most.
+    told
+        The peers.
+    drawn
+        Which states of each peer are of variance 1 as a frame begins, by chance of their own, and forgotten.
+    """
+    found = frames(*(system, prepared, first), _alone, told=told)
+    of = _affine(found)
+    n, peers = len(of.mean), of.peers
+    pushes = np.array([start + state for start in found.sites[:-1] for state in drawn])
+    rest, fewer = np.delete(np.arange(n), pushes), len(drawn)
+    added = np.zeros((n, n))
+    added[pushes, pushes] = of.scale[pushes] ** -2.0
+    whole = _tagged(of, min(order, len(of.arcs)))
+    after = _step(whole, whole.shortened(np.stack([added * (not one) for one in whole.sets])))[whole.entries]
+    # What is drawn anew is there for a frame: all that lasts is over the other states.
+    inner = replace(
+        of,
+        mean=of.mean[np.ix_(rest, rest)],
+        enters=of.enters[:, rest],
+        misses=of.misses[..., rest],
+        sites=tuple(start - place * fewer for place, start in enumerate(of.sites)),
+        held=tuple(range(one.start - peers * fewer, one.stop - peers * fewer) for one in of.held),
+    )
+    tags = replace(
+        whole,
+        of=inner,
+        entries=(entries := _orbits(inner, whole.sets)),
+        many=np.bincount(entries.ravel()),
+        columns=np.array([np.argsort(_states(inner, one)) for one in whole.permutations]),
+    )
+    lasting = settled(partial(_step, tags), tags.shortened(after[:, rest[:, None], rest]))
+    if lasting is None:
+        return None
+    added[np.ix_(rest, rest)] = lasting[tags.entries[0]]
+    return found, added * np.outer(of.scale, of.scale)
+
+
+def _alone(channels: int) -> NDArray[np.int64]:
+    """Return the patterns in which no packet is lost, and each one's alone (C + 1, C)."""
+    return np.concatenate([np.zeros((1, channels), np.int64), np.eye(channels, dtype=np.int64)])
 
 
 def _affine(found: Frames) -> _Affine:
@@ -120,6 +175,7 @@ def _affine(found: Frames) -> _Affine:
         peers=peers,
         sites=found.sites,
         held=held,
+        scale=scale,
     )
 
 
@@ -146,8 +202,8 @@ class _Tagged:
 
     `entries` (sets, n, n) numbers the entries of each set's matrix, those alike once; `many` counts them.
     What a channel's state tags of F X (`first`: set, channel), of rows (`origin`: set, channel, whose columns
-    stand as `columns` says), and two channels' of F X Fᵀ (`second`: set, channel, channel), follow from those
-    of the sets that stand for them: sparse matrices.
+    stand as `columns` says, for each of the `permutations` of peers), and two channels' of F X Fᵀ (`second`:
+    set, channel, channel), follow from those of the sets that stand for them: sparse matrices.
     """
 
     of: _Affine
@@ -156,6 +212,7 @@ class _Tagged:
     many: Integers
     first: Any  # scipy.sparse.csr_matrix
     origin: Integers
+    permutations: tuple[tuple[int, ...], ...]
     columns: Integers
     second: Any  # scipy.sparse.csr_matrix
 
@@ -250,6 +307,7 @@ def _tagged(of: _Affine, order: int) -> _Tagged:
         many=np.bincount(entries.ravel()),
         first=_sparse(first, len(sets) * count, len(origin)),
         origin=np.array(origin, np.intp),
+        permutations=tuple(permutations),
         columns=np.array([np.argsort(_states(of, peers)) for peers in permutations]),
         second=_sparse(second, len(sets) * count**2, len(sets) * count**2),
     )

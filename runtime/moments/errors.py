@@ -1,7 +1,7 @@
 """How far copies are from each other while hands push at random, over the network as it is.
 
 Takes: a scene that is stable in mean square, and how its second moments move (`crowd`, `patterns`).
-Gives: `Told`; `crowd_error`, `standing_error`, `pattern_error`.
+Gives: `Told`; `crowd_error`, `standing_error`, `pattern_error`, `tagged_error`.
 Guarantees: a value whose digits rounding leaves in doubt is none.
 Does not: say whether the scene is stable (see `network`).
 
@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.modes import dense_loop
-from apc.eigen.relative import Relative
+from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
+from apc.moments.bursts import tagged_moments
 from apc.moments.crowd import crowd, hearing, peer_classes
 from apc.moments.gains import Moments, around, gain, number_of, scaled, stein, units_of
 from apc.moments.hands import Copy, Peer, forced
@@ -54,12 +55,13 @@ APART = 1e-9
 
 NO_COPIES = "no position of a mass is told to others"
 IN_DOUBT = "rounding leaves its digits in doubt"
+NO_END = "its iteration did not come to an end"
 DRIFTING = "nothing holds the copies together: what they differ by grows for ever"
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """The largest error of copies in m; or None, and `why`."""
+    """The largest error of copies in m; or None, and `why`. Of an estimate `why` says what it leaves out."""
 
     metres: float | None
     why: str = ""
@@ -196,8 +198,43 @@ def pattern_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -
         drawn[start + np.array(one.got.drawn, np.intp)] = 1.0
     moments = resting_moments(of, np.diag(drawn[of.at.rest]))
     if moments is None:
-        return Told(None, "its iteration did not come to an end")
+        return Told(None, NO_END)
     return _largest([_Spread(None, of.at, found.sites, RADII.exact(moments))], classes)
+
+
+def tagged_error(system: CompiledSystem, prepared: Prepared, first: Fraction, orders: Sequence[int]) -> Told:
+    """Return the largest error of copies, or why there is none: bursts between equal peers, tag by tag.
+
+    Parameters
+    ----------
+    system, prepared, first
+        As for `standing_error`.
+    orders
+        How many tags there are at most; of two, what the last gives is an estimate.
+    """
+    pushed = forced(system, hearing(system, prepared, first=first, stand_in=True), first)
+    if isinstance(pushed, str):
+        return Told(None, pushed)
+    (got,) = {id(one): one for one in pushed.peers.values()}.values()
+    classes = [_Class(1, got)] * system.peers
+    told = Told(None, "")
+    before: list[float] = []
+    for order in orders:
+        found = tagged_moments(system, prepared, first, order, told=pushed.told, drawn=got.drawn)
+        if found is None:
+            return Told(None, NO_END)
+        at = relative_coordinates(found[0].basis)
+        take = np.zeros((len(at.rest), len(found[1])))
+        take[np.arange(len(at.rest)), at.rest], take[:, at.held] = 1.0, -at.weights
+        inner = RADII.exact(take @ found[1] @ take.T)
+        told = _largest([_Spread(None, at, found[0].sites, inner)], classes)
+        if told.metres is None:
+            return told
+        before.append(told.metres)
+    if len(orders) == 1:
+        return told
+    note = f"an estimate: moments of at most {orders[1]} channels' states together; with {orders[0]} it is "
+    return Told(before[-1], f"{note}{before[0]:.9g} m")
 
 
 def _pushed(

@@ -24,7 +24,7 @@ from apc.frame.parameters import resolve
 from apc.moments.almost_sure import AlmostSure, almost_sure, unplayed
 from apc.moments.bursts import tagged_radius
 from apc.moments.crowd import crowd
-from apc.moments.errors import Told, crowd_error, pattern_error, standing_error
+from apc.moments.errors import Told, crowd_error, pattern_error, standing_error, tagged_error
 from apc.moments.gains import gain, mean_square_radius
 from apc.moments.memory import is_memoryless
 from apc.moments.patterns import MOST_CHANNELS, pattern_radius, patterns
@@ -164,12 +164,10 @@ def _by_patterns(
     sure = all(law.one_minus_h == 1 and law.one_minus_k == 0 for _, law in lossy)
     alike = len(system.groups) == 1 and not system.groups[0].columns and len(lossy) == 1
     complete = all(link.graph.shape == "complete" for link in system.links)
-    errors = partial(pattern_error, system, prepared, first)
-    if channels > MOST_CHANNELS:
-        errors = partial(Told, None, f"it is not worked out for bursts on {channels} ways")
     if holding == {True} and sure and len(laws) == 1 and alike and complete and system.peers <= MOST_TAGGED:
         if system.peers <= EXACTLY_TAGGED:
             (radius,) = tagged_radius(system, prepared, first, (channels,))
+            errors = partial(tagged_error, system, prepared, first, (channels,))
             return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True, errors=errors)
         rough, radius = tagged_radius(system, prepared, first, ORDERS)
         note = (
@@ -177,12 +175,14 @@ def _by_patterns(
             f"radius is {rough:.9g}"
         )
         low, high = radius - abs(radius - rough), radius + abs(radius - rough)
+        errors = partial(tagged_error, system, prepared, first, ORDERS)
         return Growth(radius, low, high, False, note=note, errors=errors)
     if channels > MOST_CHANNELS:
         what = "bursts" if not all(is_memoryless(law) for _, law in lossy) else "values that stand in"
         why = f"{what} on {channels} ways between different peers; {MOST_CHANNELS} are the most that are followed"
         return Growth(np.nan, 0.0, np.inf, False, why)
     radius = pattern_radius(patterns(system, prepared, first))
+    errors = partial(pattern_error, system, prepared, first)
     return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True, errors=errors)
 
 

@@ -36,7 +36,7 @@ from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import Selected, Way
-from apc.moments.crowd import hearing, own_value, peer_classes, remembered_of, standing_motions
+from apc.moments.crowd import Hearing, hearing, own_value, peer_classes, remembered_of, standing_motions
 from apc.moments.gains import Gain, around, number_of, of_kind, scaled, stein
 from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
 from apc.network.channel import channel_law
