@@ -77,7 +77,13 @@ HOUSE = (
         contact_modes
         """,
     ),
-    ("apc.moments", "memory mean_loops gains crowd held peak worst almost_sure"),
+    (
+        "apc.moments",
+        """
+        memory mean_loops gains crowd held peak worst almost_sure stand_in patterns bursts traces
+        hands errors network
+        """,
+    ),
     (
         "apc.vary",
         """

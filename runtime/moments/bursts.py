@@ -1,7 +1,7 @@
 """Second moments under bursts of losses, tag by tag: exact for few channels, an estimate for many.
 
 Takes: a scene of equal peers that all hear each other, or any few, whose receivers hold what they miss.
-Gives: `tagged_radius`.
+Gives: `tagged_radius`, `tagged_moments`.
 Guarantees: with as many tags as there are channels it is exact but for rounding; with fewer, an estimate.
 Does not: bound its rounding, or what fewer tags leave out.
 
@@ -18,9 +18,11 @@ entries of it that permutations of the set to itself exchange are one number.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +31,8 @@ from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import relative_places
-from apc.moments.patterns import Frames, frames
+from apc.moments.crowd import Hearing
+from apc.moments.patterns import Frames, frames, largest, settled
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
@@ -38,16 +41,15 @@ Integers = NDArray[np.intp]
 # An arc of who hears whom: (receiver, sender).
 Arc = tuple[int, int]
 Tags = tuple[Arc, ...]
-
-# Up to so many numbers, a matrix of moments is written out.
-FEW = 400
+Terms = list[tuple[float, Tags]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Affine:
     """A frame as it is affine in the channels' states: A, and U_c F_c of each (C, n, m), (C, m, n).
 
-    `chance` is that of a bad state, `last` how much of it is left a frame later.
+    `chance` is that of a bad state, `last` how much of it is left a frame later. States are divided by
+    `scale` (n,).
     """
 
     mean: Floats
@@ -59,6 +61,7 @@ class _Affine:
     peers: int
     sites: tuple[int, ...]
     held: tuple[range, ...]
+    scale: Floats
 
 
 def tagged_radius(
@@ -75,12 +78,64 @@ def tagged_radius(
     orders
         How many tags there are at most, one after another.
     """
-    found = frames(
-        *(system, prepared, first),
-        lambda count: np.concatenate([np.zeros((1, count), int), np.eye(count, dtype=int)]),
-    )
+    found = frames(*(system, prepared, first), _alone)
     affine = _affine(found)
     return [_radius(affine, order) for order in orders]
+
+
+def tagged_moments(
+    system: CompiledSystem, prepared: Prepared, first: Fraction, order: int, *, told: Hearing, drawn: range
+) -> tuple[Frames, Floats] | None:
+    """Return the second moments (n, n) of a long run, motions that nothing holds back projected out.
+
+    They come with the frames whose states they are of; None where they are not found.
+
+    Parameters
+    ----------
+    system, prepared, first
+        As for `tagged_radius`.
+    order
+        How many tags there are at most.
+    told
+        The peers.
+    drawn
+        Which states of each peer are of variance 1 as a frame begins, by chance of their own, and forgotten.
+    """
+    found = frames(*(system, prepared, first), _alone, told=told)
+    of = _affine(found)
+    n, peers = len(of.mean), of.peers
+    pushes = np.array([start + state for start in found.sites[:-1] for state in drawn])
+    rest, fewer = np.delete(np.arange(n), pushes), len(drawn)
+    added = np.zeros((n, n))
+    added[pushes, pushes] = of.scale[pushes] ** -2.0
+    whole = _tagged(of, min(order, len(of.arcs)))
+    after = _step(whole, whole.shortened(np.stack([added * (not one) for one in whole.sets])))[whole.entries]
+    # What is drawn anew is there for a frame: all that lasts is over the other states.
+    inner = replace(
+        of,
+        mean=of.mean[np.ix_(rest, rest)],
+        enters=of.enters[:, rest],
+        misses=of.misses[..., rest],
+        sites=tuple(start - place * fewer for place, start in enumerate(of.sites)),
+        held=tuple(range(one.start - peers * fewer, one.stop - peers * fewer) for one in of.held),
+    )
+    tags = replace(
+        whole,
+        of=inner,
+        entries=(entries := _orbits(inner, whole.sets)),
+        many=np.bincount(entries.ravel()),
+        columns=np.array([np.argsort(_states(inner, one)) for one in whole.permutations]),
+    )
+    lasting = settled(partial(_step, tags), tags.shortened(after[:, rest[:, None], rest]))
+    if lasting is None:
+        return None
+    added[np.ix_(rest, rest)] = lasting[tags.entries[0]]
+    return found, added * np.outer(of.scale, of.scale)
+
+
+def _alone(channels: int) -> NDArray[np.int64]:
+    """Return the patterns in which no packet is lost, and each one's alone (C + 1, C)."""
+    return np.concatenate([np.zeros((1, channels), np.int64), np.eye(channels, dtype=np.int64)])
 
 
 def _affine(found: Frames) -> _Affine:
@@ -120,6 +175,7 @@ def _affine(found: Frames) -> _Affine:
         peers=peers,
         sites=found.sites,
         held=held,
+        scale=scale,
     )
 
 
@@ -135,172 +191,191 @@ def _alike(scale: Floats, found: Frames, held: Sequence[range]) -> Floats:
 
 def _radius(of: _Affine, order: int) -> float:
     """Return the largest eigenvalue of all moments of so many tags at most."""
-    tags = _Tagged(of, min(order, len(of.arcs)))
-    start = tags.shortened(np.stack([np.eye(len(of.mean)) * (not one) for one in tags.sets]))
-    if tags.size <= FEW:
-        matrix = np.array([tags.step(column) for column in np.eye(tags.size)]).T
-        return float(np.linalg.eigvals(matrix).real.max())
-    linalg = load_pool("scipy.sparse.linalg")
-    operator = linalg.LinearOperator((tags.size, tags.size), matvec=tags.step, dtype=np.float64)
-    values = linalg.eigs(operator, k=1, which="LR", v0=start, return_eigenvectors=False, tol=1e-13, ncv=40)
-    return float(values.real.max())
+    tags = _tagged(of, min(order, len(of.arcs)))
+    start = np.stack([np.eye(len(of.mean)) * (not one) for one in tags.sets])
+    return largest(partial(_step, tags), tags.shortened(start))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Tagged:
-    """Moments tagged by sets of channels, one of those that permutations take to each other."""
+    """Moments tagged by sets of channels, one of those that permutations take to each other.
 
-    def __init__(self, of: _Affine, order: int) -> None:
-        """Find the sets, and what each one's moments follow from."""
-        self.of, self.order = of, order
-        self.number = {arc: place for place, arc in enumerate(of.arcs)}
-        self._known: dict[Tags, tuple[Tags, tuple[int, ...]]] = {}
-        found = dict.fromkeys([()])
-        for size in range(1, order + 1):  # each larger set is a smaller one with an arc more
-            smaller = [one for one in found if len(one) == size - 1]
-            for one in smaller:
-                for arc in of.arcs:
-                    if arc not in one:
-                        found.setdefault(self._canonical(tuple(sorted((*one, arc))))[0])
-        self.sets: list[Tags] = list(found)
-        self._place = {one: place for place, one in enumerate(self.sets)}
-        self._orbits()
-        self._neighbours()
+    `entries` (sets, n, n) numbers the entries of each set's matrix, those alike once; `many` counts them.
+    What a channel's state tags of F X (`first`: set, channel), of rows (`origin`: set, channel, whose columns
+    stand as `columns` says, for each of the `permutations` of peers), and two channels' of F X Fᵀ (`second`:
+    set, channel, channel), follow from those of the sets that stand for them: sparse matrices.
+    """
 
-    def _canonical(self, tags: Tags) -> tuple[Tags, tuple[int, ...]]:
-        """Return the set that stands for all like it, and the permutation that takes that one to this."""
-        if tags not in self._known:
-            touched = sorted({peer for arc in tags for peer in arc})
-            rest = [peer for peer in range(self.of.peers) if peer not in touched]
-            best: tuple[Tags, tuple[int, ...]] | None = None
-            for chosen in itertools.permutations(touched):
-                label = {peer: place for place, peer in enumerate(chosen)}
-                renamed = tuple(sorted((label[g], label[h]) for g, h in tags))
-                if best is None or renamed < best[0]:
-                    best = renamed, (*chosen, *rest)
-            assert best is not None
-            self._known[tags] = best
-        return self._known[tags]
-
-    def _orbits(self) -> None:
-        """Number the entries of each set's matrix, those alike that the set's own permutations exchange."""
-        n = len(self.of.mean)
-        self.entries = np.zeros((len(self.sets), n, n), np.intp)
-        first = 0
-        sparse = load_pool("scipy.sparse")
-        graph = load_pool("scipy.sparse.csgraph")
-        every = np.arange(n * n).reshape(n, n)
-        for place, tags in enumerate(self.sets):
-            touched = sorted({peer for arc in tags for peer in arc})
-            rest = [peer for peer in range(self.of.peers) if peer not in touched]
-            moves = [every.T]
-            for chosen in itertools.permutations(touched):
-                label = dict(zip(touched, chosen, strict=True))
-                if tuple(sorted((label[g], label[h]) for g, h in tags)) == tags and touched:
-                    moves.append(self._moved(every, [label.get(peer, peer) for peer in range(self.of.peers)]))
-            for one, other in itertools.pairwise(rest):
-                swapped = list(range(self.of.peers))
-                swapped[one], swapped[other] = other, one
-                moves.append(self._moved(every, swapped))
-            rows = np.concatenate([every.ravel()] * len(moves))
-            columns = np.concatenate([move.ravel() for move in moves])
-            links = sparse.coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(n * n, n * n))
-            count, labels = graph.connected_components(links, directed=False)
-            self.entries[place] = first + labels.reshape(n, n)
-            first += count
-        self.size = first
-        self.many = np.bincount(self.entries.ravel(), minlength=first)
-
-    def states(self, peers: Sequence[int]) -> Integers:
-        """Return which state comes from where when peer i becomes `peers[i]`: new[states] = old."""
-        of = self.of
-        found = np.zeros(len(of.mean), np.intp)
-        own = of.sites[1]
-        for peer, to in enumerate(peers):
-            found[of.sites[peer] : of.sites[peer] + own] = of.sites[to] + np.arange(own)
-        for place, (g, h) in enumerate(of.arcs):
-            found[list(of.held[place])] = list(of.held[self.number[peers[g], peers[h]]])
-        return found
-
-    def _moved(self, every: Integers, peers: Sequence[int]) -> Integers:
-        to = self.states(peers)
-        return every[np.ix_(to, to)]
-
-    def _neighbours(self) -> None:
-        """Find, of each set and channel, which sets' moments its tagged ones are."""
-        of, count = self.of, len(self.of.arcs)
-        kappa = (1 - 2 * of.chance) / np.sqrt(of.chance * (1 - of.chance))
-        single: list[list[tuple[float, Tags]]] = []
-        rows: list[tuple[int, int, float, Tags]] = []
-        pairs: list[tuple[int, int, int, float, Tags]] = []
-
-        def tagged(tags: Tags, arc: Arc) -> list[tuple[float, Tags]]:
-            if arc in tags:
-                return [(1.0, tuple(one for one in tags if one != arc)), (kappa, tags)]
-            return [(1.0, tuple(sorted((*tags, arc))))]
-
-        for place, tags in enumerate(self.sets):
-            for c, arc in enumerate(of.arcs):
-                own = tagged(tags, arc)
-                rows += [(place, c, factor, one) for factor, one in own if len(one) <= self.order]
-                for d, other in enumerate(of.arcs):
-                    if d == c:
-                        both = [(1.0, tags), *((kappa * factor, one) for factor, one in own)]
-                    else:
-                        both = [(f * g, two) for f, one in own for g, two in tagged(one, other)]
-                    pairs += [(place, c, d, factor, one) for factor, one in both if len(one) <= self.order]
-        del single, count
-        self.rows = self._gathered([(place, c, c, factor, one) for place, c, factor, one in rows])
-        self.pairs = self._gathered(pairs)
-
-    def _gathered(
-        self, listed: Sequence[tuple[int, int, int, float, Tags]]
-    ) -> tuple[Integers, Floats, Integers]:
-        """Return where terms belong (place, c, d), their factors, and where they come from (place, c, d, how)."""
-        perms: dict[tuple[int, ...], int] = getattr(self, "perms", {})
-        self.perms = perms
-        to, factors, origin = [], [], []
-        for place, c, d, factor, tags in listed:
-            stands, peers = self._canonical(tags)
-            back = {peer: label for label, peer in enumerate(peers)}
-            of = [self.number[back[self.of.arcs[one][0]], back[self.of.arcs[one][1]]] for one in (c, d)]
-            to.append((place, c, d))
-            factors.append(factor)
-            origin.append((self._place[stands], *of, perms.setdefault(peers, len(perms))))
-        return np.array(to, np.intp), np.array(factors), np.array(origin, np.intp)
+    of: _Affine
+    sets: tuple[Tags, ...]
+    entries: Integers
+    many: Integers
+    first: Any  # scipy.sparse.csr_matrix
+    origin: Integers
+    permutations: tuple[tuple[int, ...], ...]
+    columns: Integers
+    second: Any  # scipy.sparse.csr_matrix
 
     def shortened(self, moments: Floats) -> Floats:
         """Return each number once: the mean of the entries it stands for."""
-        return np.bincount(self.entries.ravel(), moments.ravel(), minlength=self.size) / self.many
+        size = len(self.many)
+        found = np.bincount(self.entries.ravel(), moments.ravel(), minlength=size) / self.many
+        return np.asarray(found)
 
-    def step(self, numbers: Floats) -> Floats:
-        """Return all moments a frame later."""
-        of = self.of
-        moments = numbers[self.entries]
-        count, n = len(of.arcs), len(of.mean)
-        width = of.misses.shape[1]
-        sigma = np.sqrt(of.chance * (1 - of.chance))
-        flat = of.misses.reshape(count * width, n)
-        missed = (flat @ moments).reshape(len(moments), count, width, n)  # F X
-        both = np.einsum("scwn,dvn->scdwv", missed, of.misses)
-        to, factors, origin = self.rows
-        if not hasattr(self, "columns"):
-            self.columns = np.array([np.argsort(self.states(peers)) for peers in self.perms])
-        forms = np.zeros((len(moments), count, width, n))
-        values = np.take_along_axis(
-            missed[origin[:, 0], origin[:, 1]], self.columns[origin[:, 3]][:, None, :], axis=-1
-        )
-        np.add.at(forms, (to[:, 0], to[:, 1]), factors[:, None, None] * values)
-        to, factors, origin = self.pairs
-        squares = np.zeros((len(moments), count, count, width, width))
-        np.add.at(
-            squares,
-            (to[:, 0], to[:, 1], to[:, 2]),
-            factors[:, None, None] * both[origin[:, 0], origin[:, 1], origin[:, 2]],
-        )
-        enters = of.enters.transpose(1, 0, 2).reshape(n, count * width)
-        crossed = enters @ (forms.reshape(len(moments), count * width, n) @ of.mean.T)
-        squares = squares.transpose(0, 1, 3, 2, 4).reshape(len(moments), count * width, count * width)
-        moved = of.mean @ moments @ of.mean.T
-        moved += sigma * (crossed + crossed.transpose(0, 2, 1)) + sigma**2 * (enters @ squares @ enters.T)
-        decays = np.array([of.last ** len(one) for one in self.sets])
-        return self.shortened(decays[:, None, None] * moved)
+
+class _Names:
+    """What stands for each set of tags, and the permutation that takes that one to it; remembered."""
+
+    def __init__(self, peers: int) -> None:
+        """Start with nothing remembered."""
+        self.peers = peers
+        self._known: dict[Tags, tuple[Tags, tuple[int, ...]]] = {}
+
+    def of(self, tags: Tags) -> tuple[Tags, tuple[int, ...]]:
+        """Return the set that stands for all like it, and the peers that its peers 0, 1, … are in this one."""
+        if tags not in self._known:
+            touched, rest = _touched(tags, self.peers)
+            renamed = (
+                (_renamed(tags, {peer: place for place, peer in enumerate(chosen)}), (*chosen, *rest))
+                for chosen in itertools.permutations(touched)
+            )
+            self._known[tags] = min(renamed)
+        return self._known[tags]
+
+
+def _touched(tags: Tags, peers: int) -> tuple[list[int], list[int]]:
+    """Return the peers that tags name, and the rest."""
+    touched = sorted({peer for arc in tags for peer in arc})
+    return touched, [peer for peer in range(peers) if peer not in touched]
+
+
+def _renamed(tags: Tags, label: Mapping[int, int]) -> Tags:
+    return tuple(sorted((label[g], label[h]) for g, h in tags))
+
+
+def _tagged(of: _Affine, order: int) -> _Tagged:
+    """Find the sets of so many tags at most, and what each one's moments follow from."""
+    names = _Names(of.peers)
+    layers: list[dict[Tags, None]] = [{(): None}]
+    for _ in range(order):  # each larger set is a smaller one with an arc more
+        larger = ((*one, arc) for one in layers[-1] for arc in of.arcs if arc not in one)
+        layers.append(dict.fromkeys(names.of(tuple(sorted(tags)))[0] for tags in larger))
+    sets = tuple(one for layer in layers for one in layer)
+    entries = _orbits(of, sets)
+    kappa = (1 - 2 * of.chance) / np.sqrt(of.chance * (1 - of.chance))
+
+    def times(terms: Terms, arc: Arc) -> Terms:
+        """Return what moments so tagged are, tagged by an arc more."""
+        found = []
+        for factor, tags in terms:
+            if arc in tags:
+                found += [(factor, tuple(one for one in tags if one != arc)), (factor * kappa, tags)]
+            else:
+                found.append((factor, tuple(sorted((*tags, arc)))))
+        return found
+
+    place = {one: number for number, one in enumerate(sets)}
+    number = {arc: c for c, arc in enumerate(of.arcs)}
+    count = len(of.arcs)
+    permutations: dict[tuple[int, ...], int] = {}
+    origin: list[tuple[int, int, int]] = []
+    first: list[tuple[float, int, int]] = []
+    second: list[tuple[float, int, int]] = []
+    for s, tags in enumerate(sets):
+        for c, arc in enumerate(of.arcs):
+            once = times([(1.0, tags)], arc)
+            for factor, one in once:
+                if len(one) <= order:
+                    stands, peers = names.of(one)
+                    (own,) = _renamed((arc,), {peer: label for label, peer in enumerate(peers)})
+                    first.append((factor, s * count + c, len(origin)))
+                    origin.append(
+                        (place[stands], number[own], permutations.setdefault(peers, len(permutations)))
+                    )
+            for d, other in enumerate(of.arcs):
+                for factor, one in times(once, other):
+                    if len(one) <= order:
+                        stands, peers = names.of(one)
+                        label = {peer: name for name, peer in enumerate(peers)}
+                        to = [number[label[g], label[h]] for g, h in (arc, other)]
+                        source = (place[stands] * count + to[0]) * count + to[1]
+                        second.append((factor, (s * count + c) * count + d, source))
+    return _Tagged(
+        of=of,
+        sets=sets,
+        entries=entries,
+        many=np.bincount(entries.ravel()),
+        first=_sparse(first, len(sets) * count, len(origin)),
+        origin=np.array(origin, np.intp),
+        permutations=tuple(permutations),
+        columns=np.array([np.argsort(_states(of, peers)) for peers in permutations]),
+        second=_sparse(second, len(sets) * count**2, len(sets) * count**2),
+    )
+
+
+def _sparse(terms: Sequence[tuple[float, int, int]], rows: int, columns: int) -> Any:
+    """Return a sparse matrix of (entry, row, column)."""
+    entries, row, column = zip(*terms, strict=True)
+    return load_pool("scipy.sparse").csr_matrix((entries, (row, column)), shape=(rows, columns))
+
+
+def _orbits(of: _Affine, sets: Sequence[Tags]) -> Integers:
+    """Number the entries of each set's matrix, those alike that the set's own permutations exchange."""
+    sparse, graph = load_pool("scipy.sparse"), load_pool("scipy.sparse.csgraph")
+    n, first = len(of.mean), 0
+    found = np.zeros((len(sets), n, n), np.intp)
+    every = np.arange(n * n).reshape(n, n)
+    for place, tags in enumerate(sets):
+        touched, rest = _touched(tags, of.peers)
+        moves = [every.T]
+        changes = [
+            label
+            for chosen in itertools.permutations(touched)
+            if _renamed(tags, label := dict(zip(touched, chosen, strict=True))) == tags
+        ]
+        changes += [{one: other, other: one} for one, other in itertools.pairwise(rest)]
+        for change in changes:
+            to = _states(of, [change.get(peer, peer) for peer in range(of.peers)])
+            moves.append(every[np.ix_(to, to)])
+        rows = np.concatenate([every.ravel()] * len(moves))
+        columns = np.concatenate([move.ravel() for move in moves])
+        alike = sparse.coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(n * n, n * n))
+        count, labels = graph.connected_components(alike, directed=False)
+        found[place] = first + labels.reshape(n, n)
+        first += count
+    return found
+
+
+def _states(of: _Affine, peers: Sequence[int]) -> Integers:
+    """Return which state comes from where when peer i becomes `peers[i]`: new[states] = old."""
+    found = np.zeros(len(of.mean), np.intp)
+    number = {arc: place for place, arc in enumerate(of.arcs)}
+    own = of.sites[1]
+    for peer, to in enumerate(peers):
+        found[of.sites[peer] : of.sites[peer] + own] = of.sites[to] + np.arange(own)
+    for place, (g, h) in enumerate(of.arcs):
+        found[list(of.held[place])] = list(of.held[number[peers[g], peers[h]]])
+    return found
+
+
+def _step(tags: _Tagged, numbers: Floats) -> Floats:
+    """Return all moments a frame later."""
+    of = tags.of
+    moments = numbers[tags.entries]
+    many, (count, width, n) = len(moments), of.misses.shape
+    sigma = np.sqrt(of.chance * (1 - of.chance))
+    flat = of.misses.reshape(count * width, n)
+    missed = flat @ moments  # F X
+    both = (missed @ flat.T).reshape(many, count, width, count, width).transpose(0, 1, 3, 2, 4)
+    rows = missed.reshape(many, count, width, n)[tags.origin[:, 0], tags.origin[:, 1]]
+    rows = np.take_along_axis(rows, tags.columns[tags.origin[:, 2]][:, None, :], axis=-1)
+    forms = (tags.first @ rows.reshape(len(rows), width * n)).reshape(many, count * width, n)
+    squares = tags.second @ both.reshape(many * count**2, width**2)
+    squares = squares.reshape(many, count, count, width, width).transpose(0, 1, 3, 2, 4)
+    squares = squares.reshape(many, count * width, count * width)
+    enters = of.enters.transpose(1, 0, 2).reshape(n, count * width)
+    crossed = enters @ (forms @ of.mean.T)
+    moved = of.mean @ moments @ of.mean.T
+    moved += sigma * (crossed + crossed.transpose(0, 2, 1)) + sigma**2 * (enters @ squares @ enters.T)
+    decays = np.array([of.last ** len(one) for one in tags.sets])
+    return tags.shortened(decays[:, None, None] * moved)

@@ -37,6 +37,7 @@ from apc.network.channel import ChannelLaw, channel_law
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
+Flags = NDArray[np.bool_]
 
 # A link on which every packet takes the nominal delay.
 PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
@@ -123,7 +124,7 @@ def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
     )
 
 
-def crowd(system: CompiledSystem, prepared: Prepared) -> Moments:
+def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = None) -> Moments:
     """Make the mean loops of a scene and the luck that drives them.
 
     Parameters
@@ -132,8 +133,10 @@ def crowd(system: CompiledSystem, prepared: Prepared) -> Moments:
         The compiled scene, with the numbers to analyse.
     prepared
         From `analysis.prepare`, of this system with any numbers.
+    told
+        Its peers, where they are not those of `hearing`.
     """
-    told = hearing(system, prepared)
+    told = told or hearing(system, prepared)
     loops, weights = peer_classes(told)
     common = loops[0]
     remembered = {one.route: one for one in remembered_of(system, told, common)}
@@ -228,7 +231,7 @@ def remembered_of(
     """
     heard: dict[Route, list[Selected]] = {}
     for site, rows in zip(common.sites, told.of(common), strict=True):
-        felt = site.lifted.q.any(axis=0) | site.lifted.d.any(axis=0)
+        felt: Flags = np.any(site.lifted.q, axis=0) | np.any(site.lifted.d, axis=0)
         for place, row in enumerate(rows):
             if felt[place] and not row.gap:
                 heard.setdefault((row.way.link, row.way.delay), []).append(row)

@@ -2,7 +2,7 @@
 
 Takes: the mean loops of a scene and what the luck of its channels does to them.
 Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `stein`, `around`, `scaled`,
-`of_kind`, `number_of`.
+`of_kind`, `number_of`, `units_of`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd`).
 
@@ -39,14 +39,17 @@ NOTHING = 1e-24
 # Doublings until a sum counts as endless, 2^60 frames; or where what is doubled has grown to this.
 DOUBLINGS, ENDLESS = 60, 1e100
 
-# Steps towards the radius; secants need some six. The first is so near above the means' own growth.
+# Steps towards the radius; secants need some ten. The first is so near above the means' own growth.
 STEPS, NEAR = 60, 1e-9
 
-# Where G is first looked for to be small, beside the means' own growth or this; and how near 1 is near enough.
-LEAST, FARTHER, CLOSE = 1e-3, 1.1, 1e-14
+# How far above the means' own growth, or this, G is first looked for to be small, and how much farther each time.
+LEAST, FIRST_GAP, WIDER = 1e-3, 1e-3, 30
+
+# How near 1 is near enough; and as far from it, slopes are not rounding.
+CLOSE, ROUGH = 1e-13, 1e-6
 
 # How near it is enclosed at first, relatively, and how much farther at last.
-FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
+FIRST_WIDTH, LAST_WIDTH = 1e-11, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +165,7 @@ def gain(of: Moments, growth: float, numbers: Arithmetic = FLOATS) -> Matrix | N
     for part in of.parts:
         for d, channel in part.channels.items():
             kind = of.luck[d]
-            covariances = of_kind(RADII.exact(_units(kind)), numbers)
+            covariances = of_kind(RADII.exact(units_of(kind)), numbers)
             driven = scaled(around(of_kind(channel.driven, numbers), covariances, numbers), shrink, numbers)
             moments = stein(scaled(of_kind(channel.matrix, numbers), root, numbers), driven, numbers)
             if moments is None:
@@ -211,7 +214,7 @@ class _Answer:
         return numbers.add(late, around(left[..., n:], self.covariances, numbers, right[..., n:]))
 
 
-def _units(kind: Luck) -> Floats:
+def units_of(kind: Luck) -> Floats:
     """Return a unit of each entry of its covariances, over the luck of all slots (b, k, k)."""
     sizes = [spread.shape[-1] for spread in kind.spreads]
     starts = np.cumsum([0, *sizes])
@@ -250,28 +253,36 @@ def mean_square_radius(means: tuple[float, float], of: Gain | None) -> Enclosed:
     square = (low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT))
     if of is None:
         return Enclosed(low * high, *square)
-    radius = _radius(of, max(high**2, np.finfo(np.float64).tiny))
-    if radius is None:
-        return Enclosed(low * high, *square)
-    width, below, above = FIRST_WIDTH, square[0], np.inf
-    while width <= LAST_WIDTH and not (np.isfinite(above) and below >= radius * (1 - width / 4)):
-        if not np.isfinite(above) and _compared(of, radius * (1 + width)) is False:
-            above = radius * (1 + width) * (1 + UNIT)
-        if radius * (1 - width) > below and _compared(of, radius * (1 - width)) is True:
-            below = radius * (1 - width) * (1 - UNIT)
-        if np.isfinite(above) and below >= radius * (1 - 1.01 * width):
-            break
+    least = max(high**2, np.finfo(np.float64).tiny)
+    found, steep = _radius(of, least)
+    radius = low * high if found is None else found
+    above, wide = np.inf, None
+    start, width = (least, NEAR) if found is None else (found, FIRST_WIDTH)
+    while width <= LAST_WIDTH and above > start * (1 + width):
+        bounds = _bounds(of, start * (1 + width))
+        if bounds is not None:
+            above = min(above, start * (1 + width) * max(bounds[1], 1.0) * (1 + 2 * UNIT))
+            wide = (bounds[1] - bounds[0]) / steep if wide is None else wide
+        width = max(8 * width, 0.0 if wide is None else wide)
+    below, width = square[0], FIRST_WIDTH if wide is None else max(wide, FIRST_WIDTH / 8)
+    while found is not None and width <= LAST_WIDTH and below < found * (1 - width):
+        bounds = _bounds(of, found * (1 - width))
+        if bounds is not None:
+            below = max(below, found * (1 - width) * min(bounds[0], 1.0) * (1 - 2 * UNIT))
         width *= 8
     return Enclosed(radius, min(below, radius), max(above, square[1], radius))
 
 
-def _compared(of: Gain, growth: float) -> bool | None:
-    """Say whether second moments grow faster than `growth`, None if that is open."""
+def _bounds(of: Gain, growth: float) -> tuple[float, float] | None:
+    """Return bounds on the largest eigenvalue of G(λ), None where there are none.
+
+    Of G, terms fall as 1/λ or faster: where it is ρ at λ, it is 1 between λ min(ρ, 1) and λ max(ρ, 1).
+    """
     matrix = of(growth, RADII)
     if matrix is None or not np.isfinite(matrix).all():
         return None
     _, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
-    return True if found.low > 1 else False if found.high < 1 else None
+    return found.low, found.high
 
 
 def _largest(of: Gain, growth: float) -> float:
@@ -283,33 +294,44 @@ def _largest(of: Gain, growth: float) -> float:
     return float(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0))
 
 
-def _radius(of: Gain, least: float) -> float | None:
+def _radius(of: Gain, least: float) -> tuple[float | None, float]:
     """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
 
-    1/G is followed, which is nearly straight where G has its pole: by secants between a point on either side,
-    the one that stays where it is counting half each time (the Illinois rule).
+    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. 1/G is followed, which is nearly straight
+    where G has its pole: by secants between a point on either side, one that stays twice counting half (the
+    Illinois rule).
     """
 
     def over(growth: float) -> float:
         return 1 / max(_largest(of, growth), np.finfo(np.float64).tiny) - 1
 
-    low, high = least * (1 + NEAR), max(least, LEAST) * FARTHER
-    at_low, at_high = over(low), over(high)
+    low, gap = least * (1 + NEAR), max(least, LEAST) * FIRST_GAP
+    at_low = over(low)
     if at_low > 0:
-        return None
+        return None, 1.0
+    high = low + gap
+    at_high = over(high)
     while at_high < 0:
-        low, at_low, high = high, at_high, 2 * high
+        low, at_low, gap = high, at_high, WIDER * gap
+        high = low + gap
         at_high = over(high)
     best, off = (low, -at_low) if -at_low < at_high else (high, at_high)
+    steep, stayed = max(1.0, best * (at_high - at_low) / (high - low)), 0
     for _ in range(STEPS):
         middle = low - at_low * (high - low) / (at_high - at_low)
-        if off <= CLOSE or not low < middle < high:
+        if off <= max(CLOSE, UNIT * steep) or not low < middle < high:
             break
         found = over(middle)
+        if found < 0:
+            slope = (found - at_low) / (middle - low)
+            low, at_low = middle, found
+            at_high, stayed = (at_high / 2, 1) if stayed == 1 else (at_high, 1)
+        else:
+            slope = (at_high - found) / (high - middle)
+            high, at_high = middle, found
+            at_low, stayed = (at_low / 2, -1) if stayed == -1 else (at_low, -1)
+        if off > ROUGH:
+            steep = max(1.0, middle * slope)
         if abs(found) < off:
             best, off = middle, abs(found)
-        if found < 0:
-            low, at_low, at_high = middle, found, at_high / 2
-        else:
-            high, at_high, at_low = middle, found, at_low / 2
-    return best
+    return best, steep

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.relative import relative_coordinates
+from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
@@ -83,11 +83,18 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class MeanLoop:
-    """A loop of means in relative coordinates: its `matrix` (2, n, n) with its radius."""
+    """A loop of means in relative coordinates: its `matrix` (2, n, n) with its radius.
+
+    `at` are these, of states that begin at `offsets`, site by site; `misses` are as those of a `Channel`, over
+    the loop's own states (2, k_slot, n).
+    """
 
     name: str
     multiplicity: int
     matrix: Matrix
+    at: Relative
+    offsets: tuple[int, ...]
+    misses: Mapping[tuple[int, Route, int], Matrix]
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,9 +194,9 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
                 if other is not one:
                     continue
                 held = over_all(one.followed.before[slot], place)
-                sent = np.zeros_like(held)
-                sent[0, :, n_m + row_of[Sent(one.route[0], channel, slot)]] = 1.0
-                rows.append(RADII.subtract(sent, held))
+                packet = np.zeros_like(held)
+                packet[0, :, n_m + row_of[Sent(one.route[0], channel, slot)]] = 1.0
+                rows.append(RADII.subtract(packet, held))
                 count += held.shape[-2]
             misses[one.route, slot] = slice(start, count)
     plainly = np.zeros((2, n_s, n_m + n_s))
@@ -207,14 +214,16 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
     names = [
         f"{channel} heard" for (_, channel), many in zip(numbers, counts, strict=True) for _ in range(many)
     ]
-    sent = {one: count + row for one, row in row_of.items()}
+    sent: dict[Sent, int] = {one: count + row for one, row in row_of.items()}
     return Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses, sent)
 
 
 @dataclass(frozen=True, slots=True)
 class _Apart:
-    """What a channel's memory is apart from its mean, over [δ, ξ]: `values`, by number and value; `kept`
-    those of the next frame; `misses` of each slot."""
+    """What a channel's memory is apart from its mean, over [δ, ξ].
+
+    `values` are by number and value, `kept` those of the next frame; `misses` are of each slot.
+    """
 
     values: Matrix
     kept: Matrix
@@ -283,8 +292,8 @@ def mean_loop(
         now, before = np.zeros((2, len(rows), starts[-1])), np.zeros((2, len(rows), firsts[-1]))
         for line, row in enumerate(rows):
             one = of_route.get((row.way.link, row.way.delay))
-            if one is None or row.channel not in one.channels:
-                continue
+            if one is None or row.gap or row.channel not in one.channels:
+                continue  # what is missed is held, and nothing stands in for it
             value = one.memory.heard[row.clock, row.tick]
             for h, weight in enumerate(loop.coupling[row.way][g]):
                 if weight:
@@ -293,9 +302,9 @@ def mean_loop(
             place = one.channels.index(row.channel) * len(one.memory.old) + value
             for channel, own, first in zip(listened, apart, firsts, strict=False):
                 if channel.site == g and channel.route == one.route and channel.weights.get(row.way):
-                    weight = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
+                    by = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
                     span = slice(first, first + own.values.shape[-1])
-                    before[:, line, span] = RADII.multiply(weight, own.values[:, place, None])[:, 0]
+                    before[:, line, span] = RADII.multiply(by, own.values[:, place, None])[:, 0]
         feedback.append(Feedback(now, before))
     closed = close([one.map for one in sites], feedback, layout, numbers=RADII)
     at = relative_coordinates(standing_state(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
@@ -304,6 +313,14 @@ def mean_loop(
     if len(at.held):
         weights = with_radius(at.weights, at.doubt)
         moved = RADII.subtract(moved, RADII.multiply(weights, closed.matrix[:, at.held]))
+
+    def missed(columns: NDArray[np.intp]) -> dict[tuple[int, Route, int], Matrix]:
+        return {
+            (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
+            for h, site in enumerate(sites)
+            for which, rows in site.misses.items()
+        }
+
     found = []
     for channel, own, first, last in zip(listened, apart, firsts, firsts[1:], strict=False):
         states = len(own.kept[0])
@@ -311,15 +328,11 @@ def mean_loop(
         matrix[:, :n, :n], matrix[:, :n, n:] = moved[..., rest], moved[..., first : first + states]
         matrix[:, n:, n:] = own.kept[..., :states]
         driven = np.concatenate([moved[..., first + states : last], own.kept[..., states:]], axis=-2)
-        columns = np.concatenate([rest, np.arange(first, last)])
-        misses = {
-            (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
-            for h, site in enumerate(sites)
-            for which, rows in site.misses.items()
-        }
+        misses = missed(np.concatenate([rest, np.arange(first, last)]))
         within = [np.concatenate([np.zeros((2, rows.shape[-2], n)), rows], axis=-1) for rows in own.misses]
         found.append(Channel(channel, matrix, driven, misses, tuple(within)))
-    return MeanLoop(loop.name, loop.multiplicity, moved[..., rest]), found
+    mean = MeanLoop(loop.name, loop.multiplicity, moved[..., rest], at, tuple(offsets), missed(rest))
+    return mean, found
 
 
 def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequence[int]) -> Floats:

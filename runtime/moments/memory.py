@@ -58,7 +58,7 @@ class Memory:
     @property
     def slots(self) -> int:
         """How many packets are sent in a frame."""
-        return self.chances.shape[1]
+        return int(self.chances.shape[1])
 
     def uncertain(self, slot: int) -> NDArray[np.intp]:
         """Return the values of which it is open whether a slot's packet takes their place."""
@@ -68,7 +68,7 @@ class Memory:
     def spread(self, slot: int) -> Floats:
         """Return the covariance (n, n) of whether a slot's packet takes the place of its uncertain values."""
         own = self.chances[self.uncertain(slot), slot]
-        return np.minimum.outer(own, own) - np.outer(own, own)
+        return np.asarray(np.minimum.outer(own, own) - np.outer(own, own))
 
 
 def is_memoryless(law: ChannelLaw) -> bool:
@@ -134,31 +134,32 @@ def memory_of(
         Whether a tick misses what arrives just then.
     """
     ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
-    chance: dict[Fraction, float] = {}
+    unit = math.lcm(*(one.denominator for one in (frame, *sent, *ticks.values())))
+    length, starts = int(frame * unit), [int(one * unit) for one in reversed(sent)]
+    chance: dict[int, float] = {}
 
-    def described(time: Fraction) -> tuple[float, ...]:
+    def described(time: int) -> tuple[float, ...]:
         """Return how likely a tick hears each packet, the newest first, of this frame and those before."""
         found = []
         for back in range(ahead + 1):
-            for start in reversed(sent):
-                elapsed = time - start + back * frame
+            for start in starts:
+                elapsed = time - start + back * length
                 if elapsed not in chance:
-                    chance[elapsed] = arrives(law, delay, elapsed, strictly=strictly)
+                    chance[elapsed] = arrives(law, delay, Fraction(elapsed, unit), strictly=strictly)
                 found.append(chance[elapsed])
         return tuple(found)
 
-    slots, instants = len(sent), sorted(set(ticks.values()))
+    slots, instants = len(sent), sorted({int(one * unit) for one in ticks.values()})
     keys: dict[tuple[float, ...], int] = {}
-    of_time: dict[Fraction, int] = {}
-    later = ()
+    of_time: dict[int, int] = {}
+    later: list[int] = []
     for number in range(ahead + 1):
         for time in instants:
-            key = described(time + number * frame)
-            place = keys.setdefault(key, len(keys))
-            if not number:
-                of_time[time] = place
+            place = keys.setdefault(described(time + number * length), len(keys))
+            if number:
+                later.append(place)
             else:
-                later = (*later, place)
+                of_time[time] = place
     kept = list(dict.fromkeys(later))
     # A value kept is called by what is known of it a frame later: of no packet of that frame yet.
     listed = list(keys)
@@ -167,6 +168,6 @@ def memory_of(
     return Memory(
         old=np.array(old, np.intp),
         chances=np.array([key[:slots][::-1] for key in listed]),
-        heard={tick: of_time[time] for tick, time in ticks.items()},
+        heard={tick: of_time[int(time * unit)] for tick, time in ticks.items()},
         kept=np.array(kept, np.intp),
     )

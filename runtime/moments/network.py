@@ -8,7 +8,7 @@ Does not: look at the nominal network (see `analysis`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -24,6 +24,7 @@ from apc.frame.parameters import resolve
 from apc.moments.almost_sure import AlmostSure, almost_sure, unplayed
 from apc.moments.bursts import tagged_radius
 from apc.moments.crowd import crowd
+from apc.moments.errors import Told, crowd_error, pattern_error, standing_error, tagged_error
 from apc.moments.gains import gain, mean_square_radius
 from apc.moments.memory import is_memoryless
 from apc.moments.patterns import MOST_CHANNELS, pattern_radius, patterns
@@ -78,7 +79,7 @@ class NetworkVerdict(Result):
 class Growth:
     """What second moments grow by in a frame, with bounds; estimates where `exact` is False.
 
-    `why` says why there is none, `note` what it is.
+    `why` says why there is none, `note` what it is. `errors` works out how far copies are from each other.
     """
 
     radius: float
@@ -88,6 +89,7 @@ class Growth:
     why: str = ""
     note: str = ""
     proof: str = ""
+    errors: Callable[[], Told] | None = None
 
     @property
     def stable(self) -> bool | None:
@@ -123,20 +125,27 @@ def growth(system: CompiledSystem, prepared: Prepared) -> Growth:
         if isinstance(found, str):
             return Growth(np.nan, 0.0, np.inf, False, found)
         low, high = found[0] ** 2, found[1] ** 2
-        return Growth((low + high) / 2, low * (1 - ROUNDED), high * (1 + ROUNDED), True)
+        unserved = partial(Told, None, "it is not worked out over recorded delays")
+        return Growth((low + high) / 2, low * (1 - ROUNDED), high * (1 + ROUNDED), True, errors=unserved)
     holding = {link.channel.on_loss == "hold" for link, _ in lossy if link.channel is not None}
     if all(is_memoryless(law) for _, law in lossy):
         if holding == {True} or not any(law.mean_loss for _, law in lossy):
             of = crowd(system, prepared)
             inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None)
-            return Growth(inner.radius, inner.low, inner.high, True)
+            errors = partial(crowd_error, system, prepared)
+            return Growth(inner.radius, inner.low, inner.high, True, errors=errors)
         first, why = _due(system, lossy)
-        if not why and len(lossy) == 1 and len(system.links) == 1:
-            means, adds = stand_in(system, prepared, first)
-            inner = mean_square_radius(means, adds)
-            return Growth(inner.radius, inner.low, inner.high, True)
+        if not why and len(system.links) == 1 and not system.links[0].delays:
+            closed = stand_in(system, prepared, first)
+            if isinstance(closed, str):
+                return Growth(np.nan, 0.0, np.inf, False, closed)
+            inner = mean_square_radius(*closed)
+            errors = partial(standing_error, system, prepared, first)
+            return Growth(inner.radius, inner.low, inner.high, True, errors=errors)
     else:
         first, why = _due(system, lossy)
+    if not why and any(law.jitter for _, law in lossy):
+        why = "jitter of one link beside losses of another that come in bursts or with on_loss: zero"
     if why:
         return Growth(np.nan, 0.0, np.inf, False, why)
     return _by_patterns(system, prepared, first, lossy, holding)
@@ -158,19 +167,23 @@ def _by_patterns(
     if holding == {True} and sure and len(laws) == 1 and alike and complete and system.peers <= MOST_TAGGED:
         if system.peers <= EXACTLY_TAGGED:
             (radius,) = tagged_radius(system, prepared, first, (channels,))
-            return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True)
+            errors = partial(tagged_error, system, prepared, first, (channels,))
+            return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True, errors=errors)
         rough, radius = tagged_radius(system, prepared, first, ORDERS)
         note = (
             f"an estimate: moments of at most {ORDERS[1]} channels' states together; with {ORDERS[0]} the "
             f"radius is {rough:.9g}"
         )
-        return Growth(radius, radius - abs(radius - rough), radius + abs(radius - rough), False, note=note)
+        low, high = radius - abs(radius - rough), radius + abs(radius - rough)
+        errors = partial(tagged_error, system, prepared, first, ORDERS)
+        return Growth(radius, low, high, False, note=note, errors=errors)
     if channels > MOST_CHANNELS:
         what = "bursts" if not all(is_memoryless(law) for _, law in lossy) else "values that stand in"
         why = f"{what} on {channels} ways between different peers; {MOST_CHANNELS} are the most that are followed"
         return Growth(np.nan, 0.0, np.inf, False, why)
     radius = pattern_radius(patterns(system, prepared, first))
-    return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True)
+    errors = partial(pattern_error, system, prepared, first)
+    return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True, errors=errors)
 
 
 def _channels(link: Link, peers: int) -> int:
@@ -250,11 +263,13 @@ def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> N
         found = growth(system, prepared)
         worst = worst_case(system, prepared) if any(law.mean_loss for _, law in unreliable(system)) else None
         surely, unsure = _almost_sure(system, prepared, found)
+        rms = _rms_error(found)
     told = bool(np.isfinite(found.radius))
     notes = (
         found.why and f"not judged: {found.why}",
         found.note,
         unsure,
+        rms.why and f"root mean square error of copies: {rms.why}",
         worst.note if worst is not None else "",
     )
     return NetworkVerdict(
@@ -265,11 +280,18 @@ def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> N
         error=max(found.high - found.radius, found.radius - found.low) if told else None,
         exact=found.exact,
         proof=found.proof,
-        rms_error_m=None,
+        rms_error_m=rms.metres,
         almost_sure=surely,
         losses_in_a_row=worst,
         notes=tuple(text for text in notes if text),
     )
+
+
+def _rms_error(found: Growth) -> Told:
+    """Return the error of copies where second moments die out, or why there is none."""
+    if found.stable and found.errors is not None:
+        return found.errors()
+    return Told(None, "" if found.why else "only where second moments die out")
 
 
 def verdict_of(found: Growth) -> str:

@@ -1,7 +1,8 @@
 """Second moments of a few peers, pattern by pattern of which packets are lost: bursts, and what stands in.
 
 Takes: a scene of few channels, all of whose packets are due at the same instant of each frame.
-Gives: `Frames`, `frames`; `Patterns`, `patterns`; `pattern_radius`.
+Gives: `Frames`, `frames`; `Patterns`, `patterns`; `every_pattern`, `of_all`; `pattern_radius`,
+`resting_moments`; `largest`, `settled`.
 Guarantees: exact but for rounding: every pattern of lost packets is looked at.
 Does not: bound its rounding; serve jitter, or packets due at different instants.
 
@@ -14,7 +15,7 @@ A_b; second moments X_s, of the frames that begin in pattern s, move by
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -26,10 +27,10 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Feedback, StateLayout, close
 from apc.eigen.modes import dense_loop
 from apc.eigen.pseudospectrum import balance
-from apc.eigen.relative import relative, relative_coordinates
+from apc.eigen.relative import Relative, relative, relative_coordinates
 from apc.frame.lift import FrameMap
 from apc.frame.radius import RADII, value_of
-from apc.moments.crowd import hearing, own_value, remembered_of, standing_motions
+from apc.moments.crowd import Hearing, hearing, own_value, remembered_of, standing_motions
 from apc.moments.mean_loops import standing_state, with_memory
 from apc.network.channel import ChannelLaw, channel_law
 from apc.threads import load_pool
@@ -39,6 +40,15 @@ Matrix = NDArray[Any]
 
 # Channels whose patterns are all looked at: 64 matrices, of three peers.
 MOST_CHANNELS = 6
+
+# Up to so many numbers, a map of moments is written out.
+FEW = 400
+
+# Of larger ones, eigenvalues that are found, the vectors they are found in, and how often from the start.
+FOUND, TRIED, RESTARTS = 4, 60, 40
+
+# What is left of a system of equations that is solved in as many vectors, relatively.
+LEFT = 1e-13
 
 # What the frame of a motion that stands still may be off by, in floats.
 STANDING = 1e-12
@@ -66,6 +76,8 @@ def frames(
     prepared: Prepared,
     first: Fraction,
     lost: Callable[[int], NDArray[np.int64]],
+    *,
+    told: Hearing | None = None,
 ) -> Frames:
     """Close the whole scene for some patterns of lost packets.
 
@@ -77,8 +89,10 @@ def frames(
         When frames begin: all packets that may be lost are due then.
     lost
         Gives the patterns (k, C) of C channels: 1 for a packet that is lost.
+    told
+        Its peers, where they are not those of `hearing` with what stands in.
     """
-    told = hearing(system, prepared, first=first, stand_in=True)
+    told = told or hearing(system, prepared, first=first, stand_in=True)
     loop = dense_loop(told.groups, told.exchange)
     remembered = {one.route: one for one in remembered_of(system, told, loop, perfect=True)}
     links = {link.name: link for link in system.links}
@@ -87,7 +101,7 @@ def frames(
         for route in remembered
         if links[route[0]].channel is not None
     }
-    channels = sorted(
+    channels: list[tuple[str, str, int, int]] = sorted(
         {
             (way.link, way.delay, g, h)
             for way, rows in loop.coupling.items()
@@ -102,18 +116,19 @@ def frames(
     offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
     held: dict[int, range] = {}
     n = offsets[-1]
-    for place, one in enumerate(channels):
-        channel = links[one[0]].channel
+    for place, (name, delay, *_) in enumerate(channels):
+        channel = links[name].channel
         if channel is not None and channel.on_loss == "hold":
-            held[place] = range(n, n + len(remembered[one[0], one[1]].channels))
+            held[place] = range(n, n + len(remembered[name, delay].channels))
             n = held[place].stop
     names = tuple(name for one in sites for name in one.names)
     layout = StateLayout(tuple(offsets[:-1]), (*names, *["held"] * (n - offsets[-1])), {})
-    number = {one: place for place, one in enumerate(channels)}
+    number = {which: place for place, which in enumerate(channels)}
     gone = lost(len(channels))
     feedback = []
     for g, rows in enumerate(told.of(loop)):
-        now, before = np.zeros((len(gone), len(rows), starts[-1])), np.zeros((len(gone), len(rows), n))
+        now: Matrix = np.zeros((len(gone), len(rows), starts[-1]))
+        before: Matrix = np.zeros((len(gone), len(rows), n))
         for line, row in enumerate(rows):
             route = row.way.link, row.way.delay
             one = remembered.get(route)
@@ -139,13 +154,13 @@ def frames(
     closed = close(maps, feedback, layout)
     matrix = closed.matrix
     for place, states in held.items():
-        link, delay, _, h = channels[place]
-        one, missed = remembered[link, delay], gone[:, place, None]
-        value = one.memory.heard[min(one.memory.heard)]
-        for state, name in zip(states, one.channels, strict=True):
-            arrived = closed.sent[:, starts[h] + sites[h].values[one.route, name, value]]
-            matrix[:, state] = arrived * (1 - missed)
-            matrix[:, state, state] += missed[:, 0]
+        name, delay, _, h = channels[place]
+        of, lost_now = remembered[name, delay], gone[:, place, None]
+        value = of.memory.heard[min(of.memory.heard)]
+        for state, what in zip(states, of.channels, strict=True):
+            arrived = closed.sent[:, starts[h] + sites[h].values[of.route, what, value]]
+            matrix[:, state] = arrived * (1 - lost_now)
+            matrix[:, state, state] += lost_now[:, 0]
     known = RADII.exact(matrix[0])
     known[1] = STANDING
     basis = standing_state(known, standing_motions(loop), loop, [*offsets[:-1], n])
@@ -159,22 +174,32 @@ class Patterns:
     """The frame of each pattern of lost packets, over relative coordinates, and the law of each channel.
 
     `matrices` (2^C, n, n): channel c's packet is lost in those whose bit c is set. `laws` (C,).
+    The coordinates are those of `at`, each divided by its `scale` (n,).
     """
 
     matrices: Floats
     laws: tuple[ChannelLaw, ...]
+    at: Relative
+    scale: Floats
 
 
 def patterns(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Patterns:
     """Close the whole scene for every pattern of lost packets; parameters as for `frames`."""
-    found = frames(
-        *(system, prepared, first), lambda count: (np.arange(2**count)[:, None] >> np.arange(count)) & 1
-    )
+    return of_all(frames(*(system, prepared, first), every_pattern))
+
+
+def every_pattern(channels: int) -> NDArray[np.int64]:
+    """Return all patterns of lost packets (2^C, C)."""
+    return (np.arange(2**channels)[:, None] >> np.arange(channels)) & 1
+
+
+def of_all(found: Frames) -> Patterns:
+    """Return the frames of every pattern over relative coordinates."""
     at = relative_coordinates(found.basis)
     inner = relative(found.matrices, at)
     # Rounding is small beside the largest moment only: of states of one size it is beside all.
     scale = balance(np.abs(inner).max(axis=0))
-    return Patterns(inner / scale[:, None] * scale, found.laws)
+    return Patterns(inner / scale[:, None] * scale, found.laws, at, scale)
 
 
 def pattern_radius(of: Patterns) -> float:
@@ -186,7 +211,12 @@ def pattern_radius(of: Patterns) -> float:
         The frames of all patterns.
     """
     k, n = of.matrices.shape[:2]
-    count = len(of.laws)
+    return largest(a_frame_later(of), np.broadcast_to(np.eye(n), (k, n, n)).reshape(-1).copy())
+
+
+def a_frame_later(of: Patterns) -> Callable[[Floats], Floats]:
+    """Return what makes of second moments, pattern by pattern in a row (2^C n²,), those of a frame later."""
+    k, n = of.matrices.shape[:2]
     laws = of.laws
     sure = all(law.one_minus_h == 1 and law.one_minus_k == 0 for law in laws)
     chances = _chances(laws) if not sure else None
@@ -200,17 +230,87 @@ def pattern_radius(of: Patterns) -> float:
             for b in range(k):
                 moved += chances[:, b, None, None] * (of.matrices[b] @ x @ of.matrices[b].T)
         moved = (moved + moved.transpose(0, 2, 1)) / 2
-        return _changed(moved.reshape((2,) * count + (n * n,)), laws).reshape(-1)
+        return _changed(moved.reshape((2,) * len(laws) + (n * n,)), laws).reshape(-1)
 
-    start = np.broadcast_to(np.eye(n), (k, n, n)).reshape(-1).copy()
-    size = k * n * n
-    if size <= 400:
-        matrix = np.array([step(column) for column in np.eye(size)]).T
-        return float(np.abs(np.linalg.eigvals(matrix)).max())
+    return step
+
+
+def resting_moments(of: Patterns, drawn: Floats) -> Floats | None:
+    """Return the second moments (n, n) of a long run in floats, None where they are not found.
+
+    Parameters
+    ----------
+    of
+        The frames of all patterns, stable in mean square.
+    drawn
+        The covariance (n, n) of what is added at the end of each frame, by chance of its own.
+    """
+    likely: Floats = np.ones(1)
+    for law in of.laws:
+        likely = np.asarray(np.kron([1 - law.bad, law.bad], likely))
+    scale = np.outer(of.scale, of.scale)
+    added = np.multiply.outer(likely, drawn / scale)
+    after = a_frame_later(of)(added.reshape(-1)).reshape(added.shape)
+    # What is drawn anew is there for a frame: all that lasts is over the other states.
+    rest = np.flatnonzero(of.matrices.any(axis=(0, 2)))
+    inner = np.ix_(np.arange(len(added)), rest, rest)
+    step = a_frame_later(replace(of, matrices=of.matrices[inner]))
+    found = settled(step, after[inner].reshape(-1))
+    if found is None:
+        return None
+    added[inner] += found.reshape(after[inner].shape)
+    return np.asarray(added.sum(axis=0) * scale)
+
+
+def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
+    """Return the largest eigenvalue of a map that leaves a cone of moments invariant, in floats.
+
+    Parameters
+    ----------
+    step
+        The map of vectors (n,).
+    start
+        Moments (n,) inside the cone.
+
+    Notes
+    -----
+    The eigenvalue is real, and no other is larger in magnitude. A few are asked for: alone, the first that an
+    iteration finds may be one near to it.
+    """
+    if start.size <= FEW:
+        return float(np.linalg.eigvals(np.array([step(column) for column in np.eye(start.size)])).real.max())
     linalg = load_pool("scipy.sparse.linalg")
-    operator = linalg.LinearOperator((size, size), matvec=step, dtype=np.float64)
-    values = linalg.eigs(operator, k=1, which="LR", v0=start, return_eigenvectors=False, tol=1e-13, ncv=40)
-    return float(np.abs(values).max())
+    operator = linalg.LinearOperator((start.size, start.size), matvec=step, dtype=np.float64)
+    try:
+        values = linalg.eigs(
+            operator,
+            FOUND,
+            which="LR",
+            v0=start,
+            ncv=TRIED,
+            maxiter=RESTARTS,
+            tol=1e-13,
+            return_eigenvectors=False,
+        )
+    except linalg.ArpackNoConvergence as slow:  # the largest come first
+        values = slow.eigenvalues
+    return float(values.real.max(initial=-np.inf))
+
+
+def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats | None:
+    """Return the sum of all that `step` makes of what is added once a frame (n,), None where it isn't found.
+
+    Parameters
+    ----------
+    step
+        The map of vectors (n,), of a spectral radius below 1.
+    added
+        What is added (n,).
+    """
+    linalg = load_pool("scipy.sparse.linalg")
+    operator = linalg.LinearOperator((added.size,) * 2, matvec=lambda x: x - step(x), dtype=np.float64)
+    found, open_end = linalg.gmres(operator, added, rtol=LEFT, atol=0.0, restart=TRIED, maxiter=RESTARTS)
+    return None if open_end else np.asarray(found)
 
 
 def _changed(moved: Floats, laws: Sequence[ChannelLaw]) -> Floats:

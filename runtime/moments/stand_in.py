@@ -1,7 +1,7 @@
 """Second moments where a receiver puts its own value in the place of a missing one.
 
 Takes: a scene whose packets are due at the same instant of each frame, lost independently of each other.
-Gives: `stand_in`.
+Gives: `stand_in`; `Classes`, `standing_in`, `luck_of_luck`, `entries_of`, `spread_of`.
 Guarantees: equal peers cost the same, however many they are.
 Does not: serve bursts (see `patterns`), jitter, or several unreliable links.
 
@@ -19,8 +19,10 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,23 +30,28 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
+from apc.eigen.closing import Loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, Arithmetic, radius_of, value_of, with_radius
-from apc.moments.crowd import hearing, own_value, peer_classes, remembered_of, standing_motions
+from apc.frame.schedule import Selected, Way
+from apc.moments.crowd import Hearing, hearing, own_value, peer_classes, remembered_of, standing_motions
 from apc.moments.gains import Gain, around, number_of, of_kind, scaled, stein
-from apc.moments.mean_loops import standing_state, with_memory
+from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
 from apc.network.channel import channel_law
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 
-# Ways of hearing so many of each class that are looked at together.
+# Ways of hearing so many of each class that are looked at together: twelve peers that all differ.
 MOST_NODES = 4096
 
+# Roundings of a node, of its weight and of a product with either.
+NODE_ROUNDINGS = 16
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Receiver:
     """How a peer of a class moves by how many it hears: each row of `heard` (m, K) of probability `weight`.
 
@@ -58,6 +65,29 @@ class _Receiver:
     shares: tuple[Matrix, ...]
     apart: Matrix
     per_peer: tuple[Matrix, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Classes:
+    """Classes of equal peers: how many, where each one's states start, and how a peer of each moves.
+
+    `parts` are the means' loops in relative coordinates (class or None for all, matrix, coordinates), `means`
+    bounds on their spectral radius.
+    """
+
+    counts: tuple[int, ...]
+    offsets: tuple[int, ...]
+    receivers: tuple[_Receiver, ...]
+    parts: tuple[tuple[int | None, Matrix, Relative], ...]
+    means: tuple[float, float]
+
+    def of(self, place: int) -> slice:
+        """Return the states of a class."""
+        return slice(self.offsets[place], self.offsets[place + 1])
+
+    def size(self, place: int) -> int:
+        """Return how many states a peer of a class has."""
+        return self.offsets[place + 1] - self.offsets[place]
 
 
 def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
@@ -85,8 +115,24 @@ def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
     return nodes, vectors[0] ** 2
 
 
-def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tuple[tuple[float, float], Gain]:
-    """Return bounds on the means' spectral radius and G(λ) of what luck adds, see `gains`.
+def stand_in(
+    system: CompiledSystem, prepared: Prepared, first: Fraction
+) -> tuple[tuple[float, float], Gain] | str:
+    """Return bounds on the means' spectral radius and G(λ) of what luck adds, see `gains`; or why not.
+
+    Parameters
+    ----------
+    system, prepared, first
+        As for `standing_in`.
+    """
+    found = standing_in(system, prepared, first)
+    return found if isinstance(found, str) else (found.means, partial(luck_of_luck, found))
+
+
+def standing_in(
+    system: CompiledSystem, prepared: Prepared, first: Fraction, *, told: Hearing | None = None
+) -> Classes | str:
+    """Return how peers move that put their own values in the place of missing ones; or why not.
 
     Parameters
     ----------
@@ -94,8 +140,10 @@ def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tup
         The compiled scene, and what `analysis.prepare` made of it.
     first
         When frames begin: all packets that may be lost are due then.
+    told
+        Its peers, where they are not those of `hearing` with what stands in.
     """
-    told = hearing(system, prepared, first=first, stand_in=True)
+    told = told or hearing(system, prepared, first=first, stand_in=True)
     loops, weights = peer_classes(told)
     common = loops[0]
     remembered = remembered_of(system, told, common, perfect=True)
@@ -104,32 +152,68 @@ def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tup
     law = channel_law(system, link, told.timings[one.route[1]])
     counts = [site.count for site in common.sites]
     sites = [with_memory(group, remembered) for group in common.sites]
-    sizes = [len(site.names) for site in sites]
-    offsets = np.cumsum([0, *sizes]).tolist()
-    values, heard_now = [], sorted(set(one.memory.heard.values()))
+    heard_now = sorted(set(one.memory.heard.values()))
+    values = []
     for site in sites:
-        rows = [site.values[one.route, name, value] for name in one.channels for value in heard_now]
-        assert not site.map.d[:, rows].any(), (
+        places = [site.values[one.route, name, value] for name in one.channels for value in heard_now]
+        assert not site.map.d[:, places].any(), (
             "what is heard was sent after hearing something in the same frame"
         )
-        values.append(site.map.s[:, rows])
+        values.append(site.map.s[:, places])
     receivers = []
     for h, rows in enumerate(told.of(common)):
-        others = [counts[g] - (g == h) for g in range(len(counts))]
+        others = [count - (g == h) for g, count in enumerate(counts)]
+        own = {way: listed[h] for way, listed in weights.items()}
         ticks = len({(row.clock, row.tick) for row in rows})
-        hears = [any(weights[way][h][g] for way in weights) for g in range(len(counts))]
         nodes = [
-            quadrature(n, 1 - law.mean_loss, ticks + 3) if does else (np.zeros(1), np.ones(1))
-            for n, does in zip(others, hears, strict=True)
+            quadrature(n, 1 - law.mean_loss, ticks + 3)
+            if any(listed[g] for listed in own.values())
+            else (np.zeros(1), np.ones(1))
+            for g, n in enumerate(others)
         ]
-        heard = np.array(list(itertools.product(*(own for own, _ in nodes))))
-        weight = np.array([math.prod(listed) for listed in itertools.product(*(own for _, own in nodes))])
-        receivers.append(_receiver(sites[h], h, rows, one, heard_now, values, weights, others, heard, weight))
-    return _gains(receivers, counts, sizes, offsets, common, loops)
+        ways = math.prod(len(listed) for listed, _ in nodes)
+        if ways > MOST_NODES:
+            return (
+                f"values that stand in between different peers: a peer hears others in {ways:,} ways; "
+                f"{MOST_NODES:,} are the most that are followed"
+            )
+        heard = np.array(list(itertools.product(*(listed for listed, _ in nodes))))
+        weight = np.array(
+            [math.prod(listed) for listed in itertools.product(*(shares for _, shares in nodes))]
+        )
+        receivers.append(_receiver(sites[h], rows, one, values, own, others, heard, weight))
+    offsets = np.cumsum([0] + [len(site.names) for site in sites]).tolist()
+    return _closed(tuple(receivers), tuple(counts), tuple(offsets), loops)
 
 
-def _receiver(site, h, rows, one, heard_now, values, weights, others, heard, weight) -> _Receiver:
-    """Close a peer's loop with itself: what stands in for what it misses."""
+def _receiver(
+    site: Site,
+    rows: Sequence[Selected],
+    one: Remembered,
+    values: Sequence[Matrix],
+    weights: Mapping[Way, Sequence[Fraction]],
+    others: Sequence[int],
+    heard: Floats,
+    weight: Floats,
+) -> _Receiver:
+    """Close a peer's loop with itself: what stands in for what it misses.
+
+    Parameters
+    ----------
+    site, rows
+        The peer, and what each row of its r hears.
+    one
+        What is heard of each sender.
+    values
+        What ticks hear of each class's peers, over their states.
+    weights
+        What the peer weighs a peer of each class by, way by way.
+    others
+        How many there are of each class beside it.
+    heard, weight
+        The ways of hearing so many of each class (m, K), and their probabilities (m,).
+    """
+    heard_now = sorted(set(one.memory.heard.values()))
     plain = site.map
     own_places = sorted({site.sent[own_value(row)] for row in rows if row.gap})
     m, n_r = len(heard), len(rows)
@@ -139,16 +223,14 @@ def _receiver(site, h, rows, one, heard_now, values, weights, others, heard, wei
         if (row.way.link, row.way.delay) != one.route or row.channel not in one.channels:
             continue
         if row.gap:
-            missed = sum(
-                float(weights[row.way][h][g]) * (others[g] - heard[:, g]) for g in range(len(others))
-            )
+            missed = sum(float(weights[row.way][g]) * (others[g] - heard[:, g]) for g in range(len(others)))
             place = own_places.index(site.sent[own_value(row)])
             gap[:, 0, line, place] = missed
             gap[:, 1, line, place] = (
                 16
                 * UNIT
                 * sum(
-                    abs(float(weights[row.way][h][g])) * (others[g] + np.abs(heard[:, g]))
+                    abs(float(weights[row.way][g])) * (others[g] + np.abs(heard[:, g]))
                     for g in range(len(others))
                 )
             )
@@ -156,7 +238,7 @@ def _receiver(site, h, rows, one, heard_now, values, weights, others, heard, wei
         value = heard_now.index(one.memory.heard[row.clock, row.tick])
         value += one.channels.index(row.channel) * len(heard_now)
         for g, block in enumerate(from_class):
-            own = float(weights[row.way][h][g])
+            own = float(weights[row.way][g])
             block[0, line, value], block[1, line, value] = own, UNIT * abs(own)
     own_rows, own_heard = plain.s[:, own_places], plain.d[:, own_places]
     # r = gap o + s and o = O x + D r: time orders it, D gap is nilpotent.
@@ -169,16 +251,13 @@ def _receiver(site, h, rows, one, heard_now, values, weights, others, heard, wei
             break
         felt = RADII.add(felt, term)
     reached = RADII.multiply(plain.q, felt)
-    own = RADII.add(
+    alone = RADII.add(
         np.broadcast_to(plain.p, (m, *plain.p.shape)), RADII.multiply(RADII.multiply(reached, gap), own_rows)
     )
-    from_class = tuple(
-        RADII.multiply(RADII.multiply(reached, block), rows_of)
-        for block, rows_of in zip(from_class, values, strict=True)
-    )
-    mean = _mean(weight, own)
-    apart, shares, per_peer = [RADII.subtract(own, mean)], [], []
-    for g, block in enumerate(from_class):
+    mean = _mean(weight, alone)
+    apart, shares, per_peer = [RADII.subtract(alone, mean)], [], []
+    for g, (felt_of, rows_of) in enumerate(zip(from_class, values, strict=True)):
+        block = RADII.multiply(RADII.multiply(reached, felt_of), rows_of)
         alike = _each(block, heard[:, g])
         shared = _mean(weight, alike)
         shares.append(scaled(shared, number_of(1 / max(others[g], 1), RADII), RADII))
@@ -195,33 +274,28 @@ def _mean(weight: Floats, blocks: Matrix) -> Matrix:
     return with_radius(value, radius * (1 + 8 * UNIT))
 
 
-NODE_ROUNDINGS = 16
-
-
-def _gains(receivers, counts, sizes, offsets, common, loops) -> tuple[tuple[float, float], Gain]:
-    classes = range(len(counts))
-    n = offsets[-1]
+def _closed(
+    receivers: tuple[_Receiver, ...], counts: tuple[int, ...], offsets: tuple[int, ...], loops: Sequence[Loop]
+) -> Classes:
+    """Close the means' loops, of all peers and of each class's apart."""
+    common, n = loops[0], offsets[-1]
     whole = np.zeros((2, n, n))
-    for h in classes:
-        for g in classes:
-            others = counts[g] - (g == h)
-            block = scaled(receivers[h].shares[g], number_of(float(others), RADII), RADII)
-            block = RADII.add(receivers[h].mean, block) if h == g else block
+    for h, one in enumerate(receivers):
+        for g, count in enumerate(counts):
+            block = scaled(one.shares[g], number_of(float(count - (g == h)), RADII), RADII)
+            block = RADII.add(one.mean, block) if h == g else block
             whole[:, offsets[h] : offsets[h + 1], offsets[g] : offsets[g + 1]] = block
     at = relative_coordinates(standing_state(whole, standing_motions(common), common, offsets))
     parts: list[tuple[int | None, Matrix, Relative]] = [(None, _reduced(whole, at), at)]
     for loop in loops[1:]:
         h = [site.name for site in common.sites].index(loop.sites[0].name)
         apart = RADII.subtract(receivers[h].mean, receivers[h].shares[h])
-        own = relative_coordinates(standing_state(apart, standing_motions(loop), loop, [0, sizes[h]]))
+        still = standing_state(apart, standing_motions(loop), loop, [0, offsets[h + 1] - offsets[h]])
+        own = relative_coordinates(still)
         parts.append((h, _reduced(apart, own), own))
     bounds = [enclose_eigenvalues(value_of(matrix), radius_of(matrix))[1] for _, matrix, _ in parts]
-    low, high = max(one.low for one in bounds), max(one.high for one in bounds)
-
-    def gain(growth: float, numbers: Arithmetic) -> Matrix | None:
-        return _gain(growth, numbers, receivers, counts, offsets, parts)
-
-    return (low, high), gain
+    means = max(one.low for one in bounds), max(one.high for one in bounds)
+    return Classes(counts, offsets, receivers, tuple(parts), means)
 
 
 def _each(blocks: Matrix, by: Floats) -> Matrix:
@@ -234,6 +308,7 @@ def _each(blocks: Matrix, by: Floats) -> Matrix:
 
 
 def _reduced(matrix: Matrix, at: Relative) -> Matrix:
+    """Return a loop (2, n, n) in relative coordinates."""
     inner = matrix[:, at.rest[:, None], at.rest]
     if not len(at.held):
         return inner
@@ -241,62 +316,86 @@ def _reduced(matrix: Matrix, at: Relative) -> Matrix:
     return RADII.subtract(inner, RADII.multiply(weights, matrix[:, at.held[:, None], at.rest]))
 
 
-def _gain(growth, numbers, receivers, counts, offsets, parts) -> Matrix | None:
+def luck_of_luck(of: Classes, growth: float, numbers: Arithmetic) -> Matrix | None:
     """Return G(λ) over the entries of each class's Ω."""
-    classes = range(len(counts))
-    sizes = [offsets[h + 1] - offsets[h] for h in classes]
-    entries = [[(a, b) for a in range(n) for b in range(a, n)] for n in sizes]
-    firsts = np.cumsum([0] + [len(one) for one in entries]).tolist()
+    listed = [np.array(one, np.intp).T for one in entries_of(of)]
+    firsts = np.cumsum([0] + [one.shape[1] for one in listed]).tolist()
     found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
-    root, shrink = number_of(growth**-0.5, numbers), number_of(1 / growth, numbers)
-    for d in classes:
-        units = np.zeros((len(entries[d]), sizes[d], sizes[d]))
-        for number, (a, b) in enumerate(entries[d]):
-            units[number, a, b] = units[number, b, a] = 1.0
-        kinds = of_kind(RADII.exact(units), numbers)
-        spread: dict[int | None, Matrix] = {}
-        for h, matrix, at in parts:
-            if h not in (None, d):
-                continue
-            # What luck adds to a peer, in relative coordinates; of all peers' mean, a peer is one in n.
-            place = offsets[d] if h is None else 0
-            total = offsets[-1] if h is None else sizes[d]
-            into = np.zeros((2, total, sizes[d]))
-            into[0, place : place + sizes[d]] = np.eye(sizes[d])
-            weights = with_radius(at.weights, at.doubt)
-            into = (
-                into[:, at.rest]
-                if not len(at.held)
-                else RADII.subtract(into[:, at.rest], RADII.multiply(weights, into[:, at.held]))
-            )
-            driven = scaled(around(of_kind(into, numbers), kinds, numbers), shrink, numbers)
-            if h is None:
-                driven = scaled(driven, number_of(1 / counts[d], numbers), numbers)
-            moments = stein(scaled(of_kind(matrix, numbers), root, numbers), driven, numbers)
-            if moments is None:
-                return None
-            whole = np.zeros((*moments.shape[:-2], total, total))
-            whole[..., at.rest[:, None], at.rest] = moments
-            spread[h] = whole
-        for h in classes:
-            added = _added(h, d, receivers[h], counts, offsets, spread, numbers)
-            listed = np.array(entries[h], np.intp).T
-            block = np.moveaxis(added[..., listed[0], listed[1]], 0, -1)
-            place = np.s_[..., firsts[h] : firsts[h + 1], firsts[d] : firsts[d + 1]]
-            found[place] = numbers.add(found[place], block)
+    for d, (rows, columns) in enumerate(listed):
+        units, number = np.zeros((len(rows), of.size(d), of.size(d))), np.arange(len(rows))
+        units[number, rows, columns] = units[number, columns, rows] = 1.0
+        spread = spread_of(of, d, of_kind(RADII.exact(units), numbers), growth, numbers)
+        if spread is None:
+            return None
+        for h, (a, b) in enumerate(listed):
+            added = _added(of, h, d, spread, numbers)
+            block = np.moveaxis(added[..., a, b], 0, -1)
+            where = np.s_[..., firsts[h] : firsts[h + 1], firsts[d] : firsts[d + 1]]
+            found[where] = numbers.add(found[where], block)
     return found
 
 
-def _added(h, d, one, counts, offsets, spread, numbers) -> Matrix:
+def entries_of(of: Classes) -> list[list[tuple[int, int]]]:
+    """Return the entries (a, b) of each class's Ω, a ≤ b."""
+    return [[(a, b) for a in range(n) for b in range(a, n)] for n in np.diff(of.offsets).tolist()]
+
+
+def spread_of(
+    of: Classes, d: int, added: Matrix, growth: float, numbers: Arithmetic
+) -> dict[int | None, Matrix] | None:
+    """Return the moments that peers of a class make who each get Ω more a frame, None where they have no end.
+
+    They are those of all classes' means (None), and those of class d that a peer of n has 1 − 1/n of, apart
+    from its like.
+
+    Parameters
+    ----------
+    of, d
+        The classes, and which of them.
+    added
+        Ω (b, n, n), or several.
+    growth
+        λ, what second moments grow by in a frame.
+    numbers
+        What Ω is of.
+    """
+    root, shrink = number_of(growth**-0.5, numbers), number_of(1 / growth, numbers)
+    spread: dict[int | None, Matrix] = {}
+    for h, matrix, at in of.parts:
+        if h not in (None, d):
+            continue
+        # What luck adds to a peer, in relative coordinates; of all peers' mean, a peer is one in n.
+        place = of.offsets[d] if h is None else 0
+        total = of.offsets[-1] if h is None else of.size(d)
+        into = np.zeros((2, total, of.size(d)))
+        into[0, place : place + of.size(d)] = np.eye(of.size(d))
+        weights = with_radius(at.weights, at.doubt)
+        into = (
+            into[:, at.rest]
+            if not len(at.held)
+            else RADII.subtract(into[:, at.rest], RADII.multiply(weights, into[:, at.held]))
+        )
+        driven = scaled(around(of_kind(into, numbers), added, numbers), shrink, numbers)
+        if h is None:
+            driven = scaled(driven, number_of(1 / of.counts[d], numbers), numbers)
+        moments = stein(scaled(of_kind(matrix, numbers), root, numbers), driven, numbers)
+        if moments is None:
+            return None
+        whole = np.zeros((*moments.shape[:-2], total, total))
+        whole[..., at.rest[:, None], at.rest] = moments
+        spread[h] = whole
+    return spread
+
+
+def _added(of: Classes, h: int, d: int, spread: Mapping[int | None, Matrix], numbers: Arithmetic) -> Matrix:
     """Return Ω of a peer of class h, for moments that class d's luck made (b, n, n)."""
-    classes = range(len(counts))
+    classes, one = range(len(of.counts)), of.receivers[h]
 
     def together(g: int, k: int) -> Matrix:
         """Return the moments of two peers, of classes g and k, that are not the same."""
-        rows, columns = slice(offsets[g], offsets[g + 1]), slice(offsets[k], offsets[k + 1])
-        alike = spread[None][..., rows, columns]
+        alike: Matrix = spread[None][..., of.of(g), of.of(k)]
         if g == k == d and d in spread:
-            return numbers.subtract(alike, scaled(spread[d], number_of(1 / counts[d], numbers), numbers))
+            return numbers.subtract(alike, scaled(spread[d], number_of(1 / of.counts[d], numbers), numbers))
         return alike
 
     def alone(g: int) -> Matrix:
@@ -307,8 +406,8 @@ def _added(h, d, one, counts, offsets, spread, numbers) -> Matrix:
 
     # What luck adds: how a peer moves apart from the mean of such peers, those it hears taken alike; and which
     # of those that differ it hears, a of n.
-    size = offsets[h + 1] - offsets[h]
-    ends = np.cumsum([size] + [offsets[g + 1] - offsets[g] for g in classes]).tolist()
+    size = of.size(h)
+    ends = np.cumsum([size] + [of.size(g) for g in classes]).tolist()
     joint = np.zeros((*alone(h).shape[:-2], ends[-1], ends[-1]))
     joint[..., :size, :size] = alone(h)
     for g in classes:
@@ -317,10 +416,10 @@ def _added(h, d, one, counts, offsets, spread, numbers) -> Matrix:
         joint[..., rows, :size] = np.swapaxes(together(h, g), -1, -2)
         for k in classes:
             joint[..., rows, ends[k] : ends[k + 1]] = together(g, k)
-    total = _mean_of(one.weight, around(of_nodes(one.apart, numbers), joint[:, None], numbers), numbers)
+    total = _mean_of(one.weight, around(_of_nodes(one.apart, numbers), joint[:, None], numbers), numbers)
     if d in spread and one.heard[:, d].any():
-        others = counts[d] - (d == h)
-        here = around(of_nodes(one.per_peer[d], numbers), spread[d][:, None], numbers)
+        others = of.counts[d] - (d == h)
+        here = around(_of_nodes(one.per_peer[d], numbers), spread[d][:, None], numbers)
         total = numbers.add(total, _mean_of(one.weight * one.heard[:, d], here, numbers))
         share = of_kind(one.shares[d], numbers)
         missed = float(one.weight @ (others - one.heard[:, d]))
@@ -329,7 +428,7 @@ def _added(h, d, one, counts, offsets, spread, numbers) -> Matrix:
     return total
 
 
-def of_nodes(blocks: Matrix, numbers: Arithmetic) -> Matrix:
+def _of_nodes(blocks: Matrix, numbers: Arithmetic) -> Matrix:
     """Return matrices (m, 2, …) with their radii as they are, or without them."""
     return blocks if numbers is RADII else blocks[:, 0]
 
@@ -337,7 +436,7 @@ def of_nodes(blocks: Matrix, numbers: Arithmetic) -> Matrix:
 def _mean_of(weight: Floats, blocks: Matrix, numbers: Arithmetic) -> Matrix:
     """Return the mean (b, …) of matrices (b, m, …)."""
     if numbers is not RADII:
-        return np.einsum("m,bmij->bij", weight, blocks)
+        return np.asarray(np.einsum("m,bmij->bij", weight, blocks))
     value = np.einsum("m,bmij->bij", weight, blocks[:, :, 0])
     size = np.einsum("m,bmij->bij", np.abs(weight), np.abs(blocks[:, :, 0]))
     radius = np.einsum("m,bmij->bij", np.abs(weight), blocks[:, :, 1])
