@@ -77,7 +77,10 @@ HOUSE = (
         contact_modes
         """,
     ),
-    ("apc.moments", "memory mean_loops gains crowd held peak worst almost_sure"),
+    (
+        "apc.moments",
+        "memory mean_loops gains crowd stand_in patterns bursts traces held peak worst almost_sure network",
+    ),
     (
         "apc.vary",
         """
