@@ -6,13 +6,14 @@ Guarantees: on `fifty_digits.events`, which shares no map, no closing and no sch
 Does not: use any symmetry, or serve more channels than `MOST` numbers hold.
 
 The state holds every peer, what it computed and sent lately, and for each way from peer to peer the packet
-that counts. Luck is a Markov chain of each way: whether it is bad, whether its last packet is missed, which of
-the packets under way has arrived. Second moments X of every combination of these move from event to event,
+that counts. Luck is a Markov chain of each way: whether it is bad, whether its last packet is missed, which
+of the packets under way has arrived. Second moments X of every combination of these move from event to event,
 either by X → A X Aᵀ or, of one way, X_k → Σ P(k → k') J X Jᵀ: never by a formula for a whole frame.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -79,13 +80,16 @@ class _Way:
     queue: slice
 
 
-# A step of one way's chain: (from, to, probability, place in the queue of the packet that counts now, None for
-# the one that counted before).
+# A step of one way's chain: (from, to, probability, place in the queue of the packet that counts now, None
+# for the one that counted before).
 Step = tuple[int, int, float, int | None]
 
 
-def second_moment_radius(system: CompiledSystem, laws: Mapping[str, Law]) -> float:
-    """Return what second moments grow by in a frame, motions left out that no draw moves."""
+def second_moment_radius(system: CompiledSystem, laws: Mapping[str, Law], *, thorough: bool = False) -> float:
+    """Return what second moments grow by in a frame, motions left out that no draw moves.
+
+    An iteration may find the smaller of two eigenvalues near each other; if `thorough`, several are found.
+    """
     played = _Played(system, laws)
     n, project = played.size, played.without_standing()
     shape = tuple(way.states for way in played.ways)
@@ -104,14 +108,25 @@ def second_moment_radius(system: CompiledSystem, laws: Mapping[str, Law]) -> flo
         start = step(start)
         start = start / np.abs(start).max()
     operator = scipy.sparse.linalg.LinearOperator((start.size, start.size), matvec=step, dtype=np.float64)
-    try:
-        values = scipy.sparse.linalg.eigs(
-            *(operator, 4), which="LM", v0=start, ncv=min(60, start.size - 1), maxiter=30, tol=1e-13,
-            return_eigenvectors=False,
-        )  # fmt: skip
-    except scipy.sparse.linalg.ArpackNoConvergence as slow:  # the largest come first
-        values = slow.eigenvalues
-    return float(np.abs(values).max())
+    found: list[float] = []
+    for count, restarts in ((6, 400), (1, 400)) if thorough else ((2, 6), (1, 400)):
+        try:
+            values = scipy.sparse.linalg.eigs(
+                operator,
+                count,
+                which="LM",
+                v0=start,
+                ncv=min(70 if thorough else 50, start.size - 1),
+                maxiter=restarts,
+                tol=1e-12,
+                return_eigenvectors=False,
+            )
+        except scipy.sparse.linalg.ArpackNoConvergence as slow:
+            values = slow.eigenvalues
+        found += np.abs(values).tolist()
+        if found:
+            break
+    return max(found)
 
 
 class _Played:
@@ -205,7 +220,7 @@ class _Played:
         return found
 
     def _flush(self) -> None:
-        """Add all that happened since luck was last drawn, one map for every state of the chains or for all."""
+        """Add all that happened since luck was last drawn: one map for each state of the chains, or for all."""
         whole, alike = self.pending, self.pending.ndim == 2
         self.pending = np.eye(self.size)
         self.record.append(("map", lambda modes: whole if alike else whole[tuple(modes)]))
@@ -251,7 +266,7 @@ class _Played:
         self.pending: Floats = np.eye(self.size)
         zero = any(way.law.zero and not way.law.jitter for way in self.ways)
         shape = [way.states for way in self.ways]
-        for now, following in zip(times, times[1:], strict=False):
+        for now, following in itertools.pairwise(times):
             for i, site in enumerate(self.sites):
                 for send, rule in zip(site.kind.sends, site.sends, strict=True):
                     if not scene._ticks_now(scene.clock_of[send.link], now):
@@ -316,19 +331,19 @@ class _Played:
     def _sent(self, i: int, link: str, rule: Callable, now: Fraction) -> Floats:
         queue = self.packets[i, link]
         found = np.eye(self.size)
-        for newer, older in zip(queue, queue[1:], strict=False):
+        for newer, older in itertools.pairwise(queue):
             found[older] = np.eye(self.size)[newer]
         found[queue[0]] = self._own(i, rule, now)
         return found
 
     def _own(self, i: int, rule: Callable, now: Fraction) -> Floats:
         """Return what a peer would send, over the state."""
-        site = self.sites[i]
         arguments = [np.eye(self.size)[self.x[i]], self._held(i, now, before=True)]
         return _applied(rule, now, arguments, self.size)
 
     def _held(self, i: int, now: Fraction, *, before: bool) -> Floats:
-        site, found = self.sites[i], []
+        site = self.sites[i]
+        found: list[Floats] = []
         place = {clock.clock: number for number, clock in enumerate(site.kind.clocks)}
         for hold, delay in zip(site.kind.holds, site.delays, strict=True):
             phase, period = self.scene.clocks[hold.clock]
@@ -360,7 +375,7 @@ class _Played:
                     memory.reshape(-1, self.size),
                     heard.reshape(-1, self.size),
                 ]
-                for newer, older in zip(listed, listed[1:], strict=False):
+                for newer, older in itertools.pairwise(listed):
                     found[older] = np.eye(self.size)[newer]
                 found[listed[0]] = _applied(site.ticks[place], now, arguments, self.size)
         return found

@@ -5,11 +5,11 @@ Gives: `tagged_radius`, `tagged_moments`.
 Guarantees: with as many tags as there are channels it is exact but for rounding; with fewer, an estimate.
 Does not: bound its rounding, or what fewer tags leave out.
 
-A channel's state is bad with probability b; φ = (s − b)/√(b(1 − b)) has mean 0, variance 1, and is on the mean
-1 − p − r times itself a frame later. What moves in a frame is affine in all states, A + Σ_c φ_c U_c F_c, with
-F_c how far what is held is from what is sent. So moments tagged by a set S of channels, E[x xᵀ Π_(c ∈ S) φ_c],
-move by one another, tags that are squared becoming 1 + κ φ_c; those of more than k tags decay as (1 − p − r)^k
-and are left out.
+A channel's state is bad with probability b; φ = (s − b)/√(b(1 − b)) has mean 0, variance 1, and is on the
+mean 1 − p − r times itself a frame later. What moves in a frame is affine in all states, A + Σ_c φ_c U_c
+F_c, with F_c how far what is held is from what is sent. So moments tagged by a set S of channels, E[x xᵀ
+Π_(c ∈ S) φ_c], move by one another, tags that are squared becoming 1 + κ φ_c; those of more than k tags
+decay as (1 − p − r)^k and are left out.
 
 Peers that can change places: sets that a permutation takes to each other have one matrix between them, and
 entries of it that permutations of the set to itself exchange are one number.
@@ -232,7 +232,7 @@ class _Names:
         self._known: dict[Tags, tuple[Tags, tuple[int, ...]]] = {}
 
     def of(self, tags: Tags) -> tuple[Tags, tuple[int, ...]]:
-        """Return the set that stands for all like it, and the peers that its peers 0, 1, … are in this one."""
+        """Return the set that stands for all like it, and which peers its peers 0, 1, … are here."""
         if tags not in self._known:
             touched, rest = _touched(tags, self.peers)
             renamed = (

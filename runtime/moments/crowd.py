@@ -1,7 +1,8 @@
 """The mean loops and the luck of a scene: what its second moments are made of.
 
 Takes: a `CompiledSystem` whose links lose or delay packets independently of each other.
-Gives: `crowd`; `Hearing`, `hearing`, `own_value`; `peer_classes`, `remembered_of`, `standing_motions`, `instants`.
+Gives: `crowd`; `Hearing`, `hearing`, `own_value`; `peer_classes`, `remembered_of`, `standing_motions`,
+`instants`.
 Guarantees: equal peers on complete graphs cost the same, however many they are; peers that can change places
 are one class on any graph.
 Does not: say what it can't serve (see `network`).
@@ -191,7 +192,8 @@ def _spreads(one: Remembered) -> tuple[Matrix, ...]:
 
 
 def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
-    """Return the loops of a scene, that of all classes first, and what a peer of one weighs one of another by.
+    """Return the loops of a scene, that of all classes first, and what a peer of one weighs one of another
+    by.
 
     Peers of a class can change places: each hears all others alike, of its own class too, or none of them.
     """

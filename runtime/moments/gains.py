@@ -1,8 +1,8 @@
 """The spectral radius of second moments, from how luck drives itself.
 
 Takes: the mean loops of a scene and what the luck of its channels does to them.
-Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `stein`, `around`, `scaled`,
-`of_kind`, `number_of`, `units_of`.
+Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `stein`, `around`,
+`scaled`, `of_kind`, `number_of`, `units_of`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd`).
 
@@ -42,7 +42,8 @@ DOUBLINGS, ENDLESS = 60, 1e100
 # Steps towards the radius; secants need some ten. The first is so near above the means' own growth.
 STEPS, NEAR = 60, 1e-9
 
-# How far above the means' own growth, or this, G is first looked for to be small, and how much farther each time.
+# How far above the means' own growth, or this, G is first looked for to be small, and how much farther each
+# time.
 LEAST, FIRST_GAP, WIDER = 1e-3, 1e-3, 30
 
 # How near 1 is near enough; and as far from it, slopes are not rounding.
@@ -122,8 +123,8 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
 
     Notes
     -----
-    Doubled (Smith, 1968): of 2j terms, the second half is M^j times the first. What is left out after the last
-    doubling is M^j Y M^jᵀ, at most ‖M^j‖² / (1 − ‖M^j‖²) of the largest entry of what is there.
+    Doubled (Smith, 1968): of 2j terms, the second half is M^j times the first. What is left out after the
+    last doubling is M^j Y M^jᵀ, at most ‖M^j‖² / (1 − ‖M^j‖²) of the largest entry of what is there.
     """
     total, power = driven, matrix
     for _ in range(DOUBLINGS):
@@ -297,9 +298,9 @@ def _largest(of: Gain, growth: float) -> float:
 def _radius(of: Gain, least: float) -> tuple[float | None, float]:
     """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
 
-    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. 1/G is followed, which is nearly straight
-    where G has its pole: by secants between a point on either side, one that stays twice counting half (the
-    Illinois rule).
+    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. 1/G is followed, which is nearly
+    straight where G has its pole: by secants between a point on either side, one that stays twice counting
+    half (the Illinois rule).
     """
 
     def over(growth: float) -> float:

@@ -1,7 +1,8 @@
 """The loops that the mean of all peers moves by, and what one channel's luck does to them.
 
 Takes: the loops of a scene whose ticks each hear by themselves, and what channels remember.
-Gives: `Remembered`, `remember`; `Site`, `with_memory`, `standing_state`; `Listened`, `Channel`, `MeanLoop`, `mean_loop`.
+Gives: `Remembered`, `remember`; `Site`, `with_memory`, `standing_state`; `Listened`, `Channel`, `MeanLoop`,
+`mean_loop`.
 Guarantees: each matrix comes with the radius of its rounding, those of the sites' frames included; rigid
 motions are taken out, which no luck moves.
 Does not: compute second moments (see `gains`).

@@ -44,8 +44,9 @@ MOST_CHANNELS = 6
 # Up to so many numbers, a map of moments is written out.
 FEW = 400
 
-# Of larger ones, eigenvalues that are found, the vectors they are found in, and how often from the start.
-FOUND, TRIED, RESTARTS = 4, 60, 40
+# Of larger ones, how many vectors are looked in, for how many eigenvalues and how often from the start: first
+# a few, and where none is found one alone.
+VECTORS, TRIES = 60, ((4, 40), (1, 1000))
 
 # What is left of a system of equations that is solved in as many vectors, relatively.
 LEFT = 1e-13
@@ -59,8 +60,8 @@ class Frames:
     """The whole scene in frames whose packets are lost as patterns say: `matrices` (k, n, n).
 
     The state holds each peer's own, then what each of the `channels` (link, delay, receiver, sender) holds,
-    from `held` of it on. `basis` (n, d) are the motions that nothing holds back, `laws` those of the channels.
-    `sites` (N + 1,) says where each peer's own starts.
+    from `held` of it on. `basis` (n, d) are the motions that nothing holds back, `laws` those of the
+    channels. `sites` (N + 1,) says where each peer's own starts.
     """
 
     matrices: Floats
@@ -281,20 +282,25 @@ def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
         return float(np.linalg.eigvals(np.array([step(column) for column in np.eye(start.size)])).real.max())
     linalg = load_pool("scipy.sparse.linalg")
     operator = linalg.LinearOperator((start.size, start.size), matvec=step, dtype=np.float64)
-    try:
-        values = linalg.eigs(
-            operator,
-            FOUND,
-            which="LR",
-            v0=start,
-            ncv=TRIED,
-            maxiter=RESTARTS,
-            tol=1e-13,
-            return_eigenvectors=False,
-        )
-    except linalg.ArpackNoConvergence as slow:  # the largest come first
-        values = slow.eigenvalues
-    return float(values.real.max(initial=-np.inf))
+    found: list[float] = []
+    for count, restarts in TRIES:
+        try:
+            values = linalg.eigs(
+                operator,
+                count,
+                which="LR",
+                v0=start,
+                ncv=VECTORS,
+                maxiter=restarts,
+                tol=1e-13,
+                return_eigenvectors=False,
+            )
+        except linalg.ArpackNoConvergence as slow:  # the largest come first
+            values = slow.eigenvalues
+        found = values.real.tolist()
+        if found:
+            break
+    return max(found, default=np.nan)
 
 
 def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats | None:

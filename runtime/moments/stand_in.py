@@ -404,8 +404,8 @@ def _added(of: Classes, h: int, d: int, spread: Mapping[int | None, Matrix], num
             return numbers.add(together(g, g), spread[d])
         return together(g, g)
 
-    # What luck adds: how a peer moves apart from the mean of such peers, those it hears taken alike; and which
-    # of those that differ it hears, a of n.
+    # What luck adds: how a peer moves apart from the mean of such peers, those it hears taken alike; and
+    # which of those that differ it hears, a of n.
     size = of.size(h)
     ends = np.cumsum([size] + [of.size(g) for g in classes]).tolist()
     joint = np.zeros((*alone(h).shape[:-2], ends[-1], ends[-1]))

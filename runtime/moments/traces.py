@@ -2,7 +2,8 @@
 
 Takes: a scene all of whose unreliable links say `trace`.
 Gives: `trace_radius`.
-Guarantees: nothing is left to chance: each frame hears what `simulate` hears, once the first packets are gone.
+Guarantees: nothing is left to chance: each frame hears what `simulate` hears, once the first packets are
+gone.
 Does not: serve values that stand in for missed ones, or a trace of losses only.
 
 Which packet a tick hears follows from the trace, so every frame of a period is a loop like that of an ideal
