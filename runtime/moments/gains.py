@@ -264,7 +264,8 @@ def mean_square_radius(means: tuple[float, float], of: Gain | None) -> Enclosed:
         if bounds is not None:
             above = min(above, start * (1 + width) * max(bounds[1], 1.0) * (1 + 2 * UNIT))
             wide = (bounds[1] - bounds[0]) / steep if wide is None else wide
-        width = max(8 * width, 0.0 if wide is None else wide)
+        # What bounds say near a pole says little of farther on.
+        width = min(max(8 * width, 0.0 if wide is None else wide), 64 * width)
     below, width = square[0], FIRST_WIDTH if wide is None else max(wide, FIRST_WIDTH / 8)
     while found is not None and width <= LAST_WIDTH and below < found * (1 - width):
         bounds = _bounds(of, found * (1 - width))

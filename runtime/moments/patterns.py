@@ -48,8 +48,9 @@ FEW = 400
 # a few, and where none is found one alone.
 VECTORS, TRIES = 60, ((4, 40), (1, 1000))
 
-# What is left of a system of equations that is solved in as many vectors, relatively.
-LEFT = 1e-13
+# What is left of a system of equations that is solved in as many vectors, relatively, and how often it starts
+# again.
+LEFT, RESTARTS = 1e-13, 40
 
 # What the frame of a motion that stands still may be off by, in floats.
 STANDING = 1e-12
@@ -315,7 +316,7 @@ def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats | None:
     """
     linalg = load_pool("scipy.sparse.linalg")
     operator = linalg.LinearOperator((added.size,) * 2, matvec=lambda x: x - step(x), dtype=np.float64)
-    found, open_end = linalg.gmres(operator, added, rtol=LEFT, atol=0.0, restart=TRIED, maxiter=RESTARTS)
+    found, open_end = linalg.gmres(operator, added, rtol=LEFT, atol=0.0, restart=VECTORS, maxiter=RESTARTS)
     return None if open_end else np.asarray(found)
 
 

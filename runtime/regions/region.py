@@ -328,11 +328,11 @@ def _family(source: Source, rectangle: Rectangle, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
     if isinstance(source, BatchEvaluator):
         return resolve_family(source, rectangle, partial(matrix_errors, source))
-    if timed:  # each point has a schedule of its own: there are no slopes, and no one size
-        return DirectFamily(source, rectangle, (), ())
     if isinstance(source, MeanSquareEvaluator):  # a point takes longer than what a series would save
         errors = source.errors(rectangle.values(np.array([[0.5, 0.5]])))
         return DirectFamily(source, rectangle, (1,), tuple(one[0] for one in errors))
+    if timed:  # each point has a schedule of its own: there are no slopes, and no one size
+        return DirectFamily(source, rectangle, (), ())
     return resolve_family(source, rectangle, source.errors)
 
 
@@ -347,7 +347,8 @@ def _samples(family: Family, source: Source, rectangle: Rectangle, points: Float
                 Override(free, Fraction(number)) for free, number in zip(source.free, value, strict=True)
             ]
             apply(source.system, overrides)  # says so itself if the value can't be
-            source.closed_at(value)
+            if not isinstance(source, MeanSquareEvaluator):
+                source.closed_at(value)
             what = "the scene's frame leaves the range of floating point numbers in part of the rectangle"
             raise ApcError(Mistake("E905", PLACE, what, hint="a smaller range"))
     return log_magnitudes(matrices, BRANCHES)
@@ -378,6 +379,7 @@ def _relative_error(arc: Arc, offset: Floats) -> float:
 
 def _identify(source: Source, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
+    assert not isinstance(source, MeanSquareEvaluator), "second moments have no mode"
     found = marginal_motion(with_rigid(source.closed_at(value.tolist())), eigenvalue)
     return found.name, found.turn, found.frame_s
 

@@ -73,8 +73,8 @@ VANISHING = 1e-14
 LARGEST = 1e15
 
 
-class Evaluator(Protocol):
-    """Frame matrices of closed systems over values of some parameters."""
+class Matrices(Protocol):
+    """Matrices of which the largest eigenvalue decides, over values of some parameters."""
 
     @property
     def free(self) -> tuple[Free, ...]:
@@ -85,6 +85,10 @@ class Evaluator(Protocol):
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
+
+
+class Evaluator(Matrices, Protocol):
+    """Frame matrices of closed systems over values of some parameters."""
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""

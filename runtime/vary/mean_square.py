@@ -246,14 +246,14 @@ def _samples(
     """Return the values to look at first."""
     if unit_of(system, free.name) == "1" and free.name in channel_numbers(system):
         bottom, top = low if low is not None else 0.0, high if high is not None else 1 - 1 / SHARES
-        return np.linspace(bottom, top, SHARES).tolist()
+        return [float(one) for one in np.linspace(bottom, top, SHARES)]
     scale = abs(present) or 1.0
     bottom = low if low is not None else scale / SPAN
     top = high if high is not None else max(scale, abs(bottom)) * SPAN
     if bottom > 0:
         count = max(math.ceil(SAMPLES * math.log10(top / bottom)), SAMPLES)
-        return np.geomspace(bottom, top, count + 1).tolist()
-    return np.linspace(bottom, top, 6 * SAMPLES + 1).tolist()
+        return [float(one) for one in np.geomspace(bottom, top, count + 1)]
+    return [float(one) for one in np.linspace(bottom, top, 6 * SAMPLES + 1)]
 
 
 def _crossing(at: Callable[[float], Growth], low: float, high: float, *, stable_below: bool) -> Crossing:
