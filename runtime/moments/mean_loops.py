@@ -86,8 +86,8 @@ class Channel:
 class MeanLoop:
     """A loop of means in relative coordinates: its `matrix` (2, n, n) with its radius.
 
-    `at` are these, of states that begin at `offsets`, site by site; `misses` are as those of a `Channel`, over
-    the loop's own states (2, k_slot, n).
+    `at` are these, of states that begin at `offsets`, site by site; `misses` are as those of a `Channel`,
+    over the loop's own states (2, k_slot, n).
     """
 
     name: str

@@ -56,8 +56,10 @@ class NetworkVerdict(Result):
     """What becomes of a scene whose packets get lost or come late by chance.
 
     `mean_square_radius` is what second moments grow by in a frame, right to `error`; its root compares with
-    the nominal spectral radius. `exact` is False where it is an estimate. `rms_error_m` is how far a copy is from the mean of the others; null where not asked or
-    not served, as `notes` say.
+    the nominal spectral radius. `exact` is False where it is an estimate. `rms_error_m` is how far a copy is
+    from the mean of the others, while every hand pushes with 1 N rms, anew at each tick. `almost_sure` is
+    told where mean squares do not settle it, `losses_in_a_row` where packets get lost. None is what is not
+    served, as `notes` say.
     """
 
     shown_by = "network:network"
@@ -179,7 +181,10 @@ def _by_patterns(
         return Growth(radius, low, high, False, note=note, errors=errors)
     if channels > MOST_CHANNELS:
         what = "bursts" if not all(is_memoryless(law) for _, law in lossy) else "values that stand in"
-        why = f"{what} on {channels} ways between different peers; {MOST_CHANNELS} are the most that are followed"
+        why = (
+            f"{what} on {channels} ways: followed are {MOST_CHANNELS}, or {MOST_TAGGED} equal peers that hold "
+            "what they miss"
+        )
         return Growth(np.nan, 0.0, np.inf, False, why)
     radius = pattern_radius(patterns(system, prepared, first))
     errors = partial(pattern_error, system, prepared, first)

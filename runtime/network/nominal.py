@@ -85,8 +85,8 @@ def refuse_channel_number(system: CompiledSystem, free: Free, place: Place, *, i
     """
     if free.name in channel_numbers(system):
         what = (
-            f"{free.label} can't be varied: this verdict is of the nominal network, in which no packet is lost "
-            "and all take their nominal delay"
+            f"{free.label} can't be varied: this verdict is of the nominal network, in which no packet is "
+            "lost and all take their nominal delay"
         )
         value = "2 ms" if unit_of(system, free.name) == "s" else "5 %"
         hint = instead or f'apc simulate --set {free.label}="{value}"'

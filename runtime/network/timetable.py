@@ -161,8 +161,9 @@ def _check_luck(system: CompiledSystem, route: Route, luck: Luck) -> None:
     latest, ways = luck.latest(route), len(route.pairs)
     if max(latest, route.ticks * luck.tick_period) > LONGEST:
         what = (
-            f"{route.link} is unreliable, and all its times are counted in parts of {float(luck.quantum):.6g} s,"
-            f" of which periods, phases and delays are whole multiples: at most {LONGEST} of them"
+            f"{route.link} is unreliable, and all its times are counted in parts of "
+            f"{float(luck.quantum):.6g} s, of which periods, phases and delays are whole multiples: at most "
+            f"{LONGEST} of them"
         )
         raise ApcError(Mistake("E892", Place(system.name), what, hint="periods and delays in whole µs"))
     packets = luck.kept(route) * ways

@@ -41,9 +41,8 @@ def network_text(found: NetworkVerdict) -> str:
             "nominal spectral radius",
         ]
     if found.rms_error_m is not None:
-        lines.append(
-            f"  copies apart     {found.rms_error_m * 1e3:.4g} mm rms, with 1 N rms at every hand, anew each tick"
-        )
+        apart = f"{found.rms_error_m * 1e3:.4g} mm rms"
+        lines.append(f"  copies apart     {apart}, as every hand pushes with 1 N rms, anew each tick")
     if found.almost_sure is not None:
         low, high = found.almost_sure.interval
         lines.append(

@@ -25,7 +25,7 @@ from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.names import Range
 from apc.regions.eigenpairs import Family
-from apc.vary.batch import Evaluator, Matrices
+from apc.vary.batch import Evaluator, MatrixSource
 
 Floats = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def rectangle_of(x: Range, y: Range) -> Rectangle:
 class DirectFamily:
     """A `Family` that asks the evaluator for every point."""
 
-    evaluator: Matrices
+    evaluator: MatrixSource
     rectangle: Rectangle
     sizes: tuple[int, ...]
     errors: tuple[Floats, ...]

@@ -1,7 +1,7 @@
 """The frame matrices of a system for many values of its parameters at once, with their derivatives.
 
 Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
-Gives: `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`; `lifted_here`, `relative_here`,
+Gives: `MatrixSource`, `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`; `lifted_here`, `relative_here`,
 `inverse_size`, `is_beyond`.
 Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
 derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
@@ -73,7 +73,7 @@ VANISHING = 1e-14
 LARGEST = 1e15
 
 
-class Matrices(Protocol):
+class MatrixSource(Protocol):
     """Matrices of which the largest eigenvalue decides, over values of some parameters."""
 
     @property
@@ -87,7 +87,7 @@ class Matrices(Protocol):
         """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
 
 
-class Evaluator(Matrices, Protocol):
+class Evaluator(MatrixSource, Protocol):
     """Frame matrices of closed systems over values of some parameters."""
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
