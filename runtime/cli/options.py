@@ -37,8 +37,8 @@ in_option = click.option(
     "--in",
     "criterion",
     type=click.Choice(("mean-square", "nominal")),
-    help="What stable means. mean-square: second moments die out over the network as it is, the default where "
-    "a link is unreliable; nominal: motions die out if every packet takes its nominal delay.",
+    help="What stable means. mean-square: second moments die out over the network as it is, the default "
+    "where a link is unreliable; nominal: motions die out if every packet takes its nominal delay.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 

@@ -180,10 +180,11 @@ def _by_patterns(
         errors = partial(tagged_error, system, prepared, first, ORDERS)
         return Growth(radius, low, high, False, note=note, errors=errors)
     if channels > MOST_CHANNELS:
-        what = "bursts" if not all(is_memoryless(law) for _, law in lossy) else "values that stand in"
+        bursts = not all(is_memoryless(law) for _, law in lossy)
+        what = "bursts" if bursts else "values that stand in"
         why = (
-            f"{what} on {channels} ways: followed are {MOST_CHANNELS}, or {MOST_TAGGED} equal peers that hold "
-            "what they miss"
+            f"{what} on {channels} ways: followed are {MOST_CHANNELS}, or {MOST_TAGGED} equal peers that "
+            "hold what they miss"
         )
         return Growth(np.nan, 0.0, np.inf, False, why)
     radius = pattern_radius(patterns(system, prepared, first))

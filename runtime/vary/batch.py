@@ -1,8 +1,8 @@
 """The frame matrices of a system for many values of its parameters at once, with their derivatives.
 
 Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
-Gives: `MatrixSource`, `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`; `lifted_here`, `relative_here`,
-`inverse_size`, `is_beyond`.
+Gives: `MatrixSource`, `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`; `lifted_here`,
+`relative_here`, `inverse_size`, `is_beyond`.
 Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
 derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
 its neighbours, comes out as NaN, never as a wrong number.
