@@ -88,7 +88,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator leading many bends marginal
-        delays lags search critical margins sensitivity
+        delays lags search mean_square critical margins sensitivity
         """,
     ),
     ("apc", "answer"),
@@ -108,7 +108,7 @@ HOUSE = (
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
-    ("apc.present", "forms pictures analysis vary region_picture region simulation still recording bench"),
+    ("apc.present", "forms pictures network analysis vary region_picture region simulation still recording bench"),
     # what a person calls
     (
         "apc",
