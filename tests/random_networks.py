@@ -7,13 +7,13 @@ any length, links that differ; losses, bursts and jitter, hold and zero.
 
 from __future__ import annotations
 
+import math
 import random
 import sys
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 from fractions import Fraction
-from math import prod
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library
@@ -163,6 +163,7 @@ class Tally:
     judged: int = 0
     stable: int = 0
     too_large: int = 0
+    slow: int = 0  # the reference's iteration came to no end
     beyond: int = 0  # refused by the compiler or the analysis
     undecided: int = 0
     unserved: Counter[str] = field(default_factory=Counter)
@@ -174,7 +175,7 @@ class Tally:
         why = "\n".join(f"  {count:4} {text}" for text, count in self.unserved.most_common())
         return (
             f"{self.judged} judged, {self.stable} of them stable, {self.undecided} undecided, {len(self.wrong)} wrong; "
-            f"largest difference {self.nearest:.1e}; {self.too_large} too large, {self.beyond} refused, not judged:\n{why}"
+            f"largest difference {self.nearest:.1e}; {self.too_large} too large, {self.slow} without a reference, {self.beyond} refused, not judged:\n{why}"
         )
 
 
@@ -196,6 +197,9 @@ def check(one: Draw, library: Library, tally: Tally, most: int = MOST) -> None:
     truth = second_moment_radius(system, one.laws)
     if _wrong(told, truth):
         truth = second_moment_radius(system, one.laws, thorough=True)
+    if math.isnan(truth):
+        tally.slow += 1
+        return
     tally.judged += 1
     tally.stable += bool(told.stable)
     tally.undecided += told.stable is None
@@ -221,7 +225,7 @@ def _size(system: CompiledSystem, laws: dict[str, Law]) -> int:
     """Return how many numbers the reference moves."""
     laid = _Played.__new__(_Played)
     laid.lay_out(system, laws)
-    return prod(way.states for way in laid.ways) * laid.size**2
+    return math.prod(way.states for way in laid.ways) * laid.size**2
 
 
 def run(count: int, *, seed: int = 0, quick: bool = False) -> Tally:

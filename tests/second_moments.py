@@ -126,7 +126,7 @@ def second_moment_radius(system: CompiledSystem, laws: Mapping[str, Law], *, tho
         found += np.abs(values).tolist()
         if found:
             break
-    return max(found)
+    return max(found, default=math.nan)
 
 
 class _Played:
