@@ -126,7 +126,7 @@ def second_moment_radius(system: CompiledSystem, laws: Mapping[str, Law], *, tho
         found += np.abs(values).tolist()
         if found:
             break
-    return max(found)
+    return max(found, default=math.nan)
 
 
 class _Played:
@@ -220,7 +220,7 @@ class _Played:
         return found
 
     def _flush(self) -> None:
-        """Add all that happened since luck was last drawn: one map a state of the chains, or for all."""
+        """Add what happened since luck was last drawn: one map for each state of the chains or for all."""
         whole, alike = self.pending, self.pending.ndim == 2
         self.pending = np.eye(self.size)
         self.record.append(("map", lambda modes: whole if alike else whole[tuple(modes)]))

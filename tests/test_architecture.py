@@ -108,7 +108,10 @@ HOUSE = (
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
-    ("apc.present", "forms pictures network analysis vary region_picture region simulation still recording bench"),
+    (
+        "apc.present",
+        "forms pictures network analysis vary region_picture region simulation still recording bench",
+    ),
     # what a person calls
     (
         "apc",
