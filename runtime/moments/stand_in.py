@@ -335,7 +335,13 @@ def luck_of_luck(of: Classes, growth: float, numbers: Arithmetic) -> Matrix | No
 
 
 def luck_after(of: Classes, d: int, added: Matrix, growth: float, numbers: Arithmetic) -> list[Matrix] | None:
-    """Return Ω of each class's peers in frames after those of class d got one; parameters as `spread_of`."""
+    """Return what luck adds to peers of each class where those of one got Ω, None where that has no end.
+
+    Parameters
+    ----------
+    of, d, added, growth, numbers
+        As for `spread_of`.
+    """
     spread = spread_of(of, d, added, growth, numbers)
     return None if spread is None else [_added(of, h, d, spread, numbers) for h in range(len(of.counts))]
 
