@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,6 +68,13 @@ def pushed(
 
 def users(count: int, stiffness: float) -> tuple[User, ...]:
     return (User(0.6 / count, stiffness),) * count
+
+
+def replace_in(system: CompiledSystem, **changes: Any) -> CompiledSystem:
+    """Return the scene with another channel of its link."""
+    (link,) = system.links
+    assert link.channel is not None
+    return replace(system, links=(replace(link, channel=replace(link.channel, **changes)),))
 
 
 def metres(told: Told) -> float:
@@ -153,6 +161,9 @@ def test_it_does_not_hang_on_when_frames_are_said_to_begin(delay: str) -> None:
     first = Fraction(delay.split()[0]) / 1000 % Fraction(8, 1000)
     found = pattern_error(system, prepared, first)
     assert metres(found) == pytest.approx(metres(crowd_error(system, prepared)), rel=1e-10)
+    zero = replace_in(system, on_loss="zero")
+    found = standing_error(zero, prepare(zero), first)
+    assert metres(found) == pytest.approx(metres(pattern_error(zero, prepare(zero), first)), rel=1e-10)
 
 
 def test_by_chance_it_is_as_it_is_on_the_mean() -> None:
@@ -220,10 +231,8 @@ def test_a_verdict_tells_the_error_or_why_there_is_none() -> None:
     assert shaking is not None
     assert shaking.rms_error_m is None
     assert "root mean square error of copies: only where second moments die out" in shaking.notes
-    (link,) = pushed("loss: 10 %")[0].links
-    assert link.channel is not None
-    recorded = replace(link, channel=replace(link.channel, loss=None, trace=np.array([0.008, 0.009])))
-    played = judge_network(replace(pushed("loss: 10 %")[0], links=(recorded,)))
+    delays = np.array([0.008, 0.009])
+    played = judge_network(replace_in(pushed("loss: 10 %")[0], loss=None, trace=delays))
     assert played is not None
     assert played.stable
     assert played.rms_error_m is None

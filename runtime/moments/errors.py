@@ -27,13 +27,13 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.modes import dense_loop
 from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
+from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.moments.bursts import tagged_moments
 from apc.moments.crowd import crowd, hearing, peer_classes
 from apc.moments.gains import Moments, around, gain, number_of, scaled, stein, units_of
 from apc.moments.hands import Copy, Peer, forced
 from apc.moments.patterns import every_pattern, frames, of_all, resting_moments
-from apc.moments.stand_in import entries_of, luck_of_luck, spread_of, standing_in
+from apc.moments.stand_in import Classes, entries_of, luck_after, luck_of_luck, spread_of, standing_in
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -138,30 +138,35 @@ def standing_error(system: CompiledSystem, prepared: Prepared, first: Fraction) 
         return Told(None, pushed)
     loops, _ = peer_classes(pushed.told)
     classes = [_Class(site.count, pushed.peers[id(site.schedule)]) for site in loops[0].sites]
+    plain = standing_in(system, prepared, first)
     of = standing_in(system, prepared, first, told=pushed.told)
-    if isinstance(of, str):
-        return Told(None, of)
-    entries = entries_of(of)
+    if isinstance(plain, str) or isinstance(of, str):
+        return Told(None, str(plain))
     # What a peer gets in a frame beside what moves it on the mean: its pushes, and Ω by luck.
-    known = [
-        with_radius(np.array([[float(a == b and a in one.got.drawn)] for a, b in listed]), np.zeros(1))[
-            ..., 0
-        ]
-        for one, listed in zip(classes, entries, strict=True)
-    ]
-    matrix = luck_of_luck(of, 1.0, RADII)
-    found = None if matrix is None else _solved(matrix, np.concatenate(known, axis=-1), _squares(entries))
+    pushes = [np.zeros((2, of.size(d), of.size(d))) for d in range(len(classes))]
+    for one, own in zip(classes, pushes, strict=True):
+        own[0, one.got.drawn, one.got.drawn] = 1.0
+    matrix, start = luck_of_luck(plain, 1.0, RADII), _lucky(of, pushes)
+    if matrix is None or start is None:
+        return Told(None, IN_DOUBT)
+    # What luck adds to what a peer has without them goes on as it does without them.
+    lasting = [np.delete(np.arange(of.size(d)), one.got.added) for d, one in enumerate(classes)]
+    entries = entries_of(plain)
+    places = [np.array(listed, np.intp).T for listed in entries]
+    known = [own[:, kept[a], kept[b]] for own, kept, (a, b) in zip(start, lasting, places, strict=True)]
+    found = _solved(matrix, np.concatenate(known, axis=-1), _squares(entries))
     if found is None:
         return Told(None, IN_DOUBT)
+    number = 0
+    whole = [own.copy() for own in pushes]
+    for own, kept, (a, b) in zip(whole, lasting, places, strict=True):
+        own[:, kept[a], kept[b]] = own[:, kept[b], kept[a]] = found[:, number : number + len(a)]
+        number += len(a)
+    luck = _lucky(of, whole)
     totals: dict[int | None, Matrix] = {}
-    start = 0
-    for d, listed in enumerate(entries):
-        own, size = found[:, start : start + len(listed)], of.offsets[d + 1] - of.offsets[d]
-        start += len(listed)
-        rows, columns = np.array(listed, np.intp).T
-        added = np.zeros((2, size, size))
-        added[:, rows, columns] = added[:, columns, rows] = own
-        spread = spread_of(of, d, added[None], 1.0, RADII)
+    for d, own in enumerate(pushes):
+        added = None if luck is None else RADII.add(own, luck[d])
+        spread = None if added is None else spread_of(of, d, added[None], 1.0, RADII)
         if spread is None:
             return Told(None, IN_DOUBT)
         for apart, (moments,) in spread.items():
@@ -174,6 +179,17 @@ def standing_error(system: CompiledSystem, prepared: Prepared, first: Fraction) 
         for apart, _, at in of.parts
     ]
     return _largest(spreads, classes)
+
+
+def _lucky(of: Classes, added: Sequence[Matrix]) -> list[Matrix] | None:
+    """Return what luck adds to peers of each class who get so much a frame, None where it has no bound."""
+    found = [np.zeros_like(own) for own in added]
+    for d, own in enumerate(added):
+        after = luck_after(of, d, own[None], 1.0, RADII)
+        if after is None:
+            return None
+        found = [RADII.add(one, more[0]) for one, more in zip(found, after, strict=True)]
+    return found
 
 
 def pattern_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Told:

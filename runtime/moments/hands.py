@@ -48,9 +48,13 @@ Copy = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """What of z a peer got: `drawn` are forces in N as a frame begins, `copies` positions in m."""
+    """What of z a peer got: `drawn` are forces in N as a frame begins, `copies` positions in m.
+
+    `added` are all that it got.
+    """
 
     drawn: range
+    added: range
     copies: Mapping[Copy, int]
 
 
@@ -235,7 +239,9 @@ def _pushed(
     )
     behind = first + count + len(before)
     return own, Peer(
-        range(first, first + count), {copy: behind + number for number, copy in enumerate(copies)}
+        drawn=range(first, first + count),
+        added=range(first, behind + len(copies)),
+        copies={copy: behind + number for number, copy in enumerate(copies)},
     )
 
 

@@ -1,7 +1,7 @@
 """Second moments where a receiver puts its own value in the place of a missing one.
 
 Takes: a scene whose packets are due at the same instant of each frame, lost independently of each other.
-Gives: `stand_in`; `Classes`, `standing_in`, `luck_of_luck`, `entries_of`, `spread_of`.
+Gives: `stand_in`; `Classes`, `standing_in`, `luck_of_luck`, `luck_after`, `entries_of`, `spread_of`.
 Guarantees: equal peers cost the same, however many they are.
 Does not: serve bursts (see `patterns`), jitter, or several unreliable links.
 
@@ -324,15 +324,26 @@ def luck_of_luck(of: Classes, growth: float, numbers: Arithmetic) -> Matrix | No
     for d, (rows, columns) in enumerate(listed):
         units, number = np.zeros((len(rows), of.size(d), of.size(d))), np.arange(len(rows))
         units[number, rows, columns] = units[number, columns, rows] = 1.0
-        spread = spread_of(of, d, of_kind(RADII.exact(units), numbers), growth, numbers)
-        if spread is None:
+        after = luck_after(of, d, of_kind(RADII.exact(units), numbers), growth, numbers)
+        if after is None:
             return None
-        for h, (a, b) in enumerate(listed):
-            added = _added(of, h, d, spread, numbers)
+        for h, ((a, b), added) in enumerate(zip(listed, after, strict=True)):
             block = np.moveaxis(added[..., a, b], 0, -1)
             where = np.s_[..., firsts[h] : firsts[h + 1], firsts[d] : firsts[d + 1]]
             found[where] = numbers.add(found[where], block)
     return found
+
+
+def luck_after(of: Classes, d: int, added: Matrix, growth: float, numbers: Arithmetic) -> list[Matrix] | None:
+    """Return what luck adds to peers of each class where those of one got Ω, None where that has no end.
+
+    Parameters
+    ----------
+    of, d, added, growth, numbers
+        As for `spread_of`.
+    """
+    spread = spread_of(of, d, added, growth, numbers)
+    return None if spread is None else [_added(of, h, d, spread, numbers) for h in range(len(of.counts))]
 
 
 def entries_of(of: Classes) -> list[list[tuple[int, int]]]:
