@@ -15,6 +15,8 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.regions.axes import parse_axes
+from apc.regions.region import region
 from tests.lossy import unreliable
 from tests.topologies import AVERAGE, compiled
 
@@ -108,12 +110,10 @@ def test_loss_is_a_parameter_like_others(folder: Path, capsys: pytest.CaptureFix
 
 
 def test_a_boundary_over_loss_is_not_flat(folder: Path) -> None:
-    found = apc.region(
-        compiled(unreliable("loss: 10 %")),
-        x="lan.loss=0 %:40 %",
-        y="coordination.stiffness=1000 N/m:1500 N/m",
-        criterion="mean-square",
-    )
+    system = compiled(unreliable("loss: 10 %"))
+    axes = parse_axes(system, "lan.loss=0 %:40 %", "coordination.stiffness=1000 N/m:1500 N/m")
+    found = region(system, axes, cells=3)
+    assert found.criterion == "mean-square"
     (curve,) = found.curves
     ends = dict(sorted(map(tuple, curve.points[[0, -1]].tolist())))
     # The references: 1096.4 without losses, 1384 at 40 %.
@@ -148,6 +148,7 @@ def test_a_sweep_over_loss_is_of_the_network_as_it_is() -> None:
         ("loss: 1 %, jitter: 9 ms, reorder: all", "overtaken and count all the same"),
         ("loss: 1 %, jitter: 1 ms, on_loss: zero", "together with on_loss: zero"),
         ("loss: {p: 1 %, r: 10 %}, jitter: 1 ms", "jitter and bursts of lan"),
+        ("jitter: 24 ms", "packets that may arrive at so many ticks"),
     ],
 )
 def test_what_is_not_served_is_refused_by_name(more: str, why: str) -> None:
@@ -167,8 +168,8 @@ def test_a_delay_is_not_varied_in_mean_square() -> None:
 
 
 def test_a_jitter_longer_than_the_delay_arrives_at_once_at_the_earliest() -> None:
-    """Uniform over 0 … 16 ms; with 24 ms a third of the packets would arrive before they were sent."""
-    found = [apc.judge_network(compiled(unreliable(f"jitter: {ms} ms"))) for ms in (7, 8, 24)]
+    """Uniform over 1 … 15 ms or 0 … 16 ms; of 9 ms, one in eighteen would arrive before it was sent."""
+    found = [apc.judge_network(compiled(unreliable(f"jitter: {ms} ms"))) for ms in (7, 8, 9)]
     radii = [one.mean_square_radius for one in found if one is not None]
     assert len(radii) == len(found)
     assert all(one is not None and one.stable for one in found)

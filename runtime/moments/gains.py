@@ -238,7 +238,7 @@ def number_of(value: float, numbers: Arithmetic) -> Matrix:
     return np.array([value, 4 * UNIT * abs(value)]).reshape(2, 1, 1)
 
 
-def mean_square_radius(means: tuple[float, float], of: Gain | None) -> Enclosed:
+def mean_square_radius(means: tuple[float, float], of: Gain | None, *, bounded: bool = True) -> Enclosed:
     """Enclose what second moments grow by in a frame, for all start states.
 
     Parameters
@@ -247,6 +247,8 @@ def mean_square_radius(means: tuple[float, float], of: Gain | None) -> Enclosed:
         Bounds on the spectral radius of the means.
     of
         G(λ), None where nothing is left to chance.
+    bounded
+        Whether bounds are asked for; without them, they are the radius itself.
     """
     low, high = means
     if not np.isfinite(high):
@@ -257,6 +259,8 @@ def mean_square_radius(means: tuple[float, float], of: Gain | None) -> Enclosed:
     least = max(high**2, np.finfo(np.float64).tiny)
     found, steep = _radius(of, least)
     radius = low * high if found is None else found
+    if not bounded:
+        return Enclosed(radius, radius, radius)
     above, wide = np.inf, None
     start, width = (least, NEAR) if found is None else (found, FIRST_WIDTH)
     while width <= LAST_WIDTH and above > start * (1 + width):

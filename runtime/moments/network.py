@@ -43,6 +43,9 @@ NOT_JUDGED = "not judged"
 # Peers whose bursts are followed with all tags, and with so many at most; the orders then compared.
 EXACTLY_TAGGED, MOST_TAGGED, ORDERS = 4, 8, (2, 3)
 
+# Covariances of luck that drive each other: a matrix of as many takes some ten seconds.
+MOST_ENTRIES = 300
+
 # What an iteration leaves of an eigenvalue, relatively: 1e-13 asked for, and references met to 1e-11.
 ITERATED = 1e-10
 ROUNDED = 1e-15
@@ -110,13 +113,15 @@ def unreliable(system: CompiledSystem) -> list[tuple[Link, ChannelLaw]]:
     return [(link, law) for link, law in laws if law.mean_loss or law.jitter or law.trace is not None]
 
 
-def growth(system: CompiledSystem, prepared: Prepared) -> Growth:
+def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> Growth:
     """Return what second moments grow by in a frame, common translations left out.
 
     Parameters
     ----------
     system, prepared
         The compiled scene, and what `analysis.prepare` made of it with any numbers.
+    bounded
+        Whether bounds are asked for; without them, they may be the radius itself.
     """
     lossy = unreliable(system)
     why = _unserved(system, prepared, lossy)
@@ -133,7 +138,13 @@ def growth(system: CompiledSystem, prepared: Prepared) -> Growth:
     if all(is_memoryless(law) for _, law in lossy):
         if holding == {True} or not any(law.mean_loss for _, law in lossy):
             of = crowd(system, prepared)
-            inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None)
+            if (entries := sum(len(listed) for one in of.luck for listed in one.entries)) > MOST_ENTRIES:
+                why = (
+                    f"packets that may arrive at so many ticks ({entries:,} covariances of luck, and "
+                    f"{MOST_ENTRIES} are the most): a smaller jitter or a slower clock"
+                )
+                return Growth(np.nan, 0.0, np.inf, False, why)
+            inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None, bounded=bounded)
             errors = partial(crowd_error, system, prepared)
             return Growth(inner.radius, inner.low, inner.high, True, errors=errors)
         first, why = _due(system, lossy)
@@ -141,7 +152,7 @@ def growth(system: CompiledSystem, prepared: Prepared) -> Growth:
             closed = stand_in(system, prepared, first)
             if isinstance(closed, str):
                 return Growth(np.nan, 0.0, np.inf, False, closed)
-            inner = mean_square_radius(*closed)
+            inner = mean_square_radius(*closed, bounded=bounded)
             errors = partial(standing_error, system, prepared, first)
             return Growth(inner.radius, inner.low, inner.high, True, errors=errors)
     else:

@@ -90,7 +90,14 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place) -> None:
         raise ApcError(Mistake("E898", place, what, hint=f"--in {NOMINAL}"))
 
 
-def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Override], place: Place) -> Growth:
+def growth_at(
+    system: CompiledSystem,
+    prepared: Prepared,
+    overrides: list[Override],
+    place: Place,
+    *,
+    bounded: bool = True,
+) -> Growth:
     """Return what second moments grow by with other numbers.
 
     Parameters
@@ -101,6 +108,8 @@ def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Overri
         The numbers.
     place
         Where they were asked for.
+    bounded
+        Whether bounds are asked for.
 
     Raises
     ------
@@ -108,7 +117,7 @@ def growth_at(system: CompiledSystem, prepared: Prepared, overrides: list[Overri
         E898 the network can't be judged with these numbers, by name.
     """
     changed = apply(system, overrides)
-    found = growth(changed, prepared)
+    found = growth(changed, prepared, bounded=bounded)
     if found.why:
         what = f"the scene can't be judged in mean square: {found.why}"
         raise ApcError(Mistake("E898", place, what, hint=f"--in {NOMINAL}"))
@@ -127,12 +136,12 @@ class MeanSquareEvaluator:
     prepared: Prepared
     place: Place
 
-    def growth(self, value: Sequence[float]) -> Growth:
+    def growth(self, value: Sequence[float], *, bounded: bool = False) -> Growth:
         """Return what second moments grow by at a point (m,)."""
         overrides = [
             Override(one, Fraction(float(number))) for one, number in zip(self.free, value, strict=True)
         ]
-        return growth_at(self.system, self.prepared, overrides, self.place)
+        return growth_at(self.system, self.prepared, overrides, self.place, bounded=bounded)
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
         """Return the root (k, 1, 1) at values (k, m)."""
@@ -160,7 +169,7 @@ class MeanSquareEvaluator:
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, 1, 1) on the errors of the root at values (k, m)."""
-        found = [self.growth(value) for value in values.tolist()]
+        found = [self.growth(value, bounded=True) for value in values.tolist()]
         return (np.array([(one.high - one.low) / max(one.radius, LEAST) for one in found])[:, None, None],)
 
 
@@ -213,9 +222,12 @@ def search_mean_square(
     samples = _samples(system, free, low, high, present)
     known: dict[float, Growth] = {}
 
+    def bounds_at(value: float, *, bounded: bool = True) -> Growth:
+        return growth_at(system, prepared, [Override(free, Fraction(value))], place, bounded=bounded)
+
     def at(value: float) -> Growth:
         if value not in known:
-            known[value] = growth_at(system, prepared, [Override(free, Fraction(value))], place)
+            known[value] = bounds_at(value, bounded=False)
         return known[value]
 
     for number, value in enumerate(samples):
@@ -226,7 +238,7 @@ def search_mean_square(
     edges, stable = [], [verdicts[0]]
     for place_of, (one, other) in enumerate(itertools.pairwise(samples)):
         if verdicts[place_of] != verdicts[place_of + 1]:
-            edges.append(_crossing(at, one, other, stable_below=verdicts[place_of]))
+            edges.append(_crossing(at, bounds_at, one, other, stable_below=verdicts[place_of]))
             stable.append(verdicts[place_of + 1])
     radii = {known[value].radius for value in samples}
     return Search(
@@ -256,14 +268,20 @@ def _samples(
     return [float(one) for one in np.linspace(bottom, top, 6 * SAMPLES + 1)]
 
 
-def _crossing(at: Callable[[float], Growth], low: float, high: float, *, stable_below: bool) -> Crossing:
+def _crossing(
+    at: Callable[[float], Growth],
+    bounds_at: Callable[[float], Growth],
+    low: float,
+    high: float,
+    *,
+    stable_below: bool,
+) -> Crossing:
     """Return the crossing between two values of other verdicts, and how far bounds leave it open.
 
-    By secants that keep a point on either side, the one that stays counting half each time (Illinois).
+    By secants that keep a point on either side, one that stays twice counting half (the Illinois rule).
     """
-    ends = {low: math.log(at(low).radius), high: math.log(at(high).radius)}
-    at_low, at_high = ends[low], ends[high]
-    value = low
+    at_low, at_high = math.log(at(low).radius), math.log(at(high).radius)
+    value, stayed = low, 0
     for _ in range(STEPS):
         middle = low - at_low * (high - low) / (at_high - at_low)
         if not low < middle < high:
@@ -272,12 +290,14 @@ def _crossing(at: Callable[[float], Growth], low: float, high: float, *, stable_
         if abs(found) < NEAR or high - low <= NEAR * abs(high):
             break
         if (found < 0) == (at_low < 0):
-            low, at_low, at_high = middle, found, at_high / 2
+            low, at_low = middle, found
+            at_high, stayed = (at_high / 2, 1) if stayed == 1 else (at_high, 1)
         else:
-            high, at_high, at_low = middle, found, at_low / 2
+            high, at_high = middle, found
+            at_low, stayed = (at_low / 2, -1) if stayed == -1 else (at_low, -1)
     width = FIRST * max(abs(value), 1e-300)
     while width <= FAR * max(abs(value), 1e-300):
-        below, above = at(value - width).stable, at(value + width).stable
+        below, above = bounds_at(value - width).stable, bounds_at(value + width).stable
         if None not in (below, above) and below != above:
             return Crossing(value, width, "below" if below else "above", math.nan, "crossing", BOUNDED)
         width *= 4
