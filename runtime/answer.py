@@ -122,7 +122,7 @@ def answer(
         notes = (*notes, compared.not_repeated)
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
-        network=_over_network(system, prepared),
+        network=_over_network(system, prepared, certify=certify),
         sensitivities=sensitivities_of(system, prepared, found),
         margins=_margins(system, prepared, found),
         contact_modes=modes,
@@ -132,13 +132,13 @@ def answer(
     )
 
 
-def _over_network(system: CompiledSystem, prepared: Prepared) -> NetworkVerdict | None:
+def _over_network(system: CompiledSystem, prepared: Prepared, *, certify: bool) -> NetworkVerdict | None:
     """Return the verdict over the network as it is; imported here, as most scenes have an ideal one."""
     if all(link.channel is None for link in system.links):
         return None
     from apc.moments.network import judge_network
 
-    return judge_network(system, prepared)
+    return judge_network(system, prepared, certify=certify)
 
 
 def _prove_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:

@@ -197,13 +197,13 @@ def critical(
 
 
 def judge_network(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None, certify: bool = False
 ) -> NetworkVerdict | None:
     """Say what becomes of a scene over the network that it has, lost and late packets included.
 
     Parameters
     ----------
-    model, set
+    model, set, certify
         As for `analyze`.
 
     Returns
@@ -219,7 +219,7 @@ def judge_network(
     """
     from apc.moments import network
 
-    return network.judge_network(_model(model, set))
+    return network.judge_network(_model(model, set), certify=certify)
 
 
 def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Margins:

@@ -174,3 +174,34 @@ def test_a_jitter_longer_than_the_delay_arrives_at_once_at_the_earliest() -> Non
     assert len(radii) == len(found)
     assert all(one is not None and one.stable for one in found)
     assert len(set(radii)) == len(radii)
+
+
+@pytest.mark.parametrize(
+    ("more", "stiffness", "proof"),
+    [
+        ("loss: 10 %", 500, "proved stable in mean square, by floats whose every rounding is bounded"),
+        ("loss: 10 %", 1200, "proved unstable in mean square, by floats whose every rounding is bounded"),
+        (
+            "loss: 10 %, on_loss: zero",
+            500,
+            "proved stable in mean square, by floats whose every rounding is bounded",
+        ),
+        ("loss: {p: 1 %, r: 10 %}", 500, ""),
+    ],
+)
+def test_a_proof_is_told_where_it_is_asked_for(more: str, stiffness: int, proof: str) -> None:
+    values = {"coordination.stiffness": f"{stiffness} N/m"}
+    system = compiled(unreliable(more))
+    asked, plain = (apc.judge_network(system, set=values, certify=one) for one in (True, False))
+    assert asked is not None
+    assert plain is not None
+    assert (asked.proof, plain.proof) == (proof, "")
+    assert any(text.startswith("not proved") for text in asked.notes) == (not proof)
+
+
+def test_a_scene_that_is_not_linear_is_judged_about_its_start_and_says_so() -> None:
+    text = unreliable("loss: 10 %").replace("type: SampledSpringDamper", "type: OneSidedContact")
+    found = apc.judge_network(compiled(text))
+    assert found is not None
+    assert found.linearized
+    assert str(found).splitlines()[0].endswith(", linearized at its start")

@@ -40,11 +40,18 @@ UNSTABLE = "unstable in mean square"
 UNDECIDED = "undecided"
 NOT_JUDGED = "not judged"
 
+STABLE_PROVED = "proved stable in mean square, by floats whose every rounding is bounded"
+UNSTABLE_PROVED = "proved unstable in mean square, by floats whose every rounding is bounded"
+UNPROVED = "not proved: the radius is that of an iteration in floats"
+
 # Peers whose bursts are followed with all tags, and with so many at most; the orders then compared.
 EXACTLY_TAGGED, MOST_TAGGED, ORDERS = 4, 8, (2, 3)
 
 # Covariances of luck that drive each other: a matrix of as many takes some ten seconds.
 MOST_ENTRIES = 300
+
+# Peers of which any number may be heard, one by one, where values stand in.
+ENUMERATED = 4
 
 # What an iteration leaves of an eigenvalue, relatively: 1e-13 asked for, and references met to 1e-11.
 ITERATED = 1e-10
@@ -62,7 +69,7 @@ class NetworkVerdict(Result):
     the nominal spectral radius. `exact` is False where it is an estimate. `rms_error_m` is how far a copy is
     from the mean of the others, while every hand pushes with 1 N rms, anew at each tick. `almost_sure` is
     told where mean squares do not settle it, `losses_in_a_row` where packets get lost. None is what is not
-    served, as `notes` say.
+    served, as `notes` say. `linearized`: the scene is not linear, and this holds near its start only.
     """
 
     shown_by = "network:network"
@@ -77,6 +84,7 @@ class NetworkVerdict(Result):
     rms_error_m: float | None
     almost_sure: AlmostSure | None
     losses_in_a_row: LossesInARow | None
+    linearized: bool
     notes: tuple[str, ...]
 
 
@@ -84,7 +92,8 @@ class NetworkVerdict(Result):
 class Growth:
     """What second moments grow by in a frame, with bounds; estimates where `exact` is False.
 
-    `why` says why there is none, `note` what it is. `errors` works out how far copies are from each other.
+    `why` says why there is none, `note` what it is; `proved` that every rounding is in the bounds. `errors`
+    works out how far copies are from each other.
     """
 
     radius: float
@@ -93,7 +102,7 @@ class Growth:
     exact: bool
     why: str = ""
     note: str = ""
-    proof: str = ""
+    proved: bool = False
     errors: Callable[[], Told] | None = None
 
     @property
@@ -133,7 +142,9 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
             return Growth(np.nan, 0.0, np.inf, False, found)
         low, high = found[0] ** 2, found[1] ** 2
         unserved = partial(Told, None, "it is not worked out over recorded delays")
-        return Growth((low + high) / 2, low * (1 - ROUNDED), high * (1 + ROUNDED), True, errors=unserved)
+        return Growth(
+            (low + high) / 2, low * (1 - ROUNDED), high * (1 + ROUNDED), True, proved=True, errors=unserved
+        )
     holding = {link.channel.on_loss == "hold" for link, _ in lossy if link.channel is not None}
     if all(is_memoryless(law) for _, law in lossy):
         if holding == {True} or not any(law.mean_loss for _, law in lossy):
@@ -146,7 +157,7 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
                 return Growth(np.nan, 0.0, np.inf, False, why)
             inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None, bounded=bounded)
             errors = partial(crowd_error, system, prepared)
-            return Growth(inner.radius, inner.low, inner.high, True, errors=errors)
+            return Growth(inner.radius, inner.low, inner.high, True, proved=True, errors=errors)
         first, why = _due(system, lossy)
         if not why and len(system.links) == 1 and not system.links[0].delays:
             closed = stand_in(system, prepared, first)
@@ -154,7 +165,8 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
                 return Growth(np.nan, 0.0, np.inf, False, closed)
             inner = mean_square_radius(*closed, bounded=bounded)
             errors = partial(standing_error, system, prepared, first)
-            return Growth(inner.radius, inner.low, inner.high, True, errors=errors)
+            every = system.peers <= ENUMERATED  # of more, a quadrature's nodes are rounded
+            return Growth(inner.radius, inner.low, inner.high, True, proved=every, errors=errors)
     else:
         first, why = _due(system, lossy)
     if not why and any(law.jitter for _, law in lossy):
@@ -263,7 +275,9 @@ def _due(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> tu
     return first, ""
 
 
-def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> NetworkVerdict | None:
+def judge_network(
+    system: CompiledSystem, prepared: Prepared | None = None, *, certify: bool = False
+) -> NetworkVerdict | None:
     """Judge a scene over the network that it has, None where every packet takes its nominal delay.
 
     Parameters
@@ -272,6 +286,8 @@ def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> N
         The compiled scene, with the numbers to analyse.
     prepared
         From `analysis.prepare`, of this system with any numbers.
+    certify
+        Whether a proof is asked for: which numbers carry it.
     """
     if not unreliable(system):
         return None
@@ -281,9 +297,12 @@ def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> N
         worst = worst_case(system, prepared) if any(law.mean_loss for _, law in unreliable(system)) else None
         surely, unsure = _almost_sure(system, prepared, found)
         rms = _rms_error(found)
+        linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     told = bool(np.isfinite(found.radius))
+    decided = told and found.stable is not None
     notes = (
         found.why and f"not judged: {found.why}",
+        UNPROVED if certify and decided and not found.proved else "",
         found.note,
         unsure,
         rms.why and f"root mean square error of copies: {rms.why}",
@@ -296,10 +315,13 @@ def judge_network(system: CompiledSystem, prepared: Prepared | None = None) -> N
         mean_square_radius=found.radius if told else None,
         error=max(found.high - found.radius, found.radius - found.low) if told else None,
         exact=found.exact,
-        proof=found.proof,
+        proof=(STABLE_PROVED if found.stable else UNSTABLE_PROVED)
+        if certify and decided and found.proved
+        else "",
         rms_error_m=rms.metres,
         almost_sure=surely,
         losses_in_a_row=worst,
+        linearized=not linear,
         notes=tuple(text for text in notes if text),
     )
 

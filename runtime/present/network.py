@@ -25,12 +25,13 @@ _WORDS = {
 
 def network_text(found: NetworkVerdict) -> str:
     """Return what becomes of a scene over its network, in words and numbers."""
+    judged = found.mean_square_radius is not None
+    where = "" if judged else " over its network"
     lines = [
-        f"{found.topology}: {found.verdict}{' over its network' if not found.mean_square_radius else ''}"
+        f"{found.topology}: {found.verdict}{where}{', linearized at its start' if found.linearized else ''}"
     ]
-    lines += ["", *wrapped(_WORDS.get(found.verdict.removeprefix("probably "), ""), "  ", "  ")] * bool(
-        found.mean_square_radius
-    )
+    if judged:
+        lines += ["", *wrapped(_WORDS[found.verdict.removeprefix("probably ")], "  ", "  ")]
     lines.append("")
     if found.mean_square_radius is not None:
         error = found.error or 0.0
