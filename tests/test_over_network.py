@@ -123,6 +123,8 @@ def test_a_boundary_over_loss_is_not_flat(folder: Path) -> None:
     assert found.contains(0.3, 1200.0)
     assert not found.contains(0.05, 1200.0)
     assert found.left_out == ()
+    assert str(found).splitlines()[1] == "  stable in mean square, over the network as it is"
+    assert found.plot().get_title() == "stable in mean square, over the network"
     assert folder.exists()
 
 

@@ -45,6 +45,8 @@ def region_text(found: Region) -> str:
     """Return what `apc region` prints of one region."""
     width = max(len(found.x.free.label), len(found.y.free.label))
     lines = [f"{found.topology}: {_words(found)}"]
+    if found.criterion == "mean-square":
+        lines += note("stable in mean square, over the network as it is")
     for text in found.left_out:
         lines += note(text)
     lines.append("")
@@ -107,6 +109,7 @@ def region_document(found: Region) -> dict[str, Any]:
         "area_unit": _product(found.x.unit, found.y.unit),
         "cell": list(found.cell),
         "finest_cell": found.finest,
+        "criterion": found.criterion,
         "left_out": list(found.left_out),
         "origin": dict(found.system.origin.texts),
     }

@@ -106,8 +106,11 @@ def panels_picture(found: Panels) -> Any:
 
 
 def _entitle(ax: Any, title: str, regions: Sequence[Region]) -> None:
-    """Set a title, and beneath it what the regions leave out."""
-    notes = dict.fromkeys(note for one in regions for note in one.left_out)
+    """Set a title, and beneath it what stable means and what the regions leave out."""
+    meant = ["stable in mean square, over the network"] * any(
+        one.criterion == "mean-square" for one in regions
+    )
+    notes = dict.fromkeys([*meant, *(note for one in regions for note in one.left_out)])
     lines = [line for text in (title, *notes) for line in textwrap.wrap(text, 48)]
     if lines:
         ax.set_title("\n".join(lines), fontsize=8.5)

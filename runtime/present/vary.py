@@ -45,6 +45,8 @@ def critical_text(found: Critical) -> str:
         whom = "groups" if len(found.groups) > 1 else "its peers"
         lines = [f"{found.topology}: {found.parameter}, one value for all {whom}"]
         lines += note(f"now {', '.join(own)}")
+    if found.criterion == "mean-square":
+        lines += note("stable in mean square, over the network as it is")
     for text in found.left_out:
         lines += note(text)
     lines.append("")
