@@ -38,21 +38,23 @@ STEP = 1.1  # how far apart stiffnesses are tried until the verdict changes
 NEAR = 1e-7  # how near it is then found, relatively
 SAME = 1e-6  # how near the mesh must lie to the average
 ESTIMATED = 5  # users from which bursts are followed with fewer moments than there are
-TOP = 3000.0  # the highest stiffness that is drawn
+TOP = 2600.0  # the highest stiffness that is drawn
 PLACE = Place("losses")
 
 # Where a pair of stiffnesses around the answer is first looked for.
 START = 1000.0
 
+# Shares of packets lost that are looked at, beside 0: one by one, in bursts, in bursts that are estimated.
+POINTS, FEWER, FEWEST = 24, 12, 6
+
 
 @dataclass(frozen=True)
 class Law:
-    """A way to lose packets: its words on the link, and at how many shares it is looked at, beside 0."""
+    """A way to lose packets: its words on the link, and how many in a row, None if each by itself."""
 
     label: str
     words: str
     burst: int | None
-    points: int
 
     def numbers(self, share: float) -> dict[str, float]:
         """Return the link's numbers with which such a share is lost."""
@@ -62,10 +64,10 @@ class Law:
 
 
 LAWS = (
-    Law("lost one by one, held", "loss: 10 %", None, 12),
-    Law("lost one by one, zero", "loss: 10 %, on_loss: zero", None, 12),
-    Law("bursts of 10, held", "loss: {p: 1 %, r: 10 %}", 10, 12),
-    Law("bursts of 50, held", "loss: {p: 0.2 %, r: 2 %}", 50, 12),
+    Law("lost one by one, held", "loss: 10 %", None),
+    Law("lost one by one, zero", "loss: 10 %, on_loss: zero", None),
+    Law("bursts of 10, held", "loss: {p: 1 %, r: 10 %}", 10),
+    Law("bursts of 50, held", "loss: {p: 0.2 %, r: 2 %}", 50),
 )
 
 
@@ -119,7 +121,8 @@ def largest(at: Callable[[float], Growth], start: float) -> tuple[float, float]:
 def curve(peers: int, law: Law, start: float) -> tuple[list[float], list[float], float]:
     """Return shares, the largest stable stiffness at each, and how much of one is left open at most."""
     at = growths(peers, law)
-    shares = [MOST * place / law.points for place in range(1, law.points + 1)]
+    points = POINTS if law.burst is None else FEWER if peers < ESTIMATED else FEWEST
+    shares = [MOST * place / points for place in range(1, points + 1)]
     found, left = [], 0.0
     for share in shares:
         start, open_ = largest(lambda stiffness, share=share: at(share, stiffness), start)
@@ -131,7 +134,7 @@ def curve(peers: int, law: Law, start: float) -> tuple[list[float], list[float],
 def check(peers: int, law: Law, shares: list[float], found: list[float], judge: Judge) -> list[float]:
     """Return which of the shares the mesh was asked at, and judge that it allows as much in all."""
     at = growths(peers, law, "FullMesh")
-    asked = range(2, len(shares), 4)
+    asked = range(len(shares) // 4, len(shares), -(-len(shares) // 3))
     for place in asked:
         value, _ = largest(lambda stiffness, place=place: at(shares[place], stiffness), found[place])
         what = f"mesh of {peers}, {law.label}, {shares[place]:.0%} lost"
