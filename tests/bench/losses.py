@@ -162,7 +162,7 @@ def main() -> None:
                 exact = peers < ESTIMATED or law.burst is None
                 mesh = check(peers, law, shares, found, judge)
                 told = "exact" if exact else f"an estimate: another order of moments, {left:.2g} N/m"
-                numbers = "  ".join(f"{100 * x:.0f} %: {y:.1f}" for x, y in zip(shares, found, strict=True))
+                numbers = "  ".join(f"{100 * x:.3g} %: {y:.1f}" for x, y in zip(shares, found, strict=True))
                 print(f"  {law.label:<22} {told}\n    {numbers}", flush=True)
                 percent = [100 * share for share in (0.0, *shares)]
                 ax.plot(percent, [whole, *found], color=colour, linestyle=line, label=law.label)
