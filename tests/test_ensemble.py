@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.moments.network import judge_network
 from apc.simulation import ensemble, summary
 from apc.simulation.blocks import pushes
 from apc.simulation.ensemble import PART, Ensemble, Run, play_many, share_interval
@@ -23,7 +24,7 @@ from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import play
 from tests.test_pairs import FORCES, scene
 from tests.test_selection import LINK, ODD, apart
-from tests.topologies import AVERAGE, compiled, replaced
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
 SHAKY = apart(AVERAGE, "loss: {p: 10 %, r: 20 %}, jitter: 8 ms")
 
@@ -145,6 +146,72 @@ def test_a_shares_interval_is_wilsons() -> None:
     assert share_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
     assert share_interval(0, 20) == pytest.approx((0, 0.1611), abs=5e-5)
     assert share_interval(1, 29) == pytest.approx((0.0061, 0.1718), abs=5e-5)
+
+
+PUSHES = "hands:\n  hand: {type: SineForce, flange: device, force: 1 N, frequency: 3 Hz}\n"
+
+
+def beside(text: str, runs: int = 6, seconds: str = "3") -> Ensemble:
+    return play_many(compiled(text), Settings(Fraction(seconds), seed=3), runs=runs)
+
+
+def moved(stiffness: float, loss: str) -> str:
+    """Return the three users apart at the start, over a network that loses packets."""
+    return replaced(apart(AVERAGE, loss), ("stiffness: 500 N/m", f"stiffness: {stiffness} N/m"))
+
+
+def test_runs_agree_with_the_verdict_in_mean_square() -> None:
+    """A fifth of all packets lost one by one, three users are stable to 1205 N/m."""
+    stable, unstable = beside(moved(1000, "loss: 20 %")), beside(moved(1300, "loss: 20 %"))
+    for found, verdict in ((stable, "stable in mean square"), (unstable, "unstable in mean square")):
+        assert found.mean_square is not None
+        assert found.mean_square.verdict == verdict
+        assert found.agrees
+    assert stable.calm == 6
+    assert "stable in mean square, and 6 of 6 runs settle or die away: they agree" in words(stable)
+    assert stable.to_dict()["mean_square"]["agrees"] is True
+
+
+def words(found: Ensemble) -> str:
+    text = str(found)
+    assert max(map(len, text.splitlines())) <= 80
+    return " ".join(text.split())
+
+
+def test_the_time_a_mean_square_takes_is_that_of_its_growth() -> None:
+    """Beside the radius that `judge_network` tells: after it the root of a mean square is a twentieth."""
+    text = moved(1000, "loss: 20 %")
+    verdict, found = judge_network(compiled(text)), beside(text, 1).mean_square
+    assert verdict is not None
+    assert verdict.mean_square_radius is not None
+    assert found is not None
+    assert found.settles_in is not None
+    frames = found.settles_in / 0.008
+    assert verdict.mean_square_radius ** (frames / 2) == pytest.approx(0.05, rel=1e-9)
+
+
+def test_runs_that_are_about_something_else_say_so() -> None:
+    short = beside(moved(1200, "loss: 20 %"), seconds="0.3")
+    assert short.agrees is False
+    assert "and the runs show how it begins" in words(short)
+    driven = beside(moved(500, "loss: 20 %") + PUSHES)
+    assert driven.agrees is False
+    assert "what moves the others is a force that goes on" in words(driven)
+
+
+def test_runs_with_contacts_stand_beside_the_verdict_of_the_linearization() -> None:
+    text = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8")
+    found = beside(replaced(text, ("delay: 8 ms}", "delay: 8 ms, loss: 5 %}")), 2)
+    assert found.mean_square is not None
+    assert found.mean_square.linearized
+    assert found.agrees is None
+    assert "that verdict is of small motions about the start" in words(found)
+
+
+def test_a_network_that_is_not_judged_says_why_beside_its_runs() -> None:
+    found = beside(SHAKY, 2, "0.1")
+    assert found.agrees is None
+    assert "in mean square: not judged: jitter and bursts of lan together" in words(found)
 
 
 def test_a_scene_without_chance_is_not_played_many_times() -> None:

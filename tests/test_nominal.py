@@ -21,8 +21,7 @@ def test_an_answer_can_say_what_it_leaves_out() -> None:
     assert left_out(compiled(unreliable("loss: 0 %, jitter: 0 ms"))) == ()
     [note] = left_out(compiled(unreliable("loss: {p: 1 %, r: 25 %}, jitter: 2 ms")))
     assert note == (
-        "left out: packet loss (3.85 %) and jitter of lan; here every packet takes the nominal 8 ms, and "
-        "apc simulate plays them"
+        "left out: packet loss (3.85 %) and jitter of lan; here every packet takes the nominal 8 ms"
     )
 
 

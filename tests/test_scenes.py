@@ -17,6 +17,7 @@ COMMON = "stable up to a common translation"
 # Verdict and rigid modes of the scenes on a complete graph; at their start values, where they are not linear.
 VERDICTS = {
     "finger": ("stable", 0),
+    "lossy-average": (COMMON, 1),
     "mixed-clocks": (COMMON, 1),
     "template": (COMMON, 1),
     "three-users-average": (COMMON, 1),

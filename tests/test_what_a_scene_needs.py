@@ -26,6 +26,7 @@ KEPT = {
     "experiment-average": [(4, 0, 2)],
     "experiment-mesh": [(4, 0, 2)],
     "finger": [(4, 2, 0)],  # the wall's force, and its position at the tick before
+    "lossy-average": [(4, 2, 2)],
     "mixed-clocks": [(4, 2, 10), (4, 2, 10)],  # 40 ms are five frames
     "ring-of-eight": [(4, 2, 2)],
     "star-lecture": [(4, 2, 4)],  # 20 ms are two frames

@@ -4,7 +4,7 @@ Takes: a `CompiledSystem`.
 Gives: `left_out`, `channel_numbers`, `refuse_channel_number`.
 Guarantees: a question about a number that only lost or late packets depend on is refused by name, as its
 answer would be about a network without them.
-Does not: answer for an unreliable network (see `simulate`).
+Does not: answer for an unreliable network (see `moments`).
 """
 
 from __future__ import annotations
@@ -46,8 +46,7 @@ def left_out(system: CompiledSystem, *, linear: bool = True, network: bool = Tru
         if named:
             delay = f"{float(timings[link.delay]) * 1e3:.6g} ms"
             notes.append(
-                f"left out: {' and '.join(named)} of {link.name}; here every packet takes the nominal "
-                f"{delay}, and apc simulate plays them"
+                f"left out: {' and '.join(named)} of {link.name}; here every packet takes the nominal {delay}"
             )
     return tuple(notes)
 

@@ -27,7 +27,7 @@ from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
-    from apc.simulation.ensemble import Ensemble, Statistics
+    from apc.simulation.ensemble import Ensemble, MeanSquare, Statistics
     from apc.simulation.signals import Signal
     from apc.simulation.trajectory import Played, Provenance, Trajectory
 
@@ -341,9 +341,32 @@ def ensemble_text(ensemble: Ensemble) -> str:
     settled = ensemble.statistics("settled")
     if settled is not None and settled.count < n:
         lines.append(f"  settled at: of the {settled.count} runs that settle")
+    if ensemble.mean_square is not None:
+        lines += wrapped(_beside(ensemble, ensemble.mean_square), "  ", "    ")
     if ensemble.interrupted:
         lines.append("  interrupted: there were to be more runs")
     return "\n".join(lines)
+
+
+def _beside(ensemble: Ensemble, found: MeanSquare) -> str:
+    """Return one sentence on what the runs say of the verdict in mean square."""
+    n, calm = len(ensemble.runs), ensemble.calm
+    if found.why:
+        return f"in mean square: not judged: {found.why}"
+    told = f"{found.verdict}, and {calm} of {counted(n, 'run')} settle or die away: "
+    if found.linearized:
+        return (
+            f"{told}that verdict is of small motions about the start, the runs are of contacts as they come"
+        )
+    if found.stable is None:
+        return f"{told}bounds leave that verdict open"
+    if ensemble.agrees:
+        return f"{told}they agree"
+    if not found.stable:
+        return f"{told}what makes mean squares grow is rarer, or slower, than these runs show"
+    if found.settles_in is not None and found.settles_in > ensemble.duration:
+        return f"{told}that takes some {found.settles_in:.2g} s, and the runs show how it begins"
+    return f"{told}what moves the others is a force that goes on, which that verdict is not about"
 
 
 def ensemble_document(found: Ensemble) -> dict[str, Any]:
@@ -353,7 +376,7 @@ def ensemble_document(found: Ensemble) -> dict[str, Any]:
         share_interval,
     )
 
-    n = len(found.runs)
+    n, told = len(found.runs), found.mean_square
     return {
         "topology": found.topology,
         "duration_s": float(found.duration),
@@ -365,6 +388,7 @@ def ensemble_document(found: Ensemble) -> dict[str, Any]:
             for verdict, count in found.verdicts
         },
         **{name: _statistics(found.statistics(name), QUANTILES) for name in LABELS},
+        "mean_square": None if told is None else {**document(told), "agrees": found.agrees},
     }
 
 

@@ -1,7 +1,7 @@
 """Many runs of one scene, each with packets of its own, and what they have in common.
 
 Takes: a `CompiledSystem`, its `Settings`, how many runs.
-Gives: `Run`, `Ensemble`, `play_many`; `share_interval`.
+Gives: `Run`, `Ensemble`, `MeanSquare`, `play_many`; `share_interval`.
 Guarantees: run k is the same whoever plays it, in whatever order, however many there are; a share and a mean
 stand with how far chance may have moved them; on Ctrl-C the runs that are done are kept.
 Does not: keep rows: to see run k, play it alone.
@@ -20,10 +20,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis import analysis
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
+from apc.finite_equations import finite_equations
 from apc.memory import refuse_beyond
+from apc.moments.network import growth, unreliable, verdict_of
 from apc.processes import (
     Patience,
     Workers,
@@ -38,12 +41,15 @@ from apc.simulation.blocks import blocks, instants_of, pushes
 from apc.simulation.population import Player
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
-from apc.simulation.summary import Watch, is_position
+from apc.simulation.summary import BAND, Watch, is_position
+from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
 QUANTILES = (0.05, 0.5, 0.95)
 SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
+# Verdicts of runs that come to rest, and of those that don't.
+CALM, SHAKEN = ("rests", "settles", "dies away"), ("shakes", "diverges")
 PART = 100  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
 RUN = 300  # bytes of a run that is over
 TOGETHER = 2**18  # numbers that runs side by side keep, and that rows of them are played at once
@@ -76,8 +82,27 @@ class Statistics:
 
 
 @dataclass(frozen=True, slots=True)
+class MeanSquare:
+    """The verdict in mean square that runs stand beside; `why` says why there is none.
+
+    `stable` is None where it is open. `settles_in` is the time in seconds after which the root of a mean
+    square has fallen to the part of `summary.BAND`, None where it does not fall. `linearized` says that it is
+    of small motions about the start.
+    """
+
+    verdict: str
+    stable: bool | None
+    settles_in: float | None
+    linearized: bool
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Ensemble(Result):
-    """Runs of a scene, in their order; `interrupted` says that there were to be more."""
+    """Runs of a scene, in their order; `interrupted` says that there were to be more.
+
+    `mean_square` is None where no packet is lost or late.
+    """
 
     shown_by = "simulation:ensemble"
 
@@ -86,6 +111,25 @@ class Ensemble(Result):
     seed: int
     runs: tuple[Run, ...]
     interrupted: bool = False
+    mean_square: MeanSquare | None = None
+
+    @property
+    def calm(self) -> int:
+        """How many runs come to rest, or are on their way to it."""
+        return sum(run.verdict in CALM for run in self.runs)
+
+    @property
+    def agrees(self) -> bool | None:
+        """Whether the runs show what the verdict in mean square says; None where that is open, or linearized.
+
+        Where they don't they are about something else: they are too short, or something goes on pushing.
+        """
+        found = self.mean_square
+        if found is None or found.stable is None or found.linearized:
+            return None
+        if found.stable:
+            return self.calm == len(self.runs)
+        return any(run.verdict in SHAKEN for run in self.runs)
 
     @property
     def verdicts(self) -> tuple[tuple[str, int], ...]:
@@ -163,7 +207,25 @@ def play_many(
             raise
         interrupted = True
     done.sort(key=lambda run: run.number)
-    return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted)
+    told = None if interrupted else _mean_square(system)
+    return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted, told)
+
+
+def _mean_square(system: CompiledSystem) -> MeanSquare | None:
+    """Return the verdict in mean square, None where no packet is lost or late."""
+    if not unreliable(system):
+        return None
+    try:
+        with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+            prepared = analysis.prepare(system)
+            found = growth(system, prepared)
+    except ApcError as error:  # what can't be analysed can be played
+        return MeanSquare("", None, None, False, error.mistakes[0].what)
+    linearized = not all(prepared.jacobians[group.kind].affine for group in system.groups)
+    settles_in = None
+    if 0 < found.radius < 1:
+        settles_in = 2 * math.log(BAND) / math.log(found.radius) * float(prepared.schedules[0].frame_s)
+    return MeanSquare(verdict_of(found), found.stable, settles_in, linearized, found.why)
 
 
 def _workers(

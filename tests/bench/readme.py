@@ -16,6 +16,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
 
+# How a command that draws a picture begins.
+MAKERS = ("apc ", "python -m tests.bench.losses ")
+
 BLOCK = re.compile(r"<!-- output: (?P<words>[^>]*) -->\n```text\n(?P<text>.*?)```", re.DOTALL)
 # The block of a mistake: the topology shown, with this line broken.
 ERROR, FINE, BROKEN = "error", "stiffness: 500 N/m", "stiffness: 500"
@@ -29,7 +32,7 @@ def pictures(text: str) -> dict[str, list[str]]:
     """
     shown = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
     blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
-    commands = [shlex.split(block.replace("\\\n", " ")) for block in blocks if block.startswith("apc ")]
+    commands = [shlex.split(block.replace("\\\n", " ")) for block in blocks if block.startswith(MAKERS)]
     found = {}
     for picture in shown:
         name = Path(picture).name
@@ -58,9 +61,10 @@ def printed(words: str, text: str) -> str:
 
 
 def _run(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    assert words[0] == "apc"
+    assert words[0] in {"apc", "python"}
+    module = words if words[0] == "apc" else words[2:]
     return subprocess.run(
-        [sys.executable, "-m", *words], cwd=folder, capture_output=True, text=True, check=False
+        [sys.executable, "-m", *module], cwd=folder, capture_output=True, text=True, check=False
     )
 
 
