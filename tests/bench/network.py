@@ -46,7 +46,7 @@ LOOKED = 5  # points of a curve that are asked of the opponent
 
 # Courses by hand, frames of each, and those that go before; how far apart two estimates may be, in half
 # widths of their intervals of 95 %: further is chance in one of a million.
-COURSES_BY_HAND, COURSE, SETTLING, FAR = 1000, 1000, 200, 2.5
+COURSES_BY_HAND, COURSE, SETTLING, FAR = 200, 5000, 2000, 2.5
 
 
 def matrices(peers: int, stiffness: float) -> tuple[Floats, Floats]:
@@ -217,7 +217,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer runs")
     given = parser.parse_args()
     judge = Judge(given.strict)
-    with single_threaded():
+    with single_threaded(), np.errstate(all="ignore"):
         independent(judge, 5 if given.quick else 15)
         curve(judge)
         bursts(judge)
