@@ -109,6 +109,13 @@ def test_loss_is_a_parameter_like_others(folder: Path, capsys: pytest.CaptureFix
     assert abs(nominal["value"] - 1096.4108683656323) <= 1e-6
 
 
+def test_what_is_lost_may_vary_from_nothing_on() -> None:
+    found = apc.sweep(compiled(unreliable("loss: 0 %")), {"lan.loss": "0,10 %"}, jobs=1)
+    np.testing.assert_allclose(
+        found.column("mean_square_radius"), [0.9161770691168368, 0.9136364756784219], rtol=1e-9
+    )
+
+
 def test_a_boundary_over_loss_is_not_flat(folder: Path) -> None:
     system = compiled(unreliable("loss: 10 %"))
     axes = parse_axes(system, "lan.loss=0 %:40 %", "coordination.stiffness=1000 N/m:1500 N/m")

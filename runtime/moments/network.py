@@ -122,6 +122,7 @@ def unreliable(system: CompiledSystem) -> list[tuple[Link, ChannelLaw]]:
     return [(link, law) for link, law in laws if law.mean_loss or law.jitter or law.trace is not None]
 
 
+@np.errstate(all="ignore")
 def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> Growth:
     """Return what second moments grow by in a frame, common translations left out.
 

@@ -245,7 +245,7 @@ def region(
     line from cell edge to cell edge, its error the size of a cell.
     """
     free = tuple(axis.free for axis in axes)
-    meant = criterion_of(system, criterion, PLACE)
+    meant = criterion_of(system, criterion, PLACE, free)
     for one in free:
         if meant == NOMINAL:
             refuse_channel_number(system, one, PLACE, instead=f"--in {MEAN_SQUARE}")

@@ -149,7 +149,7 @@ def sweep(
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
     grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
-    meant = criterion_of(system, criterion, PLACE)
+    meant = criterion_of(system, criterion, PLACE, [axis.free for axis in grid.axes])
     work_of = of if meant == NOMINAL else in_mean_square(of)
     quantity = find_quantity(system, work_of)
     for axis in grid.axes:

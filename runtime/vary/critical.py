@@ -112,7 +112,7 @@ def critical(
         of an unreliable link; and those of `units.quantity`.
     """
     free = find(system, name.strip(), _PLACE)
-    chosen_criterion = criterion_of(system, criterion, _PLACE)
+    chosen_criterion = criterion_of(system, criterion, _PLACE, [free])
     by_chance = chosen_criterion == MEAN_SQUARE
     if not by_chance:
         refuse_channel_number(system, free, _PLACE, instead=f"--in {MEAN_SQUARE}")

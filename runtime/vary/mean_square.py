@@ -46,8 +46,8 @@ NEAR, FAR = 1e-14, 1e-4
 FIRST, STEPS = 1e-12, 60
 
 
-def criterion_of(system: CompiledSystem, asked: str | None, place: Place) -> str:
-    """Return the criterion of a verdict: as asked, or mean square where a link is unreliable.
+def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied: Sequence[Free] = ()) -> str:
+    """Return the criterion of a verdict: as asked, or mean square where a link is, or may become, unreliable.
 
     Parameters
     ----------
@@ -57,6 +57,8 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place) -> str
         "mean-square", "nominal", or None.
     place
         Where it was asked for.
+    varied
+        What is to vary.
 
     Raises
     ------
@@ -66,7 +68,8 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place) -> str
     if asked not in (None, MEAN_SQUARE, NOMINAL):
         what = f"{str(asked)[:40]} is no criterion ({MEAN_SQUARE}, {NOMINAL})"
         raise ApcError(Mistake("E898", place, what, hint=f"--in {MEAN_SQUARE}"))
-    return asked or (MEAN_SQUARE if unreliable(system) else NOMINAL)
+    by_chance = unreliable(system) or any(one.name in channel_numbers(system) for one in varied)
+    return asked or (MEAN_SQUARE if by_chance else NOMINAL)
 
 
 def refuse_time(system: CompiledSystem, free: Free, place: Place) -> None:
