@@ -174,3 +174,29 @@ def test_a_jitter_longer_than_the_delay_arrives_at_once_at_the_earliest() -> Non
     assert len(radii) == len(found)
     assert all(one is not None and one.stable for one in found)
     assert len(set(radii)) == len(radii)
+
+
+@pytest.mark.parametrize(
+    ("more", "stiffness", "said"),
+    [
+        ("loss: 10 %", "500 N/m", "  losses in a row  any pattern of at most 1 is certified harmless"),
+        ("loss: 10 %", "1090 N/m", "  losses in a row  not even one at a time is certified harmless"),
+        ("loss: 10 %", "1500 N/m", "  losses in a row  with none a motion grows by 1.03224 a frame"),
+    ],
+)
+def test_what_is_said_of_losses_fits_their_number_and_the_line(more: str, stiffness: str, said: str) -> None:
+    found = apc.judge_network(compiled(unreliable(more)), set={"coordination.stiffness": stiffness})
+    lines = str(found).splitlines()
+    assert said in lines
+    assert max(map(len, lines)) <= 80
+
+
+def test_how_soon_bursts_end_is_scanned_from_where_they_end(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(folder, "loss: {p: 1 %, r: 10 %}")
+    found = document(["critical", "lan.loss.r", path], capsys)
+    assert found["verdict"].startswith("stable")
+    assert found["crossings"] == []
+    assert run(["critical", "coordination.damping", path, "--lower", "10 N*s/m", "--upper", "400 N*s/m"]) == 0
+    assert "–" not in capsys.readouterr().out  # second moments have no frequency

@@ -48,7 +48,10 @@ MOST_ENTRIES = 300
 
 # What an iteration leaves of an eigenvalue, relatively: 1e-13 asked for, and references met to 1e-11.
 ITERATED = 1e-10
-ROUNDED = 1e-15
+ROUNDED = 4e-15
+
+# How many times what two estimates differ by counts as their error; what bounds may be apart at most.
+DOUBTS, LOOSE = 10, 1e-9
 
 # How much earlier than its nominal delay a jitter of 1 can make a packet.
 EARLIEST = {"uniform": 1.0, "normal": LATEST["normal"], "pareto": 2 / 3}
@@ -131,9 +134,14 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
         found = trace_radius(system, prepared)
         if isinstance(found, str):
             return Growth(np.nan, 0.0, np.inf, False, found)
-        low, high = found[0] ** 2, found[1] ** 2
         unserved = partial(Told, None, "it is not worked out over recorded delays")
-        return Growth((low + high) / 2, low * (1 - ROUNDED), high * (1 + ROUNDED), True, errors=unserved)
+        low, high = found.low**2 * (1 - ROUNDED), found.high**2 * (1 + ROUNDED)
+        if low > 1 or high < 1 or high - low < LOOSE:
+            return Growth(min(max(found.radius**2, low), high), low, high, True, errors=unserved)
+        doubt = max(DOUBTS * 2 * found.radius * found.doubt, LOOSE)
+        note = f"an estimate: bounds on the roundings of {found.frames:,} frames leave it open"
+        radius = found.radius**2
+        return Growth(radius, max(radius - doubt, 0.0), radius + doubt, False, note=note, errors=unserved)
     holding = {link.channel.on_loss == "hold" for link, _ in lossy if link.channel is not None}
     if all(is_memoryless(law) for _, law in lossy):
         if holding == {True} or not any(law.mean_loss for _, law in lossy):
