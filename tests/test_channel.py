@@ -11,6 +11,7 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
+from apc.moments.memory import arrives
 from apc.network.channel import LATEST, PARETO_MOST, channel_law, deviates
 from tests.lossy import RELIABLE, delays, unreliable
 from tests.topologies import compiled
@@ -78,3 +79,10 @@ def test_pareto_is_netems_table() -> None:
     assert LATEST["pareto"] == PARETO_MOST
     ends = deviates("pareto", np.array([0.0, 1 - 16 / 65536]), np.zeros(2))
     assert ends.tolist() == [pytest.approx(-2 / 3), 4.0]
+
+
+def test_the_latest_packets_of_a_table_have_arrived_at_the_latest_tick() -> None:
+    """One in 91 is 4 jitters late, all at one instant: 7.2 ms + 4·2.2 ms is the tick at 16 ms."""
+    law = replace(RELIABLE, delay=0.0072, jitter=0.0022, distribution="pareto")
+    assert Fraction(law.jitter) > Fraction(22, 10_000)  # so that the quotient falls short of 4
+    assert arrives(law, Fraction(72, 10_000), Fraction(16, 1000)) == 1.0

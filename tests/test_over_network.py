@@ -157,7 +157,7 @@ def test_a_sweep_over_loss_is_of_the_network_as_it_is() -> None:
         ("loss: 1 %, jitter: 9 ms, reorder: all", "overtaken and count all the same"),
         ("loss: 1 %, jitter: 1 ms, on_loss: zero", "together with on_loss: zero"),
         ("loss: {p: 1 %, r: 10 %}, jitter: 1 ms", "jitter and bursts of lan"),
-        ("jitter: 24 ms", "packets that may arrive at so many ticks"),
+        ("jitter: 24 ms", "covariances of luck that drive loops of"),
     ],
 )
 def test_what_is_not_served_is_refused_by_name(more: str, why: str) -> None:
@@ -214,3 +214,29 @@ def test_a_scene_that_is_not_linear_is_judged_about_its_start_and_says_so() -> N
     assert found is not None
     assert found.linearized
     assert str(found).splitlines()[0].endswith(", linearized at its start")
+
+
+@pytest.mark.parametrize(
+    ("more", "stiffness", "said"),
+    [
+        ("loss: 10 %", "500 N/m", "  losses in a row  any pattern of at most 1 is certified harmless"),
+        ("loss: 10 %", "1090 N/m", "  losses in a row  not even one at a time is certified harmless"),
+        ("loss: 10 %", "1500 N/m", "  losses in a row  with none a motion grows by 1.03224 a frame"),
+    ],
+)
+def test_what_is_said_of_losses_fits_their_number_and_the_line(more: str, stiffness: str, said: str) -> None:
+    found = apc.judge_network(compiled(unreliable(more)), set={"coordination.stiffness": stiffness})
+    lines = str(found).splitlines()
+    assert said in lines
+    assert max(map(len, lines)) <= 80
+
+
+def test_how_soon_bursts_end_is_scanned_from_where_they_end(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(folder, "loss: {p: 1 %, r: 10 %}")
+    found = document(["critical", "lan.loss.r", path], capsys)
+    assert found["verdict"].startswith("stable")
+    assert found["crossings"] == []
+    assert run(["critical", "coordination.damping", path, "--lower", "10 N*s/m", "--upper", "400 N*s/m"]) == 0
+    assert "–" not in capsys.readouterr().out  # second moments have no frequency

@@ -53,6 +53,7 @@ class Hearing:
     rows: Mapping[int, tuple[Selected, ...]]
     timings: Mapping[str, Fraction]
     frame: Fraction
+    quantum: Fraction
     strictly: bool  # a tick misses what arrives just then
 
     def of(self, loop: Loop) -> list[tuple[Selected, ...]]:
@@ -89,7 +90,8 @@ def hearing(
     moved = replace(system, timings=tuple(replace(one, value=timings[one.name]) for one in system.timings))
     groups, exchange = lifted_groups(moved, prepared=replace(prepared, schedules=by_tick, timings=timings))
     strictly = prepared.order.index("tick") < prepared.order.index("deliver")
-    return Hearing(groups, exchange, rows, timings, schedules[0].frame_s, strictly)
+    frame, quantum = schedules[0].frame_s, schedules[0].quantum
+    return Hearing(groups, exchange, rows, timings, frame, quantum, strictly)
 
 
 def own_value(row: Selected) -> Sent:

@@ -2,7 +2,7 @@
 
 Takes: the mean loops of a scene and what the luck of its channels does to them.
 Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `stein`, `around`,
-`scaled`, `of_kind`, `number_of`, `units_of`.
+`scaled`, `of_kind`, `number_of`, `units_of`, `too_much`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd`).
 
@@ -51,6 +51,20 @@ CLOSE, ROUGH = 1e-13, 1e-6
 
 # How near it is enclosed at first, relatively, and how much farther at last.
 FIRST_WIDTH, LAST_WIDTH = 1e-11, 1e-3
+
+
+# Covariances of luck times cubes of the means' states: as much takes some ten seconds.
+MOST_WORK = 20_000_000
+
+
+def too_much(entries: int, states: int) -> str:
+    """Return why so many covariances of luck that drive loops of so many states are not followed, or ""."""
+    if entries * states**3 <= MOST_WORK:
+        return ""
+    return (
+        f"{entries:,} covariances of luck that drive loops of {states} states would take minutes: fewer "
+        "ticks at which a packet may arrive, a shorter delay, or fewer peers that differ"
+    )
 
 
 @dataclass(frozen=True, slots=True)

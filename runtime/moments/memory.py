@@ -25,7 +25,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.network.channel import LATEST, PARETO_MOST, PARETO_SHAPE, ChannelLaw
+from apc.network.channel import LATEST, PARETO_SHAPE, ChannelLaw
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +34,9 @@ SAME_CHANCE = 1e-15
 
 # Roundings of a probability, relative to 1: those of its law's numbers and of erfc or a power.
 CHANCE_ROUNDINGS = 8
+
+# Of a quotient of times by a jitter, which is a float: the latest packets of a table arrive all at once.
+ROUNDED = 4e-16
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +99,7 @@ def arrives(law: ChannelLaw, delay: Fraction, elapsed: Fraction, *, strictly: bo
     if not law.jitter:
         return kept if elapsed > delay or (elapsed == delay and not strictly) else 0.0
     late = float((elapsed - delay) / Fraction(law.jitter))
-    if late >= LATEST[law.distribution]:
+    if late >= LATEST[law.distribution] * (1 - ROUNDED):
         return kept
     match law.distribution:
         case "uniform":
@@ -107,7 +110,6 @@ def arrives(law: ChannelLaw, delay: Fraction, elapsed: Fraction, *, strictly: bo
             offset = PARETO_SHAPE / (PARETO_SHAPE - 1)
             tail = late * 3 / 4 + offset  # as `channel.deviates`, turned around
             share = 1 - tail**-PARETO_SHAPE if tail > 1 else 0.0
-            share = 1.0 if late >= PARETO_MOST else share
     return kept * min(max(share, 0.0), 1.0)
 
 

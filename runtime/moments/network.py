@@ -25,7 +25,7 @@ from apc.moments.almost_sure import AlmostSure, almost_sure, unplayed
 from apc.moments.bursts import tagged_radius
 from apc.moments.crowd import crowd
 from apc.moments.errors import Told, crowd_error, pattern_error, standing_error, tagged_error
-from apc.moments.gains import gain, mean_square_radius
+from apc.moments.gains import gain, mean_square_radius, too_much
 from apc.moments.memory import is_memoryless
 from apc.moments.patterns import MOST_CHANNELS, pattern_radius, patterns
 from apc.moments.stand_in import stand_in
@@ -47,15 +47,15 @@ UNPROVED = "not proved: the radius is that of an iteration in floats"
 # Peers whose bursts are followed with all tags, and with so many at most; the orders then compared.
 EXACTLY_TAGGED, MOST_TAGGED, ORDERS = 4, 8, (2, 3)
 
-# Covariances of luck that drive each other: a matrix of as many takes some ten seconds.
-MOST_ENTRIES = 300
-
 # Peers of which any number may be heard, one by one, where values stand in.
 ENUMERATED = 4
 
 # What an iteration leaves of an eigenvalue, relatively: 1e-13 asked for, and references met to 1e-11.
 ITERATED = 1e-10
-ROUNDED = 1e-15
+ROUNDED = 4e-15
+
+# How many times what two estimates differ by counts as their error; what bounds may be apart at most.
+DOUBTS, LOOSE = 10, 1e-9
 
 # How much earlier than its nominal delay a jitter of 1 can make a packet.
 EARLIEST = {"uniform": 1.0, "normal": LATEST["normal"], "pareto": 2 / 3}
@@ -141,20 +141,21 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
         found = trace_radius(system, prepared)
         if isinstance(found, str):
             return Growth(np.nan, 0.0, np.inf, False, found)
-        low, high = found[0] ** 2, found[1] ** 2
         unserved = partial(Told, None, "it is not worked out over recorded delays")
-        return Growth(
-            (low + high) / 2, low * (1 - ROUNDED), high * (1 + ROUNDED), True, proved=True, errors=unserved
-        )
+        low, high = found.low**2 * (1 - ROUNDED), found.high**2 * (1 + ROUNDED)
+        if low > 1 or high < 1 or high - low < LOOSE:
+            return Growth(min(max(found.radius**2, low), high), low, high, True, proved=True, errors=unserved)
+        doubt = max(DOUBTS * 2 * found.radius * found.doubt, LOOSE)
+        note = f"an estimate: bounds on the roundings of {found.frames:,} frames leave it open"
+        radius = found.radius**2
+        return Growth(radius, max(radius - doubt, 0.0), radius + doubt, False, note=note, errors=unserved)
     holding = {link.channel.on_loss == "hold" for link, _ in lossy if link.channel is not None}
     if all(is_memoryless(law) for _, law in lossy):
         if holding == {True} or not any(law.mean_loss for _, law in lossy):
             of = crowd(system, prepared)
-            if (entries := sum(len(listed) for one in of.luck for listed in one.entries)) > MOST_ENTRIES:
-                why = (
-                    f"packets that may arrive at so many ticks ({entries:,} covariances of luck, and "
-                    f"{MOST_ENTRIES} are the most): a smaller jitter or a slower clock"
-                )
+            entries = sum(len(listed) for one in of.luck for listed in one.entries)
+            states = [channel.matrix.shape[-1] for part in of.parts for channel in part.channels.values()]
+            if why := too_much(entries, max(states, default=0)):
                 return Growth(np.nan, 0.0, np.inf, False, why)
             inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None, bounded=bounded)
             errors = partial(crowd_error, system, prepared)

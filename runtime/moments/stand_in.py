@@ -37,7 +37,7 @@ from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import Selected, Way
 from apc.moments.crowd import Hearing, hearing, own_value, peer_classes, remembered_of, standing_motions
-from apc.moments.gains import Gain, around, number_of, of_kind, scaled, stein
+from apc.moments.gains import Gain, around, number_of, of_kind, scaled, stein, too_much
 from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
 from apc.network.channel import channel_law
 
@@ -126,7 +126,10 @@ def stand_in(
         As for `standing_in`.
     """
     found = standing_in(system, prepared, first)
-    return found if isinstance(found, str) else (found.means, partial(luck_of_luck, found))
+    if isinstance(found, str):
+        return found
+    why = too_much(sum(map(len, entries_of(found))), found.offsets[-1])
+    return why or (found.means, partial(luck_of_luck, found))
 
 
 def standing_in(

@@ -1,7 +1,7 @@
 """A scene over recorded delays, played again and again: frames that come back after a period.
 
 Takes: a scene all of whose unreliable links say `trace`.
-Gives: `trace_radius`.
+Gives: `trace_radius`, `Found`.
 Guarantees: nothing is left to chance: each frame hears what `simulate` hears, once the first packets are
 gone.
 Does not: serve values that stand in for missed ones, or a trace of losses only.
@@ -12,9 +12,10 @@ network, its packets of other ages; what all do in a period is the product of th
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -27,20 +28,33 @@ from apc.eigen.closing import Loop, close, feedback_of, lay_out_loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import arrange
 from apc.eigen.peer_group import MOST_STATES
-from apc.eigen.relative import relative, relative_coordinates
+from apc.eigen.relative import Relative, relative, relative_coordinates
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Heard, Schedule, Selected, Sent
 from apc.moments.crowd import Hearing, hearing, instants
+from apc.network.timetable import instant_of
 
 Floats = NDArray[np.float64]
+Balls = NDArray[Any]  # of numbers with their radii
 
 # Frames of a period that are multiplied one by one.
 MOST_FRAMES = 20_000
 
 
-def trace_radius(system: CompiledSystem, prepared: Prepared) -> tuple[float, float] | str:
-    """Return bounds on what motions grow by in a frame, on the mean over a period; or why there are none.
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What motions grow by in a frame: proved bounds, and an estimate with how far another one is from it."""
+
+    low: float
+    high: float
+    radius: float
+    doubt: float
+    frames: int
+
+
+def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found | str:
+    """Return what motions grow by in a frame, on the mean over a period; or why that is not told.
 
     Parameters
     ----------
@@ -52,18 +66,16 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> tuple[float, flo
     clocks = {clock.name: clock for clock in system.clocks}
     loops = arrange(told.groups, told.exchange).loops
     rows = {row: None for listed in told.rows.values() for row in listed}
+    slots = {name: len(instants(told, clocks[link.clock])) for name, link in links.items()}
+    frames = math.lcm(*(_period_of(links[row.way.link], slots[row.way.link]) for row in rows))
+    if frames > MOST_FRAMES:
+        return f"the recorded delays come again after {frames:,} frames, and {MOST_FRAMES:,} are the most"
     heard: dict[Selected, list[int]] = {}
-    periods = []
     for row in rows:
         link = links[row.way.link]
         sent = instants(told, clocks[link.clock])
         tick = instants(told, clocks[row.clock])[row.tick]
         heard[row] = _heard(link, told.timings[row.way.delay], sent, tick, told)
-        periods.append(len(heard[row]))
-    frames = math.lcm(*periods) if periods else 1
-    if frames > MOST_FRAMES:
-        return f"the recorded delays come again after {frames:,} frames, and {MOST_FRAMES:,} are the most"
-    slots = {name: len(instants(told, clocks[link.clock])) for name, link in links.items()}
     depth = {
         name: max(
             (-(number // slots[name]) for row in rows if row.way.link == name for number in heard[row]),
@@ -71,7 +83,7 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> tuple[float, flo
         )
         for name in links
     }
-    low, high = 0.0, 0.0
+    found = []
     for loop in loops:
         if (
             sum(
@@ -81,38 +93,44 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> tuple[float, flo
             > MOST_STATES
         ):
             return "the recorded delays are longer than can be followed"
-        found = _period(loop, told, heard, depth, slots, frames)
-        low, high = max(low, found[0]), max(high, found[1])
-    return low, high
+        found.append(_period(loop, told, heard, depth, slots, frames))
+    low, high = max(one.low for one in found), max(one.high for one in found)
+    return Found(low, high, max(one.radius for one in found), max(one.doubt for one in found), frames)
 
 
 def _heard(link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, told: Hearing) -> list[int]:
     """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame."""
     slots = len(sent)
     trace = None if link.channel is None else link.channel.trace
-    delays = np.array([float(delay)]) if trace is None else trace
-    period = math.lcm(len(delays), slots) // slots
-    finite = delays[np.isfinite(delays)]
-    back = math.ceil(Fraction(float(finite.max())) / told.frame) + math.ceil(len(delays) / slots) + 2
+    delays = (
+        [delay]
+        if trace is None
+        else [instant_of(late, told.quantum) if math.isfinite(late) else None for late in trace.tolist()]
+    )
+    longest = max(late for late in delays if late is not None)
+    newest = link.channel is None or link.channel.reorder == "newest"
     found = []
-    for frame in range(period):
-        best: tuple[Any, int] | None = None
-        for number in range(-back * slots, slots):
+    for frame in range(_period_of(link, slots)):
+        best: tuple[Fraction, int] | None = None
+        for number in itertools.count(slots - 1, -1):
             ago, slot = divmod(number, slots)
+            at = sent[slot] + ago * told.frame
+            if best is not None and (newest or at + longest < best[0]):
+                break  # what was sent before this can't have arrived later
             late = delays[(frame * slots + number) % len(delays)]
-            if not np.isfinite(late):
+            if late is None or at + late > tick or (at + late == tick and told.strictly):
                 continue
-            exact = delay if trace is None else Fraction(float(late))
-            arrived = sent[slot] + ago * told.frame + exact
-            if arrived < tick or (arrived == tick and not told.strictly):
-                rank = (
-                    number if link.channel is None or link.channel.reorder == "newest" else (arrived, number)
-                )
-                if best is None or rank > best[0]:
-                    best = rank, number
+            best = max(best or (at + late, number), (at + late, number))
         assert best is not None
         found.append(best[1])
     return found
+
+
+def _period_of(link: Link, slots: int) -> int:
+    """Return after how many frames what ticks hear of a link comes again."""
+    trace = None if link.channel is None else link.channel.trace
+    count = 1 if trace is None else len(trace)
+    return math.lcm(count, slots) // slots
 
 
 def _period(
@@ -122,33 +140,72 @@ def _period(
     depth: Mapping[str, int],
     slots: Mapping[str, int],
     frames: int,
-) -> tuple[float, float]:
-    """Return bounds on the growth of a loop in a frame."""
-    product = None
-    at = None
+) -> Found:
+    """Return what a loop grows by in a frame."""
+    known: dict[tuple[int, ...], Balls] = {}
+    rows = [told.rows[id(site.schedule)] for site in loop.sites]
+    coordinates: Relative | None = None
+    # The eigenvalues of a product are those of its halves in either order, with other roundings.
+    halves: list[Balls] = []
+    scale = 0
     for frame in range(frames):
-        sites = []
-        for site in loop.sites:
-            rows = tuple(
-                _packet(row, heard[row][frame % len(heard[row])], slots)
-                for row in told.rows[id(site.schedule)]
-            )
-            depths = tuple(depth[one.link] for one in site.schedule.sent)
-            schedule: Schedule = replace(site.schedule, heard=rows, depths=depths)
-            sites.append(replace(site, schedule=schedule))
-        now = replace(loop, sites=tuple(sites))
-        layout = lay_out_loop(now)
-        matrix = close(
-            [site.lifted.bounded for site in sites], feedback_of(now, layout), layout, numbers=RADII
-        ).matrix
-        if at is None:
-            at = relative_coordinates(find_rigid_modes(now, with_drifts=False).basis)
-        known = replace(at, weights=with_radius(at.weights, at.doubt))
-        own = relative(matrix, known, RADII)
-        product = own if product is None else RADII.multiply(own, product)
-    assert product is not None
-    _, found = enclose_eigenvalues(value_of(product), radius_of(product))
-    return found.low ** (1 / frames), found.high ** (1 / frames)
+        numbers = tuple(heard[row][frame % len(heard[row])] for listed in rows for row in listed)
+        if numbers not in known:
+            now = _hearing_so(loop, rows, iter(numbers), depth, slots)
+            layout = lay_out_loop(now)
+            matrix = close(
+                [site.lifted.bounded for site in now.sites], feedback_of(now, layout), layout, numbers=RADII
+            ).matrix
+            if coordinates is None:
+                at = relative_coordinates(find_rigid_modes(now, with_drifts=False).basis)
+                coordinates = replace(at, weights=with_radius(at.weights, at.doubt))
+            known[numbers] = relative(matrix, coordinates, RADII)
+        if frame in (0, frames // 2):
+            halves.append(known[numbers])
+        else:
+            product = RADII.multiply(known[numbers], halves[-1])
+            halves[-1], more = _scaled(product, float(np.abs(value_of(product)).max(initial=0.0)))
+            scale += more
+    first, last = halves[0], halves[-1]
+    product, turned = last, value_of(last)
+    if len(halves) > 1:
+        product, turned = RADII.multiply(last, first), value_of(first) @ value_of(last)
+    # Enclosures are as narrow as asked for where the radius is near 1.
+    product, more = _scaled(product, _radius(value_of(product)))
+    _, bounds = enclose_eigenvalues(value_of(product), radius_of(product))
+    found = bounds.low, bounds.high, _radius(value_of(product)), _radius(np.ldexp(turned, -more))
+    unit = math.exp2((scale + more) / frames)
+    low, high, radius, other = (one ** (1 / frames) * unit for one in found)
+    return Found(low, high, radius, abs(other - radius), frames)
+
+
+def _radius(matrix: Floats) -> float:
+    """Return the spectral radius of a matrix, in floats."""
+    return float(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0))
+
+
+def _scaled(matrix: Balls, near: float) -> tuple[Balls, int]:
+    """Return a matrix over the power of two that a number is near to, and its exponent."""
+    exponent = math.frexp(near)[1] if 0 < near < math.inf else 0
+    value, radius = (np.ldexp(one, -exponent) for one in (value_of(matrix), radius_of(matrix)))
+    return with_radius(value, radius), exponent
+
+
+def _hearing_so(
+    loop: Loop,
+    rows: Sequence[Sequence[Selected]],
+    numbers: Iterator[int],
+    depth: Mapping[str, int],
+    slots: Mapping[str, int],
+) -> Loop:
+    """Return a loop whose ticks hear the packets of these numbers."""
+    sites = []
+    for site, listed in zip(loop.sites, rows, strict=True):
+        depths = tuple(depth[one.link] for one in site.schedule.sent)
+        packets = tuple(_packet(row, next(numbers), slots) for row in listed)
+        schedule: Schedule = replace(site.schedule, heard=packets, depths=depths)
+        sites.append(replace(site, schedule=schedule))
+    return replace(loop, sites=tuple(sites))
 
 
 def _packet(row: Selected, number: int, slots: Mapping[str, int]) -> Heard:

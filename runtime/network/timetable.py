@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem` with its numbers, who hears whom, the frame and the quantum of its schedules, a
 seed.
-Gives: `Route`, `routes_of`; `Luck`, `luck_of`; `Timetable`, `Listener`, `Seen`, `START`.
+Gives: `Route`, `routes_of`; `Luck`, `luck_of`; `Timetable`, `Listener`, `Seen`, `START`; `instant_of`.
 Guarantees: without loss and jitter a tick sees the packet that `scheduling` says; a way is heard alike by all
 clocks of a receiver; it does not matter how time is cut into pieces; what is remembered does not grow with
 time.
@@ -40,6 +40,11 @@ START = -1  # the "packet" before the first: the sender's start values
 FINENESS = 2**20
 # No delay or frame is longer than so many quanta: integers of their parts would overflow.
 LONGEST = 2**40
+
+
+def instant_of(seconds: float, quantum: Fraction) -> Fraction:
+    """Return when something happens that a float of seconds says, as finely as arrivals are told apart."""
+    return round(Fraction(seconds) / quantum * FINENESS) * quantum / FINENESS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -42,8 +42,8 @@ def network_text(found: NetworkVerdict) -> str:
             "nominal spectral radius",
         ]
     if found.rms_error_m is not None:
-        apart = f"{found.rms_error_m * 1e3:.4g} mm rms"
-        lines.append(f"  copies apart     {apart}, as every hand pushes with 1 N rms, anew each tick")
+        apart = f"{found.rms_error_m * 1e3:.4g} mm rms, as every hand pushes with 1 N rms, anew each tick"
+        lines += wrapped(apart, "  copies apart     ", " " * 19)
     if found.almost_sure is not None:
         low, high = found.almost_sure.interval
         lines.append(
@@ -65,8 +65,11 @@ def _losses(found: NetworkVerdict) -> list[str]:
     assert row is not None
     lines = []
     if row.certified is not None:
-        lines.append(f"  losses in a row  any pattern of at most {row.certified} is certified harmless")
-    if row.unstable_pattern is not None and row.growth is not None:
+        harmless = f"any pattern of at most {row.certified}" if row.certified else "not even one at a time"
+        lines.append(f"  losses in a row  {harmless} is certified harmless")
+    if row.unstable_pattern is not None and not any(row.unstable_pattern):
+        lines.append(f"  losses in a row  with none a motion grows by {row.growth:.6g} a frame")
+    elif row.unstable_pattern is not None and row.growth is not None:
         pattern = "".join("×" if lost else "·" for lost in row.unstable_pattern)
         lines += wrapped(
             f"{pattern} lost again and again (×) makes a motion grow by {row.growth:.6g} a frame",

@@ -60,7 +60,8 @@ def critical_text(found: Critical) -> str:
         value = measured(one.value, one.error, found.unit) if one.error else exact
         lines.append(f"{mark} {value}")
         kind = "jump, " if one.kind == "jump" else ""
-        lines.append(f"    {kind}stable {one.stable_side} it, {in_hertz(one.frequency_hz)}, {one.proof}")
+        turns = f", {in_hertz(one.frequency_hz)}" if one.frequency_hz == one.frequency_hz else ""
+        lines.append(f"    {kind}stable {one.stable_side} it{turns}, {one.proof}")
     lines += ["", f"  scanned from {low} to {high}"]
     if found.stretches:
         counts = f"within each of {counted(found.stretches, 'piece', ',d')} nothing depends on it: "

@@ -260,7 +260,10 @@ def _samples(
 ) -> list[float]:
     """Return the values to look at first."""
     if unit_of(system, free.name) == "1" and free.name in channel_numbers(system):
-        bottom, top = low if low is not None else 0.0, high if high is not None else 1 - 1 / SHARES
+        # Bursts that never end (r = 0) have no long run, and all packets lost neither.
+        endless = {link.channel.loss.r for link in system.links if link.channel and link.channel.loss}
+        least = 1 / SHARES if free.name in endless else 0.0
+        bottom, top = low if low is not None else least, high if high is not None else 1 - 1 / SHARES
         return [float(one) for one in np.linspace(bottom, top, SHARES)]
     scale = abs(present) or 1.0
     bottom = low if low is not None else scale / SPAN
