@@ -109,7 +109,8 @@ def beside(rows: list[str]) -> str:
     """Return the section of what other programs take."""
     about = (
         "Processor time of one core, both of a row measured in one run of the part named last. An error is\n"
-        "the true one, `≤` what apc says itself that it is at most. Below 1 apc is the faster."
+        "the true one; after `≤` stands the most it may be, apc's own bound where it gives one.\n"
+        "Below 1 apc is the faster."
     )
     rule = "|---" * HEAD.count(" | ") + "|---|---|"
     return "\n".join([f"## {BESIDE}", "", about, "", f"{HEAD} measured in |", rule, *rows, ""])
