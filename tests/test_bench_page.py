@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench.__main__ import HERE, PAGE, PARTS, Part, main, run, sections
+from tests.bench.__main__ import BESIDE, HERE, PAGE, PARTS, Part, main, run, sections
+from tests.bench.judge import HEAD, Judge
 from tests.bench.readme import BLOCK, ERROR, README, pictures, printed
 
 HELPERS = {  # not run by themselves
@@ -42,12 +43,12 @@ def test_a_quick_run_is_of_the_same_program() -> None:
 
 
 def test_a_section_shows_its_command_its_output_and_how_it_ended() -> None:
-    fine, code = run(Part("one", "Title", ("apc", "--version")), quick=False)
+    fine, _, code = run(Part("one", "Title", ("apc", "--version")), quick=False)
     assert code == 0
     assert fine.startswith("## Title\n\n`apc --version` (20")
     assert "```text\napc" in fine
     assert "ended with" not in fine
-    wrong, code = run(Part("two", "T", ("apc", "check", "no.yaml")), quick=True)
+    wrong, _, code = run(Part("two", "T", ("apc", "check", "no.yaml")), quick=True)
     assert code == 1
     assert "It ended with code 1." in wrong
 
@@ -55,14 +56,14 @@ def test_a_section_shows_its_command_its_output_and_how_it_ended() -> None:
 def test_what_a_program_says_on_stderr_is_kept_beside_its_output(monkeypatch: pytest.MonkeyPatch) -> None:
     both = subprocess.CompletedProcess([], 1, "a table\n", "E922 not every hard case came out right\n")
     monkeypatch.setattr("tests.bench.__main__.subprocess.run", lambda *_, **__: both)
-    text, code = run(Part("one", "Title", ("apc", "--version")), quick=False)
+    text, _, code = run(Part("one", "Title", ("apc", "--version")), quick=False)
     assert "```text\na table\n\nE922 not every hard case came out right\n```" in text
     assert code == 1
 
 
 def test_a_part_that_fails_fails_the_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def ran(part: Part, *_: object) -> tuple[str, int]:
-        return f"## {part.title}\n", int(part.name == "map")
+    def ran(part: Part, *_: object) -> tuple[str, list[str], int]:
+        return f"## {part.title}\n", [], int(part.name == "map")
 
     monkeypatch.setattr("tests.bench.__main__.PAGE", tmp_path / "README.md")
     monkeypatch.setattr("tests.bench.__main__.run", ran)
@@ -71,6 +72,35 @@ def test_a_part_that_fails_fails_the_page(monkeypatch: pytest.MonkeyPatch, tmp_p
     monkeypatch.setattr("sys.argv", ["bench"])
     with pytest.raises(SystemExit, match="failed: map"):
         main()
+
+
+def test_the_first_table_is_made_of_the_rows_of_the_parts_and_keeps_those_not_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    page = tmp_path / "README.md"
+    monkeypatch.setattr("tests.bench.__main__.PAGE", page)
+
+    def played(seconds: float, *names: str) -> list[str]:
+        def ran(words: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+            judge = Judge()
+            judge.beside(words[2].rpartition(".")[2], (seconds, "1e-9"), "by hand", (2.0, "–"))
+            said = f"a line\n\n{HEAD}\n{judge.rows[0]}\n\nevery number is right\n"
+            return subprocess.CompletedProcess([], 0, said, "")
+
+        monkeypatch.setattr("tests.bench.__main__.subprocess.run", ran)
+        monkeypatch.setattr("sys.argv", ["bench", *(word for name in names for word in ("--only", name))])
+        main()
+        found = sections(page.read_text(encoding="utf-8"))
+        assert "```text\na line\n\nevery number is right\n```" in found["Regions"]
+        return [line for line in found[BESIDE].splitlines() if "by hand" in line]
+
+    row = "| {} | {} | 1e-9 | by hand | 2 s | – | {} | {} |"
+    first = played(0.5, "region", "map")
+    assert first == [
+        row.format("region", "500 ms", "0.25", "Regions"),
+        row.format("map", "500 ms", "0.25", "The paper's map"),
+    ]
+    assert played(4.0, "map") == [first[0], row.format("map", "4 s", "2", "The paper's map")]
 
 
 def test_every_part_with_targets_knows_strict() -> None:
@@ -83,7 +113,7 @@ def test_every_part_with_targets_knows_strict() -> None:
 
 def test_the_page_has_a_section_a_part_and_gives_them_back() -> None:
     text = PAGE.read_text(encoding="utf-8")
-    assert list(sections(text)) == [part.title for part in PARTS]
+    assert list(sections(text)) == [BESIDE, *(part.title for part in PARTS)]
     assert text.endswith("\n".join(sections(text).values()))
 
 

@@ -4,7 +4,9 @@ First the spectral radius of one frame, without the eigenvalue 1 of the common t
 
     apc             compiled before; the analysis alone
     NumPy by hand   SciPy's exponential of one user, a frame of eight ticks, users joined by hand
-    textbook        the same with (1 − e^(−bT/m)) m/b instead of an exponential
+    modes by hand   by an expert: equal users are two modes of one, with participation and a disc for every
+                    eigenvalue
+    textbook        NumPy by hand with (1 − e^(−bT/m)) m/b instead of an exponential
     python-control  the plants sampled by its `c2d`; it has no systems of several rates, so that the frame is
                     again joined by hand
 
@@ -63,6 +65,7 @@ ROUNDS = 15
 # Damping of device and cube, in N·s/m: the paper's, and one at which the textbook's form loses its digits.
 assert DEVICE_DAMPING == CUBE_DAMPING
 DAMPINGS = (DEVICE_DAMPING, 1e-6)
+MODES, MOST = "modes by hand", 3.0  # the program that answers as much, and what of its time apc may take
 SECONDS = 1  # that are played
 # Most that a state may be off, in m and m/s: of 1000 ticks each rounds states of at most 1 by 1e-16, which
 # all in one direction are 1e-13; ten times that is no rounding.
@@ -83,6 +86,11 @@ class Row:
     seconds: float
     error: float
     bound: float | None = None
+
+    def told(self, unit: str) -> tuple[float, str]:
+        """Return the seconds, and the error in words."""
+        most = "" if self.bound is None else f" ≤ {self.bound:.1e}"
+        return self.seconds, f"{self.error:.1e}{most}{unit}"
 
 
 def by_exponential(mass: float, damping: float) -> Floats:
@@ -106,8 +114,8 @@ def by_control(mass: float, damping: float) -> Floats:
     return np.hstack([sampled.A, sampled.B])
 
 
-def radius(step: Callable[[float, float], Floats], damping: float) -> float:
-    """Return the spectral radius of a frame of all users over (x, v, x_O, v_O, F_C, F_T, packet)."""
+def one_user(step: Callable[[float, float], Floats], damping: float) -> tuple[Floats, Floats]:
+    """Return a tick over (x, v, x_O, v_O, F_C, F_T, packet), and what of the packets of others it hears."""
     device, cube = step(DEVICE_MASS, damping), step(CUBE_MASS, damping)
     tick = np.zeros((7, 7))
     tick[:2, :2], tick[:2, 4] = device[:, :2], -device[:, 2]
@@ -117,6 +125,31 @@ def radius(step: Callable[[float, float], Floats], damping: float) -> float:
     tick[6, 6] = 1
     hears = np.zeros((7, 7))
     hears[5, 6] = -K_T
+    return tick, hears
+
+
+def modes_by_hand(damping: float) -> tuple[list[Floats], list[Floats], float]:
+    """Return the participation and the discs of each mode's eigenvalues, and the spectral radius."""
+    tick, hears = one_user(by_exponential, damping)
+    shares, discs, sizes = [], [], []
+    for weight in (1.0, -1 / (USERS - 1)):  # all alike, and apart
+        frame = np.linalg.matrix_power(tick + weight * hears, TICKS)
+        frame[6] = [0, 0, 1, 0, 0, 0, 0]
+        values, vectors = np.linalg.eig(frame)
+        inverse = np.linalg.inv(vectors)
+        shares.append(np.abs(inverse.T * vectors))
+        rounded = np.finfo(float).eps * len(frame) * np.abs(inverse) @ np.abs(frame) @ np.abs(vectors)
+        off = np.abs(inverse @ frame @ vectors - np.diag(values))
+        discs.append((off + rounded).sum(axis=1))  # Gershgorin's
+        sizes.append(np.abs(values))
+        if weight == 1:  # that of all moving together is 1
+            sizes[0][np.argmin(np.abs(values - 1))] = 0
+    return shares, discs, float(np.max(sizes))
+
+
+def radius(step: Callable[[float, float], Floats], damping: float) -> float:
+    """Return the spectral radius of a frame of all users."""
+    tick, hears = one_user(step, damping)
     mean = (np.ones((USERS, USERS)) - np.eye(USERS)) / (USERS - 1)
     fast = np.kron(np.eye(USERS), tick) + np.kron(mean, hears)
     frame = np.linalg.matrix_power(fast, TICKS)
@@ -135,6 +168,7 @@ def compare(damping: float, rounds: int = ROUNDS) -> dict[str, Row]:
     calls: dict[str, Callable[[], float]] = {
         "apc": lambda: analyze(system).spectral_radius,
         "NumPy by hand": lambda: radius(by_exponential, damping),
+        MODES: lambda: modes_by_hand(damping)[-1],
         "textbook": lambda: radius(by_textbook, damping),
     }
     if importlib.util.find_spec("control"):
@@ -185,13 +219,15 @@ def _rows(ready: Simulation) -> Floats:
     return np.concatenate([block.values for block in blocks(ready)])
 
 
-def show(title: str, table: dict[str, Row], judge: Judge) -> None:
+def show(title: str, table: dict[str, Row], judge: Judge, unit: str = "") -> None:
     """Print a table of times and errors, and judge those that come with a bound."""
     print(f"{title}\n\n  program              median      ratio      error")
     for name, row in table.items():
         said = "" if row.bound is None else judge.within(f"{name}, {title}", row.error, row.bound)
         ratio = row.seconds / table["apc"].seconds
         print(f"  {name:<16} {1e3 * row.seconds:8.3f} ms {ratio:10.3f} {row.error:10.1e}  {said}".rstrip())
+        if name != "apc":
+            judge.beside(title, table["apc"].told(unit), name, row.told(unit))
     print()
 
 
@@ -199,9 +235,12 @@ def main() -> None:
     """Print a table for each question, and who is left out."""
     judge = Judge(parser_of("comparison", __doc__).parse_args().strict)
     for damping in DAMPINGS:
-        show(f"spectral radius of the paper's scene, damping {damping:g} N·s/m", compare(damping), judge)
+        title, found = f"spectral radius of the paper's scene, damping {damping:g} N·s/m", compare(damping)
+        show(title, found, judge)
+        ratio = found["apc"].seconds / found[MODES].seconds
+        print(f"  apc / {MODES} {ratio:.2f}, target {MOST:g} {judge.in_time(title, ratio, MOST)}\n")
     print(WHOLE)
-    show(f"12 states of three users at every tick of {SECONDS} s, error in m and m/s", play(), judge)
+    show(f"12 states of three users at every tick of {SECONDS} s", play(), judge, " m, m/s")
     packages = {"python-control": ("control", "control")}
     packages |= {name: (module, package) for name, (module, package, *_) in SIMULATORS.items()}
     for name, (module, package) in packages.items():

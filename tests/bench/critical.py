@@ -32,7 +32,7 @@ from apc.frame.overrides import Override, apply
 from apc.vary.critical import critical
 from apc.vary.margins import margins
 from apc.vary.sensitivity import sensitivities
-from tests.bench.judge import Judge, parser_of
+from tests.bench.judge import NOISE, Judge, parser_of
 from tests.bench.paper_scene import K_C
 from tests.bruteforce import Scene, frame_matrices, frame_matrix
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled
@@ -182,18 +182,26 @@ def delays(judge: Judge) -> None:
         value, error, seconds, most, more = _apart("coordination.stiffness", Fraction(frames, 125), "")
         hand, own = timed(partial(gain_by_hand, frames))
         apart = abs(own - value) / value
+        work = f"critical coordination.stiffness, {frames} frames late"
+        ours = seconds, f"≤ {error / value:.0e}"
+        judge.beside(work, ours, "sweep of frequencies, Newton", (hand, f"{apart:.0e} apart"))
         print(
             f"  {frames:>4} frames late {value:19.10f} {seconds:8.3f} {most:5.0f} {more:5.0f} "
             f"{error / value:8.0e} {hand:8.3f} {seconds / hand:6.2f} {apart:7.0e} "
             f"{judge.right(f'{frames} frames, by hand', apart < 1e-8)}"
         )
-    for what, one, target in (("seconds", seconds, LONGEST_S), ("megabytes", most, LONGEST_MB)):
-        print(f"    {what} of the longest: {judge.in_time(f'{frames} frames, {what}', one, target)}")
+    for what, one, target, noise in (
+        ("seconds", seconds, LONGEST_S, NOISE),
+        ("megabytes", most, LONGEST_MB, 1.0),
+    ):
+        print(f"    {what} of the longest: {judge.in_time(f'{frames} frames, {what}', one, target, noise)}")
     print("critical lan.delay")
     for upper in UPPER:
         value, error, seconds, most, more = _apart("lan.delay", Fraction(1, 125), upper)
         reach = float(upper.split()[0]) / (1000 if "ms" in upper else 1)
         hand, first = timed(partial(delay_by_hand, reach))
+        work, ours = f"critical lan.delay up to {upper}", (seconds, f"≤ {error:.0e} s")
+        judge.beside(work, ours, "eigenvalues at each delay", (hand, "same delay"))
         print(
             f"  up to {upper:<9} {value:19.10f} {seconds:8.3f} {most:5.0f} {more:5.0f} {error:8.0e} "
             f"{hand:8.3f} {seconds / hand:6.2f}         {judge.right(f'{upper}, by hand', first == value)}"

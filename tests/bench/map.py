@@ -221,6 +221,12 @@ def at_once(judge: Judge, rounds: int) -> None:
     )
     print(f"  ratio {ours / theirs:.2f}: {judge.in_time('many at once / modal program', ours / theirs, 1)}")
     judge.within("many at once: error of the radius / bound", beside, 1)
+    judge.beside(
+        f"{len(k_c):,} points: verdict, radius, modes",
+        (ours, f"{off:.1e} ≤ {bound:.1e}"),
+        "NumPy, two modes, all points at once",
+        (theirs, f"{naive:.1e}"),
+    )
 
 
 def main() -> None:
