@@ -231,7 +231,7 @@ def size_note(simulation: Simulation, *, decimal: bool) -> str:
     decimal
         Whether the file is a text.
     """
-    rows, columns = simulation.rows, len(simulation.signals) + 1
+    rows, columns = simulation.rows - len(simulation.marks), len(simulation.signals) + 1  # of whole frames
     size = rows * columns * (DECIMAL if decimal else BINARY)
     if size < LARGE:
         return ""
