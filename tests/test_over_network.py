@@ -171,6 +171,12 @@ def test_what_is_not_served_is_refused_by_name(more: str, why: str) -> None:
     assert error.value.mistakes[0].hint == "--in nominal"
 
 
+def test_a_share_that_cannot_be_judged_is_not_sent_to_the_nominal_network() -> None:
+    with pytest.raises(apc.ApcError, match=r"E898 .* lan loses everything") as error:
+        apc.critical(compiled(unreliable("loss: 1 %")), "lan.loss", lower="99 %", upper="100 %")
+    assert error.value.mistakes[0].hint == "a narrower range between --lower and --upper"
+
+
 def test_a_delay_is_not_varied_in_mean_square() -> None:
     with pytest.raises(apc.ApcError, match=r"E898 lan\.delay can't be varied in mean square"):
         apc.critical(compiled(unreliable("loss: 1 %")), "lan.delay")
@@ -234,7 +240,7 @@ def test_what_is_said_of_losses_fits_their_number_and_the_line(more: str, stiffn
 def test_how_soon_bursts_end_is_scanned_from_where_they_end(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = written(folder, "loss: {p: 1 %, r: 10 %}")
+    path = written(folder, "loss: {p: 1 %, r: 10 %}", ("count: 3", "count: 2"))
     found = document(["critical", "lan.loss.r", path], capsys)
     assert found["verdict"].startswith("stable")
     assert found["crossings"] == []

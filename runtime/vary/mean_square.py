@@ -123,7 +123,9 @@ def growth_at(
     found = growth(changed, prepared, bounded=bounded)
     if found.why:
         what = f"the scene can't be judged in mean square: {found.why}"
-        raise ApcError(Mistake("E898", place, what, hint=f"--in {NOMINAL}"))
+        narrower = any(one.free.name in channel_numbers(system) for one in overrides)
+        hint = "a narrower range between --lower and --upper" if narrower else f"--in {NOMINAL}"
+        raise ApcError(Mistake("E898", place, what, hint=hint))
     return found
 
 
