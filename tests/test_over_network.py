@@ -97,6 +97,19 @@ def test_the_largest_stable_stiffness_is_that_of_the_references(more: str, value
     assert found.stable_side == "below"
 
 
+@pytest.mark.parametrize(
+    ("more", "proof"),
+    [
+        ("loss: 10 %", "second moments bounded on either side"),
+        ("loss: {p: 1 %, r: 10 %}", "second moments by iteration in floats, not proved"),
+    ],
+)
+def test_a_crossing_claims_no_more_than_its_moments_do(more: str, proof: str) -> None:
+    system = compiled(unreliable(more).replace("count: 3", "count: 2"))
+    found = apc.critical(system, "coordination.stiffness", lower="1100 N/m", upper="1500 N/m")
+    assert [one.proof for one in found.crossings] == [proof]
+
+
 def test_loss_is_a_parameter_like_others(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stiff = ("stiffness: 500 N/m", "stiffness: 1143.224858916119 N/m")
     words = ["critical", "lan.loss", written(folder, "loss: 5 %", stiff), "--lower", "2 %", "--upper", "20 %"]

@@ -305,9 +305,12 @@ def _crossing(
             at_low, stayed = (at_low / 2, -1) if stayed == -1 else (at_low, -1)
     width = FIRST * max(abs(value), 1e-300)
     while width <= FAR * max(abs(value), 1e-300):
-        below, above = bounds_at(value - width).stable, bounds_at(value + width).stable
+        sides = bounds_at(value - width), bounds_at(value + width)
+        below, above = (one.stable for one in sides)
         if None not in (below, above) and below != above:
-            return Crossing(value, width, "below" if below else "above", math.nan, "crossing", BOUNDED)
+            proof = BOUNDED if all(one.proved for one in sides) else ITERATED
+            proof = proof if all(one.exact for one in sides) else TAGGED
+            return Crossing(value, width, "below" if below else "above", math.nan, "crossing", proof)
         width *= 4
     side = "below" if stable_below else "above"
     return Crossing(value, width, side, math.nan, "crossing", ESTIMATED)
@@ -315,3 +318,5 @@ def _crossing(
 
 BOUNDED = "second moments bounded on either side"
 ESTIMATED = "an estimate: bounds leave either side open"
+ITERATED = "second moments by iteration in floats, not proved"
+TAGGED = "an estimate, not proved: of second moments that are themselves estimates"
