@@ -263,7 +263,8 @@ class Kind:
     """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
 
     A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
-    `parameters`, the rationals that floats round, each float at most one of them.
+    `parameters`, the rationals that floats round, each float at most one of them. `hands` are the parts that
+    the scene calls hands.
     """
 
     name: str
@@ -275,6 +276,7 @@ class Kind:
     sends: tuple[SendPartition, ...]
     ports: Ports | None = None
     rounded: tuple[tuple[int, tuple[Fraction, ...]], ...] = ()
+    hands: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

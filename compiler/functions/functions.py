@@ -168,6 +168,13 @@ class _KindBuilder:
                 for link in dict.fromkeys(link for link, _ in channels.values())
             ),
             self._ports(writer, inputs),
+            hands=tuple(
+                part.name
+                for part in self.scene.parts
+                if part.section == "hands"
+                and "." not in part.name
+                and part.name in self.kind.clocked.flat.parts
+            ),
         )
 
     def _writer(self, names: Iterable[str]) -> tuple[Writer, _Inputs]:

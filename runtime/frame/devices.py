@@ -1,0 +1,300 @@
+"""What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
+
+Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
+Gives: `Device`, `find_device`, `devices_of`; `clamped`, `held`, `HAND`; `refuse_hands`.
+Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
+Does not: ask whether it is stable (see `passivity` for hands of every kind).
+
+A device is what a peer moves and does not tell others about: what it tells them of is a copy of what all
+hold. With m v' = f + …, a slope of v' over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at
+that place does, whatever is rigidly connected with it.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem, Kind, Parameter, Ports, Receive
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.exact import evaluate_exact
+from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.parameters import exact_numbers, resolve
+from apc.frame.start import Listening, start_arguments
+
+# What the parameters of a hand that is put on every device are named after, and what each is.
+HAND = "hand"
+_NUMBERS = (
+    ("mass", "kg", "what of the hand moves with the device"),
+    ("damping", "N*s/m", "of the hand, to where the arm stands"),
+    ("stiffness", "N/m", "of the hand, to where it holds the device at the start"),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Device:
+    """What a hand holds: the part, its position and velocity among the states.
+
+    A force F there adds F · `inverse` to the rate of the velocity, exact for the numbers it was found with;
+    `mass` is the same for any, as a CasADi function (x, u, p, t) → 1/m.
+    """
+
+    part: str
+    position: int
+    velocity: int
+    inverse: Fraction
+    symbolic: Any  # casadi.Function
+
+
+def find_device(
+    site: SiteJacobians,
+    parameters: NDArray[np.float64],
+    unit_of: Mapping[str, str],
+    listening: Listening | None = None,
+    *,
+    part: str = "",
+) -> Device | str | None:
+    """Return what a hand holds, None where there is nothing; or say why that can't be said.
+
+    Parameters
+    ----------
+    site, parameters, unit_of, listening
+        The kind, a vector (n_p,) of its parameters, their units, and what it hears at the start.
+    part
+        The part that is meant; without it, the only one that others are not told about.
+    """
+    kind = site.kind
+    if not (site.walkable and kind.derivative.is_a("SXFunction")):
+        return f"{kind.name} has a nonlinear loop"
+    told_of = {
+        _part(kind.states[place].name)
+        for send, sending in zip(site.pattern.sends, kind.sends, strict=True)
+        for row, unit in zip(send.x, sending.units, strict=True)
+        if unit == "m"
+        for place in np.flatnonzero(row)
+    }
+    masses = tuple(place for place, name in enumerate(kind.parameters) if unit_of.get(name) == "kg")
+    x, u, _, _, p, t = start_arguments(site, exact_numbers(kind, parameters), Fraction, listening)
+    found: dict[str, Device | str] = {}
+    for place, state in enumerate(kind.states):
+        driven = np.flatnonzero(site.pattern.a[place])
+        own = _part(state.name)
+        wanted = own == part if part else own not in told_of
+        if state.unit != "m" or not wanted or len(driven) != 1 or site.pattern.b[place].any():
+            continue
+        velocity = int(driven[0])
+        slopes, *changes = evaluate_exact(_slopes(kind, velocity, masses), [x, u, p, t])
+        inverses = {
+            (mass, at): -change[at] / slopes[at]
+            for mass, change in enumerate(changes)
+            for at in range(len(slopes))
+            if slopes[at] and change[at]
+        }
+        if len(set(inverses.values())) == 1:
+            (mass, at), inverse = next(iter(inverses.items()))
+            found[own] = Device(own, place, velocity, inverse, _inverse(kind, velocity, masses[mass], at))
+        elif inverses:
+            found[own] = f"{own} moves with masses that move otherwise, and a hand may hold any of them"
+    if not found:
+        return None
+    if len(found) > 1:
+        return f"a hand may hold any of {', '.join(found)} ({kind.name})"
+    (one,) = found.values()
+    return f"{one} ({kind.name})" if isinstance(one, str) else one
+
+
+def _part(name: str) -> str:
+    """Return the part that a state or a parameter is of."""
+    return name.rpartition(".")[0]
+
+
+@functools.lru_cache(maxsize=64)
+def _slopes(kind: Kind, velocity: int, masses: tuple[int, ...]) -> Any:
+    """Return the slopes of a velocity's rate over states and holds, and how they change with each mass."""
+    slopes, changes, inputs = _rates(kind, velocity, masses)
+    return casadi.Function("slopes", inputs, [casadi.densify(one) for one in (slopes, *changes)])
+
+
+def _rates(kind: Kind, velocity: int, masses: Sequence[int]) -> tuple[Any, list[Any], list[Any]]:
+    """Return the same as expressions, and the symbols they are of."""
+    x, u, p, t = kind.derivative.sx_in()
+    rate = kind.derivative(x, u, p, t)[velocity]
+    slopes = casadi.jacobian(rate, casadi.vertcat(x, u)).T
+    return slopes, [casadi.jacobian(slopes, p[mass]) for mass in masses], [x, u, p, t]
+
+
+@functools.lru_cache(maxsize=64)
+def _inverse(kind: Kind, velocity: int, mass: int, at: int) -> Any:
+    """Return 1/m as a function of (x, u, p, t), from one slope and how it changes with a mass."""
+    slopes, (change,), inputs = _rates(kind, velocity, [mass])
+    return casadi.Function("inverse_inertia", inputs, [casadi.simplify(-change[at] / slopes[at])])
+
+
+def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands") -> dict[int, Device]:
+    """Return the device of each kind of peer.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    part
+        The part that is meant; without it, the only one that others are not told about.
+    option
+        What asked for it.
+
+    Raises
+    ------
+    ApcError
+        E910 a peer without a device, or with several that a hand might hold.
+    """
+    unit_of = {one.name: one.unit for one in system.parameters}
+    numbers = resolve(system)
+    found: dict[int, Device] = {}
+    for place, group in enumerate(system.groups):
+        if group.kind in found:
+            continue
+        site = jacobians(system.kinds[group.kind])
+        one = find_device(site, numbers.parameters[place][0], unit_of, part=part)
+        if isinstance(one, Device):
+            found[group.kind] = one
+            continue
+        why = (
+            one
+            or f"{group.name} has no {part or 'device: every mass of it is a copy that others are told of'}"
+        )
+        hint = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
+        raise ApcError(Mistake("E910", Place(system.origin.topology), f"{option}: {why}", hint=hint))
+    return found
+
+
+def refuse_hands(system: CompiledSystem, option: str) -> None:
+    """Refuse a scene that has hands already: ApcError E911."""
+    for group in system.groups:
+        for hand in system.kinds[group.kind].hands:
+            what = f"{option}: {group.name} has a hand already, {hand}"
+            hint = f"a scene without {hand}, or no {option}"
+            raise ApcError(Mistake("E911", Place(system.origin.topology), what, hint=hint))
+
+
+def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> CompiledSystem:
+    """Return a scene whose devices are held fast where they start.
+
+    Raises
+    ------
+    ApcError
+        E910 as `devices_of`, E911 hands in the scene.
+    """
+    refuse_hands(system, option)
+    devices = devices_of(system, option=option)
+    kinds = list(system.kinds)
+    for number, device in devices.items():
+        kind = kinds[number]
+        fixed = {device.position: kind.states[device.position].start, device.velocity: None}
+        kinds[number] = _without(kind, fixed)
+    return replace(system, kinds=tuple(kinds))
+
+
+def held(system: CompiledSystem, *, option: str) -> CompiledSystem:
+    """Return a scene with a hand on every device: mass, damping and stiffness are parameters, 0 at first.
+
+    Raises
+    ------
+    ApcError
+        E910 as `devices_of`, E911 hands in the scene.
+    """
+    refuse_hands(system, option)
+    devices = devices_of(system, option=option)
+    names = tuple(f"{HAND}.{name}" for name, _, _ in _NUMBERS)
+    kinds = list(system.kinds)
+    for number, device in devices.items():
+        kinds[number] = _with_hand(kinds[number], device, names)
+    added = tuple(
+        Parameter(name, unit, 0.0, minimum=0.0, about=about)
+        for name, (_, unit, about) in zip(names, _NUMBERS, strict=True)
+    )
+    return replace(system, kinds=tuple(kinds), parameters=(*system.parameters, *added))
+
+
+def _with_hand(kind: Kind, device: Device, names: Sequence[str]) -> Kind:
+    """Return a kind whose device carries a hand: (m + m_h) v' = m v'₀ − b_h v − k_h (x − x₀)."""
+    own = len(kind.parameters)
+
+    def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
+        mass, damping, stiffness = casadi.vertsplit(p[own:])
+        start = p[kind.parameters.index(kind.states[device.position].start)]
+        rate = kind.derivative(x, u, p[:own], t)
+        inverse = device.symbolic(x, u, p[:own], t)
+        pull = damping * x[device.velocity] + stiffness * (x[device.position] - start)
+        row = (rate[device.velocity] - inverse * pull) / (1 + inverse * mass)
+        return casadi.vertcat(rate[: device.velocity], row, rate[device.velocity + 1 :])
+
+    larger = replace(kind, parameters=(*kind.parameters, *names))
+    return _rewritten(larger, kind, lambda x, p: x, rates)
+
+
+def _without(kind: Kind, fixed: Mapping[int, str | None]) -> Kind:
+    """Return a kind without some states, each fixed at the value of a parameter, or at 0."""
+    kept = [place for place in range(len(kind.states)) if place not in fixed]
+
+    def whole(x: Any, p: Any) -> Any:
+        found = [casadi.SX(0)] * len(kind.states)
+        for number, place in enumerate(kept):
+            found[place] = x[number]
+        for place, name in fixed.items():
+            if name is not None:
+                found[place] = p[kind.parameters.index(name)]
+        return casadi.vertcat(*found)
+
+    def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
+        rate = kind.derivative(x, u, p, t)
+        return casadi.vertcat(*(rate[place] for place in kept))
+
+    smaller = replace(kind, states=tuple(kind.states[place] for place in kept))
+    return _rewritten(smaller, kind, whole, rates)
+
+
+def _rewritten(
+    kind: Kind,
+    before: Kind,
+    whole: Callable[[Any, Any], Any],
+    rates: Callable[[Any, Any, Any, Any], Any],
+) -> Kind:
+    """Return a kind of other states or parameters with its functions.
+
+    Parameters
+    ----------
+    kind, before
+        What it is to be, with the functions that the kind had before.
+    whole
+        Gives the states of before, from those of now and the parameters.
+    rates
+        Gives the rates of now, from the states of before, holds, the parameters of now and the time.
+    """
+    x, p = casadi.SX.sym("x", len(kind.states)), casadi.SX.sym("p", len(kind.parameters))
+    states = whole(x, p)
+
+    def again(function: Any, body: Callable[..., Any] | None = None) -> Any:
+        """Return a function (x, …, p, t) over the states and parameters of now."""
+        _, *between, _, t = function.sx_in()
+        value = (body or function)(states, *between, p if body else p[: len(before.parameters)], t)
+        named = function.name_in(), function.name_out()
+        return casadi.Function(function.name(), [x, *between, p, t], [value], *named)
+
+    def receiving(one: Receive) -> Receive:
+        return one if one.edge is None else replace(one, edge=again(one.edge))
+
+    clocks = tuple(
+        replace(one, tick=again(one.tick), receives=tuple(map(receiving, one.receives)))
+        for one in kind.clocks
+    )
+    sends = tuple(replace(one, send=again(one.send)) for one in kind.sends)
+    ports = None if kind.ports is None else Ports(kind.ports.parts, again(kind.ports.port))
+    derivative = again(kind.derivative, rates)
+    return replace(kind, derivative=derivative, clocks=clocks, sends=sends, ports=ports)

@@ -1,0 +1,186 @@
+"""A peer with ways in and out: values that come from outside in a frame, and what is read of it there.
+
+Takes: a `LinearSite` whose last holds are the ways in, and its `Schedule`.
+Gives: `Ports`, `with_holds`, `with_ports`.
+Guarantees: the peer moves as before; what comes in and what is read are entries of z, so that every step of
+the kernel takes them along.
+Does not: say what comes in, or lift.
+
+Each value is drawn as the frame begins, acts from its instant to the next, and is gone when the frame ends: a
+value of a clock of its own, as `schedule` has them. What is read stays until the frame ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import ClockPartition, Hold, Kind
+from apc.frame.schedule import Act, Event, Propagate, Schedule, Tick, Value
+from apc.frame.site import LinearSite, LinearTick
+
+Matrix = NDArray[Any]
+Places = NDArray[np.intp]
+
+# The clocks of what comes in and of what is read, which no scene can name so.
+INPUTS, READINGS = "what comes in", "what is read"
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """Where in z the ways in and out are: `drawn` (instants, inputs) and `read` (instants, readings).
+
+    `added` are all entries of z that the peer has not by itself.
+    """
+
+    drawn: Places
+    read: Places
+    added: range
+
+
+def with_holds(site: LinearSite, columns: Matrix) -> LinearSite:
+    """Return a site with more holds, whose values nothing reads and that move states as the columns say.
+
+    Parameters
+    ----------
+    site
+        The site, of floats or of rationals.
+    columns
+        (n_x, inputs), of the same numbers.
+    """
+    inputs = columns.shape[1]
+
+    def widened(matrix: Matrix) -> Matrix:
+        zero = np.zeros((len(matrix), inputs), dtype=matrix.dtype)
+        return np.concatenate([matrix, zero], axis=1)
+
+    holds = tuple(Hold(f"input {number + 1}", INPUTS, number, "") for number in range(inputs))
+    return replace(
+        site,
+        kind=replace(site.kind, holds=(*site.kind.holds, *holds)),
+        b=np.concatenate([site.b, columns], axis=1),
+        ticks=tuple(replace(tick, u=widened(tick.u)) for tick in site.ticks),
+        sends=tuple(replace(send, u=widened(send.u)) for send in site.sends),
+    )
+
+
+def with_ports(
+    sites: Sequence[LinearSite],
+    schedule: Schedule,
+    inputs: int,
+    drawn_at: Sequence[int],
+    readings: Sequence[Matrix],
+    read_at: Sequence[int],
+) -> tuple[list[LinearSite], Schedule, Ports]:
+    """Return a site, in one kind of number or several, with ways in and out, and where these are.
+
+    Parameters
+    ----------
+    sites
+        The site, its last holds the ways in; their clock is `INPUTS`.
+    schedule
+        What happened in a frame.
+    inputs
+        How many ways in there are.
+    drawn_at
+        At which instants of a frame, in quanta, new values begin to act, before all else happens there.
+    readings
+        What is read, over states and holds (readings, n_x + n_u), in the kinds of number of the sites.
+    read_at
+        At which instants, after all else has happened there.
+    """
+    kind = sites[0].kind
+    clock, first = len(kind.clocks), len(kind.holds) - inputs
+    outputs = readings[0].shape[0]
+    of_inputs = tuple(f"{word} {number + 1}" for word in ("drawn", "acting") for number in range(inputs))
+    of_readings = tuple(f"reading {number + 1}" for number in range(outputs))
+    kind = replace(
+        kind,
+        clocks=(
+            *kind.clocks,
+            ClockPartition(INPUTS, of_inputs, ("1",) * (2 * inputs), (), (), (), None),
+            ClockPartition(READINGS, of_readings, ("1",) * outputs, (), (), (), None),
+        ),
+    )
+    count, taken = len(drawn_at), len(read_at)
+    carries = bool(count and drawn_at[0] > 0)  # the last value of a frame acts on in the next
+    drawn = [Value(clock, one, number - count) for number in range(count) for one in range(inputs)]
+    before = [Value(clock, inputs + one, -1) for one in range(inputs)] if carries else []
+    read = [Value(clock + 1, one, number - taken) for number in range(taken) for one in range(outputs)]
+    acts: dict[int, list[Event]] = {
+        instant: [Act(first + one, drawn[number * inputs + one]) for one in range(inputs)]
+        for number, instant in enumerate(drawn_at)
+    }
+    taking = {instant: Tick(clock + 1, number, ()) for number, instant in enumerate(read_at)}
+    events: list[Event] = []
+    begun = -1
+    for now, event in _stopping(schedule, {*drawn_at, *read_at}):
+        if now > begun:
+            events += acts.get(now, [])
+            begun = now
+        if isinstance(event, Propagate) and now in taking:
+            events.append(taking[now])
+        events.append(event)
+    events += [Tick(clock, number, ()) for number in range(count)]
+    start = len(kind.states) + len(schedule.carried)
+    names = [
+        f"{word} at {at}"
+        for word, listed in (("in", drawn), ("before", before), ("out", read))
+        for at in range(len(listed))
+    ]
+    full = replace(
+        schedule,
+        events=tuple(events),
+        acting=(*schedule.acting, *(before if carries else (None,) * inputs)),
+        carried=(*schedule.carried, *drawn, *before, *read),
+        ticks=(*schedule.ticks, count, taken),
+        value_names=(*schedule.value_names, *names),
+        repeats=None,
+    )
+    behind = start + len(drawn) + len(before)
+    ports = Ports(
+        drawn=np.arange(start, start + len(drawn)).reshape(count, inputs),
+        read=np.arange(behind, behind + len(read)).reshape(taken, outputs),
+        added=range(start, behind + len(read)),
+    )
+    made = [_with_clocks(one, kind, inputs, rows) for one, rows in zip(sites, readings, strict=True)]
+    return made, full, ports
+
+
+def _with_clocks(site: LinearSite, kind: Kind, inputs: int, readings: Matrix) -> LinearSite:
+    """Return a site with the clocks of ways in and out."""
+    n_x, n_u = site.b.shape
+    number = site.b.dtype
+    acting = np.zeros((2 * inputs, n_u), dtype=number)
+    acting[inputs:, n_u - inputs :] += np.eye(inputs, dtype=np.int64)
+
+    def nothing(rows: int, columns: int) -> Matrix:
+        return np.zeros((rows, columns), dtype=number)
+
+    rows = len(readings)
+    ticks = (
+        LinearTick(
+            INPUTS, nothing(2 * inputs, n_x), acting, nothing(2 * inputs, 0), nothing(2 * inputs, 0), ()
+        ),
+        LinearTick(READINGS, readings[:, :n_x], readings[:, n_x:], nothing(rows, 0), nothing(rows, 0), ()),
+    )
+    return replace(site, kind=kind, ticks=(*site.ticks, *ticks))
+
+
+def _stopping(schedule: Schedule, at: set[int]) -> list[tuple[int, Event]]:
+    """Return a frame's events, each with its instant in quanta, so that propagation stops at some."""
+    found: list[tuple[int, Event]] = []
+    now = 0
+    for event in schedule.events:
+        if not isinstance(event, Propagate):
+            found.append((now, event))
+            continue
+        end = now + event.duration
+        for stop in sorted({one for one in at if now < one < end} | {end}):
+            found.append((now, Propagate(stop - now)))
+            now = stop
+    return found
