@@ -196,8 +196,7 @@ def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> Compi
     kinds = list(system.kinds)
     for number, device in devices.items():
         kind = kinds[number]
-        fixed = {device.position: kind.states[device.position].start, device.velocity: None}
-        kinds[number] = _without(kind, fixed)
+        kinds[number] = _without(kind, device.position, device.velocity)
     return replace(system, kinds=tuple(kinds))
 
 
@@ -214,7 +213,7 @@ def held(system: CompiledSystem, *, option: str) -> CompiledSystem:
     names = tuple(f"{HAND}.{name}" for name, _, _ in _NUMBERS)
     kinds = list(system.kinds)
     for number, device in devices.items():
-        kinds[number] = _with_hand(kinds[number], device, names)
+        kinds[number] = _with_hand(kinds[number], device.position, device.velocity, device.symbolic, names)
     added = tuple(
         Parameter(name, unit, 0.0, minimum=0.0, about=about)
         for name, (_, unit, about) in zip(names, _NUMBERS, strict=True)
@@ -222,34 +221,35 @@ def held(system: CompiledSystem, *, option: str) -> CompiledSystem:
     return replace(system, kinds=tuple(kinds), parameters=(*system.parameters, *added))
 
 
-def _with_hand(kind: Kind, device: Device, names: Sequence[str]) -> Kind:
+@functools.lru_cache(maxsize=64)
+def _with_hand(kind: Kind, position: int, velocity: int, inverse_inertia: Any, names: tuple[str, ...]) -> Kind:
     """Return a kind whose device carries a hand: (m + m_h) v' = m v'₀ − b_h v − k_h (x − x₀)."""
     own = len(kind.parameters)
 
     def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
         mass, damping, stiffness = casadi.vertsplit(p[own:])
-        start = p[kind.parameters.index(kind.states[device.position].start)]
+        start = p[kind.parameters.index(kind.states[position].start)]
         rate = kind.derivative(x, u, p[:own], t)
-        inverse = device.symbolic(x, u, p[:own], t)
-        pull = damping * x[device.velocity] + stiffness * (x[device.position] - start)
-        row = (rate[device.velocity] - inverse * pull) / (1 + inverse * mass)
-        return casadi.vertcat(rate[: device.velocity], row, rate[device.velocity + 1 :])
+        inverse = inverse_inertia(x, u, p[:own], t)
+        pull = damping * x[velocity] + stiffness * (x[position] - start)
+        row = (rate[velocity] - inverse * pull) / (1 + inverse * mass)
+        return casadi.vertcat(rate[:velocity], row, rate[velocity + 1 :])
 
     larger = replace(kind, parameters=(*kind.parameters, *names))
     return _rewritten(larger, kind, lambda x, p: x, rates)
 
 
-def _without(kind: Kind, fixed: Mapping[int, str | None]) -> Kind:
-    """Return a kind without some states, each fixed at the value of a parameter, or at 0."""
-    kept = [place for place in range(len(kind.states)) if place not in fixed]
+@functools.lru_cache(maxsize=64)
+def _without(kind: Kind, position: int, velocity: int) -> Kind:
+    """Return a kind whose device stays where it starts, and is no state."""
+    kept = [place for place in range(len(kind.states)) if place not in (position, velocity)]
+    start = kind.parameters.index(kind.states[position].start)
 
     def whole(x: Any, p: Any) -> Any:
         found = [casadi.SX(0)] * len(kind.states)
         for number, place in enumerate(kept):
             found[place] = x[number]
-        for place, name in fixed.items():
-            if name is not None:
-                found[place] = p[kind.parameters.index(name)]
+        found[position] = p[start]
         return casadi.vertcat(*found)
 
     def rates(x: Any, u: Any, p: Any, t: Any) -> Any:

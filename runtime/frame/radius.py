@@ -1,10 +1,10 @@
 """What the kernel computes with: floats, or floats that carry their radius.
 
 Takes: matrices of real floats, and bounds on what their entries are off by.
-Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`.
+Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`; `solve`.
 Guarantees: a sum or product in `RADII` holds that of all matrices within the radii of its operands, its own
 rounding and that of the radius included.
-Does not: divide; carry rational numbers or balls of many digits (see `balls`); charge what underflows, less
+Does not: carry rational numbers or balls of many digits (see `balls`); charge what underflows, less
 than 1e-307 a product.
 
 A matrix with its radius has a third axis from the end, (…, 2, n, m): its entries, and how far each may be
@@ -108,3 +108,28 @@ FLOATS = Arithmetic(np.matmul, np.add, np.subtract, lambda value: value)
 RADII = Arithmetic(
     _multiply, lambda a, b: _added(a, b, np.add), lambda a, b: _added(a, b, np.subtract), _exact
 )
+
+
+def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
+    """Return X of M X = R for all M (2, n, n) and R (2, n, m) within their radii; None where rounding hides it.
+
+    Notes
+    -----
+    With an inverse Y in floats and F = I − Y M, an X in floats is off by (I − F)⁻¹ Y (R − M X): by its size
+    |Y (R − M X)|, and ‖F‖/(1 − ‖F‖) of the largest of its column.
+    """
+    n = matrix.shape[-1]
+    try:
+        inverse = np.linalg.inv(value_of(matrix))
+    except np.linalg.LinAlgError:
+        return None
+    found = inverse @ value_of(right)
+    exact = _exact(inverse)
+    wrong = RADII.subtract(_exact(np.eye(n)), _multiply(exact, matrix))
+    norm = float((np.abs(value_of(wrong)) + radius_of(wrong)).sum(axis=1).max(initial=0.0)) * (1 + n * UNIT)
+    if not norm < 0.5:
+        return None
+    left = _multiply(exact, RADII.subtract(right, _multiply(matrix, _exact(found))))
+    off = np.abs(value_of(left)) + radius_of(left)
+    off = (off + 2 * norm * off.max(axis=0, initial=0.0)) * (1 + 8 * UNIT)
+    return with_radius(found, off)

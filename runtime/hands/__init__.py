@@ -1,0 +1,1 @@
+"""What hands do to a scene, and what they feel."""

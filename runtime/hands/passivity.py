@@ -1,0 +1,281 @@
+"""Is a scene stable with every passive hand at every device?
+
+Takes: a `CompiledSystem`.
+Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `spare_damping`.
+Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
+anything that gives back no more energy than it was given, each by itself or joined to each other.
+Does not: say with which hand it shakes: which motion of the devices takes energy out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from apc.analysis.analysis import Prepared, analyze, prepare
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.timings import part
+from apc.eigen.dissipation import least_real, proves_positive
+from apc.finite_equations import finite_equations
+from apc.frame.devices import clamped, refuse_hands
+from apc.frame.discretize import UNIT
+from apc.frame.radius import RADII, radius_of, solve, value_of
+from apc.hands.port import PortLoop, port_loops
+from apc.network.nominal import left_out
+from apc.result import Result
+from apc.threads import single_threaded
+
+OPTION = "--hands passive"
+STABLE, UNSTABLE = "stable with any passive hands", "unstable with some passive hands"
+UNDECIDED, NEVER = "undecided", "unstable with some passive hands, however much damping there is"
+
+# How far below the least that is found, relatively, what is proved may lie: the first that can be proved.
+WIDTHS = tuple(10.0**-k for k in (12, 10, 8, 6, 4))
+
+# Two frequencies fit a motion alike, relatively.
+ALIKE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class PassiveMode:
+    """A mode of devices that hands move: common, or apart.
+
+    `damping` is what its devices have in N·s/m, None where they differ; `more` what each of them needs beside
+    it, negative if some could be spared, ± `error`; None where none suffices, as the scene is unstable with
+    its devices clamped. `frequency_hz` is where most energy can be taken out. `stiffness` is what its devices
+    feel at rest, N/m, None where several groups move in it.
+    """
+
+    name: str
+    multiplicity: int
+    passive: bool | None
+    damping: float | None
+    more: float | None
+    error: float | None
+    frequency_hz: float | None
+    stiffness: float | None
+
+    @property
+    def needed(self) -> float | None:
+        """The least damping of each device, N·s/m."""
+        return None if self.damping is None or self.more is None else self.damping + self.more
+
+
+@dataclass(frozen=True, slots=True)
+class PassiveHands(Result):
+    """Whether a scene is stable whatever passive hands hold its devices.
+
+    `clamped_radius` ± `clamped_error` is the spectral radius with all devices held fast, the hardest of
+    hands. `why` says why no damping suffices, where that follows from the equations alone.
+    """
+
+    shown_by = "hands:passive"
+
+    topology: str
+    verdict: str
+    stable: bool | None
+    clamped_stable: bool | None
+    clamped_radius: float
+    clamped_error: float
+    modes: tuple[PassiveMode, ...]
+    why: str
+    proof: str
+    linearized: bool
+    left_out: tuple[str, ...]
+
+    @property
+    def worst(self) -> PassiveMode | None:
+        """The mode that needs most damping."""
+        known = [one for one in self.modes if one.more is not None]
+        lost = [one for one in self.modes if one.more is None]
+        return lost[0] if lost else max(known, key=lambda one: one.more or 0.0) if known else None
+
+
+@part("passive hands")
+def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> PassiveHands:
+    """Say whether a scene is stable with every passive hand at every device.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
+
+    Raises
+    ------
+    ApcError
+        E910 a peer without a device; E911 hands in the scene; E912 a device that is touched otherwise than by
+        samples and held forces, or too many intervals; and those of `analysis.analyze`.
+
+    Notes
+    -----
+    After Colgate and Schenkel, J. Robotic Systems 14 (1997) 37, for any number of devices, delays and clocks:
+    see `port`.
+    """
+    refuse_hands(system, OPTION)
+    prepared = prepared or prepare(system)
+    fixed = analyze(clamped(system, option=OPTION))
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        loops = port_loops(system, prepared, option=OPTION)
+        modes = () if isinstance(loops, str) else tuple(_judge(loop) for loop in loops)
+    linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
+    stable: bool | None = None
+    if isinstance(loops, str) or fixed.stable is False or any(one.passive is False for one in modes):
+        stable = False
+    elif all(one.passive for one in modes) and fixed.stable:
+        stable = True
+    verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
+    of = ", of the linearization" if not linear else ""
+    return PassiveHands(
+        topology=system.name,
+        verdict=NEVER if isinstance(loops, str) else verdict,
+        stable=stable,
+        clamped_stable=fixed.stable,
+        clamped_radius=fixed.spectral_radius,
+        clamped_error=fixed.spectral_radius_error,
+        modes=modes,
+        why=loops if isinstance(loops, str) else "",
+        proof="" if stable is None else f"proved by floats whose every rounding is bounded{of}",
+        linearized=not linear,
+        left_out=left_out(system, linear=linear),
+    )
+
+
+def spare_damping(system: CompiledSystem, prepared: Prepared) -> tuple[float, float, float]:
+    """Return how much damping could be spared at each device (N·s/m), and bounds below and above it.
+
+    −∞ where no damping suffices.
+
+    Parameters
+    ----------
+    system, prepared
+        As for `passive_hands`.
+    """
+    refuse_hands(system, OPTION)
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        loops = port_loops(system, prepared, option=OPTION)
+        if isinstance(loops, str):
+            return -np.inf, -np.inf, -np.inf
+        found = [_bounds(loop) for loop in loops]
+    least, low, high = (min(one[place] for one in found) for place in range(3))
+    return least, low, high
+
+
+def _judge(loop: PortLoop) -> PassiveMode:
+    """Say whether hands can draw energy from a mode."""
+    least, low, high, angle = _bounds(loop)
+    dampings = set(loop.dampings)
+    known = bool(np.isfinite(least))
+    return PassiveMode(
+        name=loop.name,
+        multiplicity=loop.multiplicity,
+        passive=True if low > 0 else False if high < 0 else None,
+        damping=float(dampings.pop()) if len(dampings) == 1 else None,
+        more=-least if known else None,
+        error=max(high - least, least - low) if known else None,
+        frequency_hz=_frequency(loop, angle) if known else None,
+        stiffness=float(loop.static[0, 0, 0]) if loop.static.shape[-1] == 1 else None,
+    )
+
+
+def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
+    """Return the least eigenvalue of He H + diag(b/τ), what is proved below and above it, and its angle.
+
+    −∞ where the scene is unstable with its devices clamped, of which this is no proof.
+    """
+    matrices = loop.a, loop.b, loop.c, loop.d
+    least, angle = least_real(*map(value_of, (*matrices, loop.weight)))
+    if not np.isfinite(least):
+        return least, -np.inf, np.inf, angle
+    scale = max(abs(least), float(np.abs(value_of(loop.weight)).max()))
+    low = -np.inf
+    for width in WIDTHS:
+        shift = least - width * scale
+        less = RADII.subtract(loop.weight, RADII.exact(shift * np.eye(len(loop.weight[0]))))
+        if proves_positive(*matrices, less):
+            low = shift
+            break
+    return least, _asymmetry(loop, low), _draws(loop, angle), angle
+
+
+def _asymmetry(loop: PortLoop, low: float) -> float:
+    """Return what is proved below, nothing where the stiffness at rest is not that of any spring.
+
+    Notes
+    -----
+    The residue at z = 1 has to be symmetric and not negative, or hands that move devices slowly round draw
+    energy from it. What rounding leaves of one that vanishes counts as none.
+    """
+    value, off = value_of(loop.static), radius_of(loop.static)
+    turned = np.abs(value - value.T) > off + off.T
+    symmetric = (value + value.T) / 2
+    least = float(np.linalg.eigvalsh(symmetric).min())
+    return -np.inf if turned.any() or least < -float((off + off.T).sum()) else low
+
+
+def _draws(loop: PortLoop, angle: float) -> float:
+    """Return what at most the Hermitian part is in the worst direction at an angle, a bound for its least.
+
+    Notes
+    -----
+    e^{jθ} is a rational point of the circle; complex numbers are pairs of real ones.
+    """
+    value, off = value_of(loop.static), radius_of(loop.static)
+    if (np.abs(value - value.T) > off + off.T).any() or np.linalg.eigvalsh(value + value.T).min() < -4 * float(
+        (off + off.T).sum()
+    ):
+        return -UNIT
+    n, m = loop.b.shape[-2:]
+    tangent = np.tan(angle / 2) if angle < 3.0 else None
+    cosine, sine = (
+        ((1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2))
+        if tangent is not None
+        else (-1.0, 0.0)
+    )
+    z = complex(cosine, sine)
+    a, b, c, d, weight = map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight))
+    response = c @ np.linalg.solve(z * np.eye(n) - a, b + 0j) + d
+    direction = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0]
+    turned = np.zeros((2, 2 * n, 2 * n))
+    near = 8 * UNIT
+    turned[0] = np.block([[cosine * np.eye(n), -sine * np.eye(n)], [sine * np.eye(n), cosine * np.eye(n)]])
+    turned[1] = near * np.abs(turned[0])
+    twice = np.zeros((2, 2 * n, 2 * n))
+    twice[:, :n, :n] = twice[:, n:, n:] = loop.a
+    v = RADII.exact(np.concatenate([direction.real, direction.imag])[:, None])
+
+    def both(matrix: np.ndarray) -> np.ndarray:
+        rows, columns = matrix.shape[-2:]
+        found = np.zeros((2, 2 * rows, 2 * columns))
+        found[:, :rows, :columns] = found[:, rows:, columns:] = matrix
+        return found
+
+    states = solve(RADII.subtract(turned, twice), RADII.multiply(both(loop.b), v))
+    if states is None:
+        return np.inf
+    pushed = RADII.add(
+        RADII.multiply(both(loop.c), states), RADII.multiply(both(RADII.add(loop.d, loop.weight)), v)
+    )
+    drawn = RADII.multiply(np.swapaxes(v, -1, -2), pushed)
+    size = float((direction.real**2 + direction.imag**2).sum())
+    top = float(drawn[0, 0, 0] + drawn[1, 0, 0])
+    return top / size + 8 * UNIT * abs(top)
+
+
+def _frequency(loop: PortLoop, angle: float) -> float:
+    """Return the frequency of the motion that takes most energy out at an angle, in Hz.
+
+    Frequencies that differ by a multiple of the frame rate have one angle: which of them it is, its course
+    within a frame says.
+    """
+    a, b, c, d, weight = map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight))
+    response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
+    moved = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0] * np.sqrt(loop.seconds)
+    most = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
+    found = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
+    found.sort(key=abs)  # of two that can't be told apart, the slower
+    fits = [abs(np.exp(-1j * one * loop.starts / loop.frame_s) @ moved) for one in found]
+    best = next(one for one, fit in zip(found, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
+    return abs(best) / (2 * np.pi * loop.frame_s)

@@ -1,0 +1,312 @@
+"""What devices are pushed by, while hands move them as they like: one map a mode.
+
+Takes: a `CompiledSystem`.
+Gives: `PortLoop`, `port_loops`.
+Guarantees: exact for any motion of the hands: where nothing samples a device and no force on it switches, only
+how far it went counts, and the least that its damping takes of that. Matrices carry the radius of their
+rounding.
+Does not: say whether energy can be drawn (see `passivity`).
+
+Between two instants, τ apart, a device moves by Δ against a constant force f and its damper b. The hand gives
+∫F v = ΔE + b ∫v² + f Δ, and ∫v² ≥ Δ²/τ, with equality for a constant velocity. All that others can do depends
+on the Δ alone, so the hand can draw energy if and only if Σ f Δ + b Δ²/τ can fall below all bounds. With the
+map H from Δ to f this is a question of He H(e^{jθ}) + diag(b/τ).
+
+Devices that stand aside by 1 are pushed back by K for ever: H has the pole K/(z − 1), whose Hermitian part on
+the circle is −K/2 for all θ. It is taken out, with what all else moves by when devices stand aside; what
+remains has the motions of the scene with devices clamped, and no others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared, lifted_groups
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.eigen.closing import Loop, close_loop
+from apc.eigen.modes import arrange, dense_loop
+from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of
+from apc.frame.devices import Device, find_device
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange
+from apc.frame.lift import lift
+from apc.frame.ports import Ports, with_holds, with_ports
+from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
+from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
+from apc.frame.site import LinearSite
+
+Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
+
+# Graphs whose modes are orthogonal: what hands give all peers together is the sum of what they give each.
+ORTHOGONAL = ("complete", "ring")
+
+# Intervals of all devices of a mode together.
+MOST_INTERVALS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Touched:
+    """A peer's device: its damping in N·s/m, how long each of its intervals is, and where they are in z."""
+
+    damping: Fraction
+    seconds: tuple[Fraction, ...]
+    ports: Ports
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PortLoop:
+    """A mode's map from how far devices move to what pushes them back, less its pole at rest.
+
+    `a`, `b`, `c`, `d` (2, …) are over the states of the scene with clamped devices; `weight` (2, m, m) is what
+    is added to the Hermitian part: dampers, and the pole's. Inputs and outputs are scaled: 1 more on the
+    diagonal of `weight` is 1 N·s/m more at each device. `static` (2, k, k) is the stiffness of the pole between
+    the k kinds of devices, of all peers together. `seconds` are the intervals', `starts` when they begin.
+    """
+
+    name: str
+    multiplicity: int
+    a: Matrix
+    b: Matrix
+    c: Matrix
+    d: Matrix
+    weight: Matrix
+    static: Matrix
+    dampings: tuple[Fraction, ...]
+    starts: Floats
+    seconds: Floats
+    frame_s: float
+
+
+def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tuple[PortLoop, ...] | str:
+    """Return the modes of a scene in which hands move all devices; or why no device is ever passive.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    option
+        What asked for it.
+
+    Raises
+    ------
+    ApcError
+        E910 no device, or none that can be cut out; E912 too many intervals or states.
+    """
+    groups, exchange = lifted_groups(system, prepared=prepared)
+    unit_of = {one.name: one.unit for one in system.parameters}
+    ported, touched = [], {}
+    for group in groups:
+        device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
+        if not isinstance(device, Device):
+            what = f"{option}: {device or f'{group.name} has no device'}"
+            hint = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
+            raise ApcError(Mistake("E910", Place(system.origin.topology), what, hint=hint))
+        felt = _felt_velocity(group, device)
+        if felt:
+            return felt
+        if why := _other_touch(group, device):
+            hint = "a coupler that acts by sample and hold, as SampledSpringDamper"
+            raise ApcError(Mistake("E912", Place(system.origin.topology), f"{option}: {why}", hint=hint))
+        own, one = _ported(group, device)
+        ported.append(own)
+        touched[id(own.schedule)] = one
+    loops, weights = _loops(system, ported, exchange)
+    return tuple(_port_loop(system, loop, touched, weighted=weights) for loop in loops)
+
+
+def _felt_velocity(group: PeerGroup, device: Device) -> str:
+    """Say what samples a device's velocity, "" if nothing does."""
+    kind = group.jacobians.kind
+    for partition, tick in zip(kind.clocks, group.exact.ticks, strict=True):
+        for row in np.flatnonzero(tick.x[:, device.velocity].astype(np.bool_)):
+            name = partition.outputs[row]
+            return (
+                f"{name} samples the velocity of {device.part}: a hand that moves it just then, and no further, "
+                f"is pushed by any force at no cost"
+            )
+    for sending, send in zip(kind.sends, group.exact.sends, strict=True):
+        if send.x[:, device.velocity].astype(np.bool_).any():
+            return f"the velocity of {device.part} is sent over {sending.link} as sampled"
+    return ""
+
+
+def _other_touch(group: PeerGroup, device: Device) -> str:
+    """Say what touches a device otherwise than by samples and held forces, "" if nothing does."""
+    a, own = group.exact.a, [device.position, device.velocity]
+    others = [place for place in range(len(a)) if place not in own]
+    both = a[np.ix_(others, own)].astype(np.bool_) | a[np.ix_(own, others)].T.astype(np.bool_)
+    if both.any():
+        name = group.jacobians.kind.states[others[int(np.flatnonzero(both.any(axis=1))[0])]].name
+        return f"{device.part} and what {name} is of act on one another at every moment"
+    if a[device.velocity, device.position] > 0 or a[device.velocity, device.velocity] > 0:
+        return f"a spring or damper of {device.part} to the ground is negative"
+    return ""
+
+
+def _ported(group: PeerGroup, device: Device) -> tuple[PeerGroup, Touched]:
+    """Return a group whose device is moved from outside, and what of it is touched."""
+    schedule = group.schedule
+    at = _boundaries(group.exact, schedule, device)
+    sites, readings = [], []
+    for one in (group.site, group.exact):
+        exact = one.b.dtype == object
+        inverse = device.inverse if exact else float(device.inverse)
+        sites.append(_driven(one, device))
+        push = -one.b[device.velocity] / inverse
+        zeros = np.zeros(len(sites[-1].a), dtype=one.b.dtype)
+        readings.append(np.concatenate([zeros, push, np.zeros(1, dtype=one.b.dtype)])[None])
+    (site, exact_site), full, ports = with_ports(sites, schedule, 1, at, readings, at)
+    own = replace(
+        group,
+        jacobians=replace(group.jacobians, kind=site.kind),
+        site=site,
+        exact=exact_site,
+        schedule=full,
+        lifted=lift(site, full, exact=exact_site),
+    )
+    ends = np.diff([*at, schedule.frame]).tolist()
+    damping = -group.exact.a[device.velocity, device.velocity] / device.inverse
+    return own, Touched(damping, tuple(end * schedule.quantum for end in ends), ports)
+
+
+def _boundaries(site: LinearSite, schedule: Schedule, device: Device) -> list[int]:
+    """Return the instants, in quanta, at which a device is sampled or a force on it switches, and 0."""
+    found, now = {0}, 0
+    for event in schedule.events:
+        match event:
+            case Propagate(duration):
+                now += duration
+            case Tick(partition, _, _):
+                counts = site.ticks[partition].x[:, device.position].astype(np.bool_).any()
+            case Send(partition, _):
+                counts = site.sends[partition].x[:, device.position].astype(np.bool_).any()
+            case Act(hold, _):
+                counts = bool(site.b[device.velocity, hold])
+        if not isinstance(event, Propagate) and counts and now < schedule.frame:
+            found.add(now)
+    return sorted(found)
+
+
+def _driven(site: LinearSite, device: Device) -> LinearSite:
+    """Return a site without a device's states: a hold, the last, says where the device is."""
+    own = (device.position, device.velocity)
+    kept = [place for place in range(len(site.a)) if place not in own]
+    number = site.b.dtype
+    smaller = replace(
+        site,
+        kind=replace(site.kind, states=tuple(site.kind.states[place] for place in kept)),
+        a=site.a[np.ix_(kept, kept)],
+        b=site.b[kept],
+        ticks=tuple(replace(tick, x=tick.x[:, kept]) for tick in site.ticks),
+        sends=tuple(replace(send, x=send.x[:, kept]) for send in site.sends),
+    )
+    found = with_holds(smaller, np.zeros((len(kept), 1), dtype=number))
+    for whole, part in zip((*site.ticks, *site.sends), (*found.ticks, *found.sends), strict=True):
+        part.u[:, -1] = whole.x[:, device.position]
+    return found
+
+
+def _loops(
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange
+) -> tuple[tuple[Loop, ...], bool]:
+    """Return loops that share no energy, and whether a site of them stands for as many peers as it counts."""
+    used = {one.way.link for group in groups for one in group.schedule.heard}
+    if all(exchange.links[link].graph.shape in ORTHOGONAL for link in used):
+        arranged = arrange(groups, exchange)
+        if arranged.method == "modes":
+            return arranged.loops, True
+    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
+    if states > MOST_STATES:
+        what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and intervals"
+        hint = f"equal peers on complete graphs or rings, or {MOST_STATES:,} in all"
+        raise ApcError(Mistake("E912", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+    return (dense_loop(groups, exchange),), False
+
+
+def _port_loop(
+    system: CompiledSystem, loop: Loop, touched: dict[int, Touched], *, weighted: bool
+) -> PortLoop:
+    """Return the map of a loop whose devices are moved from outside."""
+    closed = close_loop(loop)
+    whole = with_radius(closed.matrix, closed.error)
+    sites = [touched[id(group.schedule)] for group in loop.sites]
+    counts = [group.count if weighted and len(loop.sites) > 1 else 1 for group in loop.sites]
+    drawn, read, added = [], [], []
+    for start, one in zip(closed.offsets, sites, strict=True):
+        drawn.append(start + one.ports.drawn[:, 0])
+        read.append(start + one.ports.read[:, 0])
+        added += [start + place for place in one.ports.added]
+    rest = np.delete(np.arange(len(closed.matrix)), added)
+    into, out = np.concatenate(drawn), np.concatenate(read)
+    if len(into) > MOST_INTERVALS:
+        what = f"devices are sampled and pushed over {len(into):,} intervals of a frame"
+        hint = f"{MOST_INTERVALS:,} at most"
+        raise ApcError(Mistake("E912", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+    # A device is where it was as the frame began, and the intervals before have moved it since.
+    sums, of = np.zeros((len(into), len(into))), np.zeros((len(into), len(sites)))
+    scale, start = np.zeros(len(into)), 0
+    many = np.zeros(len(into))
+    for k, one in enumerate(sites):
+        own = slice(start, start + len(one.seconds))
+        sums[own, own] = np.tril(np.ones((len(one.seconds),) * 2), -1)
+        of[own, k] = 1.0
+        many[own] = counts[k]
+        scale[own] = [float(seconds / counts[k]) ** 0.5 for seconds in one.seconds]
+        start = own.stop
+    a = whole[:, rest[:, None], rest]
+    placed, pushed = whole[:, rest[:, None], into], whole[:, out[:, None], into]
+    answered = RADII.multiply(RADII.exact(np.diag(many)), whole[:, out[:, None], rest])
+    at_once = RADII.multiply(RADII.exact(np.diag(many)), pushed)
+    aside = solve(
+        RADII.subtract(RADII.exact(np.eye(len(rest))), a), RADII.multiply(placed, RADII.exact(of))
+    )
+    if aside is None:
+        what = "with its devices clamped the scene has a motion that nothing holds back"
+        hint = "couplers that hold each object to a device"
+        raise ApcError(Mistake("E912", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+    forces = RADII.add(RADII.multiply(answered, aside), RADII.multiply(at_once, RADII.exact(of)))
+    static = forces[:, [int(np.flatnonzero(of[:, k])[0]) for k in range(len(sites))]]
+    b = RADII.subtract(
+        RADII.multiply(placed, RADII.exact(sums)), RADII.multiply(aside, RADII.exact(of.T.copy()))
+    )
+    d = RADII.multiply(at_once, RADII.exact(sums))
+    pole = RADII.multiply(RADII.multiply(RADII.exact(of), static), RADII.exact(of.T.copy()))
+    dampers = np.zeros_like(pole)
+    listed = [
+        one.damping * count / seconds
+        for one, count in zip(sites, counts, strict=True)
+        for seconds in one.seconds
+    ]
+    values = np.array([float(one) for one in listed])
+    dampers[0], dampers[1] = np.diag(values), np.diag(UNIT * values)
+    half = RADII.multiply(
+        RADII.add(pole, np.swapaxes(pole, -1, -2)), RADII.exact(np.diag(np.full(len(into), 0.25)))
+    )
+    units = RADII.exact(np.diag(scale))
+
+    def scaled(matrix: Matrix) -> Matrix:
+        return RADII.multiply(RADII.multiply(units, matrix), units)
+
+    starts = np.concatenate([np.cumsum([0.0, *map(float, one.seconds[:-1])]) for one in sites])
+    return PortLoop(
+        name=loop.name,
+        multiplicity=loop.multiplicity,
+        a=a,
+        b=RADII.multiply(b, units),
+        c=RADII.multiply(units, answered),
+        d=scaled(d),
+        weight=scaled(RADII.subtract(dampers, half)),
+        static=static,
+        dampings=tuple(one.damping for one in sites),
+        starts=starts,
+        seconds=np.concatenate([[float(one) for one in site.seconds] for site in sites]),
+        frame_s=closed.frame_s,
+    )
