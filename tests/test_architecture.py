@@ -59,8 +59,8 @@ HOUSE = (
         "apc.eigen",
         """
         graph_modes peer_group listening peers closing graph_loops modes
-        rigid pseudospectrum dominant relative eigenpairs enclosure balls winding bordered roots certify
-        ratios spectrum
+        rigid dissipation pseudospectrum dominant relative eigenpairs enclosure balls winding bordered
+        roots certify ratios spectrum
         """,
     ),
     (
@@ -80,7 +80,7 @@ HOUSE = (
     (
         "apc.moments",
         """
-        memory mean_loops gains crowd held peak worst almost_sure stand_in patterns bursts traces
+        memory mean_loops gains crowd held worst almost_sure stand_in patterns bursts traces
         hands errors network
         """,
     ),

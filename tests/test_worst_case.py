@@ -14,8 +14,8 @@ import apc
 from apc.__main__ import run
 from apc.analysis.analysis import prepare
 from apc.compiler.errors import ApcError
-from apc.frame.radius import RADII, value_of, with_radius
-from apc.moments.peak import is_positive, peak_gain, proves_gain
+from apc.eigen.dissipation import peak_gain
+from apc.frame.radius import value_of
 from apc.moments.worst import (
     MANY,
     HeldParts,
@@ -301,38 +301,6 @@ def test_every_short_word_is_tried_once() -> None:
     # Necklaces of 1 to 10 beads that repeat nothing, less the one of a lost packet alone (Moreau, 1872).
     assert len(found) == sum((2, 1, 2, 3, 6, 9, 18, 30, 56, 99)) - 1
     assert pattern_of((1, 3)) == (False, True, True, False)
-
-
-def test_a_gain_is_that_of_a_closed_form_and_proved_just_above_it_only() -> None:
-    # 1/(z − a) is largest at z = 1; with a resonance r e^{±jφ} the peak is found where a grid says.
-    one = (np.array([[0.9]]), np.array([[1.0]]), np.array([[1.0]]), np.array([[0.0]]))
-    assert peak_gain(*one) == pytest.approx(10.0, rel=1e-13)
-    r, turn = 0.999, 0.7
-    a = r * np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    two = (a, np.array([[1.0], [0.3]]), np.array([[0.2, 1.0]]), np.array([[0.5]]))
-    z = np.exp(1j * np.linspace(turn - 1e-2, turn + 1e-2, 20001))
-
-    def response(at: complex) -> float:
-        found = two[2] @ np.linalg.solve(at * np.eye(2) - a, two[1]) + two[3]
-        return abs(complex(found[0, 0]))
-
-    known = max(map(response, z.tolist()))
-    assert peak_gain(*two) == pytest.approx(known, rel=1e-6)
-    for system in (one, two):
-        peak, exact = peak_gain(*system), [RADII.exact(matrix) for matrix in system]
-        assert proves_gain(exact[0], exact[1], exact[2], exact[3], peak * (1 + 1e-6))
-        assert not proves_gain(exact[0], exact[1], exact[2], exact[3], peak * (1 - 1e-9))
-    unstable = [RADII.exact(matrix) for matrix in (np.array([[1.1]]), *one[1:])]
-    assert not proves_gain(unstable[0], unstable[1], unstable[2], unstable[3], 100.0)
-    assert peak_gain(np.array([[1.1]]), *one[1:]) == math.inf
-
-
-def test_what_is_proved_positive_is_so_for_all_matrices_within_the_radii() -> None:
-    hilbert = np.array([[1 / (i + j + 1) for j in range(5)] for i in range(5)])
-    smallest = float(np.linalg.eigvalsh(hilbert)[0])
-    assert is_positive(with_radius(hilbert, np.full((5, 5), smallest / 50)))
-    assert not is_positive(with_radius(hilbert, np.full((5, 5), smallest)))
-    assert not is_positive(RADII.exact(hilbert - 1.001 * smallest * np.eye(5)))
 
 
 def test_the_pattern_is_played_and_grows_as_it_says() -> None:

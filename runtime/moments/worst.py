@@ -34,6 +34,7 @@ from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
+from apc.eigen.dissipation import peak_gain, proves_gain
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import arrange, complete_loops, dense_loop, split_exchangeable
 from apc.eigen.peer_group import PeerGroup, used_ways
@@ -42,7 +43,6 @@ from apc.frame.exchange import Exchange
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way
 from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
-from apc.moments.peak import peak_gain, proves_gain
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]

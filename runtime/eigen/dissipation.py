@@ -1,0 +1,294 @@
+"""What a loop gives back of what it is given, at the worst frequency: its H∞ norm, its least real part.
+
+Takes: x⁺ = A x + B r, d = C x + D r, of floats or of floats with their radii.
+Gives: `peak_gain`, `least_real`; `dissipates`, with it `proves_gain` and `proves_positive`; `is_positive`.
+Guarantees: what is proved holds for all matrices within the radii. No grid of frequencies decides anything.
+Does not: take out rigid motions, or weigh what comes in.
+
+With G(z) = C (zI − A)⁻¹ B + D and He G = (G + G*)/2, both questions are of one kind: is there a storage
+xᵀP x, P ≻ 0, that no input fills faster than it is supplied?
+
+    xᵀPx − x⁺ᵀPx⁺ + [x; r]ᵀ S [x; r] > 0        gain below γ: S(x, r) = γ²|r|² − |d|²
+                                                He G + W ≻ 0: S(x, r) = 2 rᵀ(d + W r)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.frame.discretize import UNIT
+from apc.frame.radius import RADII, radius_of, value_of
+
+Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
+
+# Levels tried on the way to the extreme: each step squares the distance, so some four are needed.
+LEVELS = 40
+
+# How far above what is known a level is tried, relatively, and how near the axis, relatively, an eigenvalue
+# may be on it: two that meet there are off by the square root of their rounding.
+ABOVE, ON_AXIS = 1e-13, 1e-5
+
+# Doublings of a Riccati equation; fewer than ten are needed unless a level is all but reached.
+DOUBLINGS = 60
+
+# The least storage of a state, beside the largest.
+UNSEEN = 1e-9
+
+# Parts of a storage that are left over for rounding, the first that serves.
+SPARED = tuple(10.0**-k for k in range(3, 12))
+
+
+def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
+    """Return max over θ of ‖C (e^{jθ} − A)⁻¹ B + D‖₂, infinite where A is not stable.
+
+    Notes
+    -----
+    With z = (1 + s)/(1 − s) the unit circle becomes the imaginary axis, and the gain is γ at jω exactly where
+    the Hamiltonian matrix of γ has the eigenvalue jω (Boyd, Balakrishnan and Kabamba, 1989).
+    """
+    if not b.size or not c.size:
+        return 0.0
+    values = np.linalg.eigvals(a)
+    if len(a) and np.abs(values).max() >= 1:
+        return np.inf
+    a_c, b_c, c_c, d_c = _on_axis(a, b, c, d)
+
+    def gains(angles: Floats) -> Floats:
+        return np.asarray(np.linalg.svd(_response(a, b, c, d, angles), compute_uv=False).max(axis=1))
+
+    def hamiltonian(best: float) -> Floats:
+        if not best:
+            return np.zeros((0, 0))
+        r = np.linalg.inv((best * (1 + ABOVE)) ** 2 * np.eye(b.shape[1]) - d_c.T @ d_c)
+        a_h = a_c + b_c @ r @ d_c.T @ c_c
+        lower = c_c.T @ (np.eye(len(c)) + d_c @ r @ d_c.T) @ c_c
+        return np.block([[a_h, b_c @ r @ b_c.T], [-lower, -a_h.T]])
+
+    return _highest(gains, hamiltonian, values)[0]
+
+
+def least_real(a: Floats, b: Floats, c: Floats, d: Floats, weight: Floats) -> tuple[float, float]:
+    """Return min over θ of the least eigenvalue of He(C (e^{jθ} − A)⁻¹ B + D) + W, and the θ in [0, π].
+
+    −∞ where A is not stable; +∞ of no input.
+
+    Parameters
+    ----------
+    a, b, c, d
+        The loop's matrices, as many inputs as outputs.
+    weight
+        W (m, m), symmetric.
+
+    Notes
+    -----
+    The least eigenvalue is s at θ exactly where the pencil of D + Dᵀ + 2 (W − s I) has the eigenvalue e^{jθ}.
+    On the axis it becomes a Hamiltonian matrix, whose point at infinity must not be the least: that is
+    θ = π, or θ = 0 of −A and −B.
+    """
+    if not b.size:
+        return np.inf, 0.0
+    values = np.linalg.eigvals(a)
+    if len(a) and np.abs(values).max() >= 1:
+        return -np.inf, 0.0
+    still, fastest = (
+        float(_least(_response(a, b, c, d, np.array([angle])), weight)[0]) for angle in (0.0, np.pi)
+    )
+    turn = still > fastest
+    turned = (-a, -b) if turn else (a, b)
+    a_c, b_c, c_c, d_c = _on_axis(*turned, c, d)
+    scale = max(float(np.abs(d_c + weight).max()), abs(still), abs(fastest))
+
+    def depths(angles: Floats) -> Floats:
+        return -_least(_response(*turned, c, d, angles), weight)
+
+    def hamiltonian(best: float) -> Floats:
+        level = best + ABOVE * max(abs(best), scale)
+        r = np.linalg.inv(d_c + d_c.T + 2 * weight + 2 * level * np.eye(len(weight)))
+        a_h = a_c - b_c @ r @ c_c
+        return np.block([[a_h, -b_c @ r @ b_c.T], [c_c.T @ r @ c_c, -a_h.T]])
+
+    depth, angle = _highest(depths, hamiltonian, -values if turn else values)
+    return -depth, np.pi - angle if turn else angle
+
+
+def _on_axis(a: Floats, b: Floats, c: Floats, d: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the matrices over s of a loop over z = (1 + s)/(1 − s)."""
+    inverse = np.linalg.inv(np.eye(len(a)) + a)
+    a_c, b_c = inverse @ (a - np.eye(len(a))), np.sqrt(2) * inverse @ b
+    return a_c, b_c, np.sqrt(2) * c @ inverse, d - c @ inverse @ b
+
+
+def _response(a: Floats, b: Floats, c: Floats, d: Floats, angles: Floats) -> NDArray[np.complex128]:
+    """Return C (e^{jθ} − A)⁻¹ B + D at angles θ (k,)."""
+    at = np.exp(1j * angles)[:, None, None]
+    inner = np.linalg.solve(at * np.eye(len(a)) - a, np.broadcast_to(b + 0j, (len(angles), *b.shape)))
+    return np.asarray(c @ inner + d)
+
+
+def _least(response: NDArray[np.complex128], weight: Floats) -> Floats:
+    """Return the least eigenvalue of He G + W for many G (k, m, m)."""
+    adjoint = np.swapaxes(response, -1, -2).conj()
+    return np.asarray(np.linalg.eigvalsh((response + adjoint) / 2 + weight)[:, 0])
+
+
+def _highest(
+    heights: Callable[[Floats], Floats],
+    hamiltonian: Callable[[float], Floats],
+    eigenvalues: NDArray[Any],
+) -> tuple[float, float]:
+    """Return the largest height over θ in [0, π], and where it is.
+
+    Notes
+    -----
+    At a level just above the largest that is known, the imaginary eigenvalues of the Hamiltonian matrix are
+    the frequencies where the height is the level. Between two of them it is higher: the highest at their
+    middles is the next level (Bruinsma and Steinbuch, 1990).
+    """
+    best, where = -np.inf, 0.0
+    angles = np.concatenate([[0.0, np.pi], np.abs(np.angle(eigenvalues))])
+    for _ in range(LEVELS):
+        found = heights(angles)
+        place = int(np.argmax(found))
+        if found[place] <= best + ABOVE * abs(best):
+            return max((float(found[place]), float(angles[place])), (best, where))
+        best, where = float(found[place]), float(angles[place])
+        at = np.linalg.eigvals(hamiltonian(best))
+        near = np.sort(at.imag[(np.abs(at.real) <= ON_AXIS * np.abs(at)) & (at.imag >= 0)])
+        near = np.concatenate([[0.0], near])
+        angles = 2 * np.arctan(np.concatenate([near, (near[1:] + near[:-1]) / 2]))
+    return best, where
+
+
+def proves_gain(a: Matrix, b: Matrix, c: Matrix, d: Matrix, level: float) -> bool:
+    """Say whether a loop is proved stable and its gain proved smaller than a level.
+
+    Parameters
+    ----------
+    a, b, c, d
+        The loop's matrices (2, …) with their radii.
+    level
+        More than the gain.
+    """
+    n, m = a.shape[-1], b.shape[-1]
+    given = np.zeros((2, n + m, n + m))
+    given[0, n:, n:] = level**2 * (1 - 4 * UNIT) * np.eye(m)
+    output = np.concatenate([c, d], axis=-1)
+    lost = RADII.multiply(np.swapaxes(output, -1, -2), output)
+    return dissipates(a, b, RADII.subtract(given, lost))
+
+
+def proves_positive(a: Matrix, b: Matrix, c: Matrix, d: Matrix, weight: Matrix) -> bool:
+    """Say whether a loop is proved stable and He(C (e^{jθ} − A)⁻¹ B + D) + W proved positive for all θ.
+
+    Parameters
+    ----------
+    a, b, c, d, weight
+        The loop's matrices and W (2, …) with their radii.
+    """
+    n, m = a.shape[-1], b.shape[-1]
+    supply = np.zeros((2, n + m, n + m))
+    supply[:, n:, :n], supply[:, :n, n:] = c, np.swapaxes(c, -1, -2)
+    whole = RADII.add(d, weight)
+    supply[:, n:, n:] = RADII.add(whole, np.swapaxes(whole, -1, -2))
+    return dissipates(a, b, supply)
+
+
+def dissipates(a: Matrix, b: Matrix, supply: Matrix) -> bool:
+    """Say whether a loop is proved stable and proved to store less than it is supplied, whatever comes in.
+
+    Parameters
+    ----------
+    a, b
+        The loop's matrices (2, n, n) and (2, n, m) with their radii.
+    supply
+        S (2, n + m, n + m), symmetric, with its radii; its first block must not be above 0 (nothing is
+        supplied to a loop that is left alone), or nothing is said of stability.
+
+    Notes
+    -----
+    P solves the Riccati equation of a supply that is a little smaller, in floats; that it serves is checked.
+    """
+    if not all(np.isfinite(one).all() for one in (a, b, supply)):
+        return False
+    plain = value_of(a), value_of(b), value_of(supply)
+    first = _storage(*plain, np.zeros(a.shape[-1]))
+    if first is None:
+        return False
+    # What nothing comes of needs some storage, too, for that of all to be positive.
+    sizes = np.diag(first)
+    sizes = np.maximum(sizes, UNSEEN * sizes.max(initial=0.0) or 1.0)
+    for part in SPARED:
+        p = _storage(*plain, part * sizes)
+        if p is not None and _serves(a, b, supply, (p + p.T) / 2):
+            return True
+    return False
+
+
+def _storage(a: Floats, b: Floats, supply: Floats, more: Floats) -> Floats | None:
+    """Solve P = AᵀPA − S₁₁ + diag(more) + (AᵀPB − S₁₂)(S₂₂ − BᵀPB)⁻¹(…)ᵀ by doubling.
+
+    Notes
+    -----
+    Chu, Fan and Lin (2005).
+    """
+    n = len(a)
+    with np.errstate(all="ignore"):
+        try:
+            back = np.linalg.solve(supply[n:, n:], np.hstack([supply[n:, :n], b.T]))
+            a_k, g = a - b @ back[:, :n], -b @ back[:, n:]
+            h = supply[:n, n:] @ back[:, :n] - supply[:n, :n] + np.diag(more)
+            for _ in range(DOUBLINGS):
+                turned = np.linalg.solve(np.eye(n) + g @ h, np.hstack([a_k, g @ a_k.T]))
+                one, other = turned[:, :n], turned[:, n:]
+                rise = a_k.T @ h @ one
+                h, g, a_k = h + rise, g + a_k @ other, a_k @ one
+                if not np.isfinite(h).all():
+                    return None
+                if np.abs(rise).max(initial=0.0) <= UNIT * np.abs(h).max(initial=0.0):
+                    return h
+        except np.linalg.LinAlgError:
+            return None
+    return None
+
+
+def _serves(a: Matrix, b: Matrix, supply: Matrix, p: Floats) -> bool:
+    """Say whether a storage P proves that a loop dissipates."""
+    n = len(p)
+    storage = RADII.exact(p)
+    moved = np.concatenate([a, b], axis=-1)
+    kept = RADII.multiply(np.swapaxes(moved, -1, -2), RADII.multiply(storage, moved))
+    given = np.array(supply)
+    given[:, :n, :n] = RADII.add(given[:, :n, :n], storage)
+    return is_positive(storage) and is_positive(RADII.subtract(given, kept))
+
+
+def is_positive(matrix: Matrix) -> bool:
+    """Say whether all symmetric matrices within the radii of one (2, n, n) are proved positive definite.
+
+    Notes
+    -----
+    They are if a Cholesky decomposition in floats of the matrix less c runs through, c being more than the
+    radii's norm and what rounding does to the decomposition, γ_{n+1} tr / (1 − γ_{n+1}) (Rump, 2006). Rows
+    and columns are scaled by powers of two before, which is exact.
+    """
+    value, radius = value_of(matrix), radius_of(matrix)
+    n = len(value)
+    diagonal = np.diag(value)
+    if not np.isfinite(matrix).all() or (diagonal <= 0).any():
+        return False
+    scale = np.ldexp(1.0, -(np.frexp(diagonal)[1] // 2))
+    value, radius = scale[:, None] * value * scale, scale[:, None] * radius * scale
+    # The mean of the matrix and its transpose is within the radii of either, but for one rounding.
+    off = np.maximum(radius, radius.T) + np.abs(value - value.T) + 2 * UNIT * np.abs(value)
+    charge = (n + 2) * UNIT
+    shift = 1.01 * (float(off.sum(axis=1).max(initial=0.0)) + charge / (1 - charge) * float(np.trace(value)))
+    try:
+        np.linalg.cholesky((value + value.T) / 2 - (shift + 4 * UNIT) * np.eye(n))
+    except np.linalg.LinAlgError:
+        return False
+    return True
