@@ -14,7 +14,7 @@ xᵀP x, P ≻ 0, that no input fills faster than it is supplied?
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,8 +33,9 @@ LEVELS = 40
 # may be on it: two that meet there are off by the square root of their rounding.
 ABOVE, ON_AXIS = 1e-13, 1e-5
 
-# Doublings of a Riccati equation; fewer than ten are needed unless a level is all but reached.
-DOUBLINGS = 60
+# Doublings of a Riccati equation: fewer than ten are needed unless a level is all but reached, and some 20
+# where one is within 1e-10 of it.
+DOUBLINGS = 30
 
 # The least storage of a state, beside the largest.
 UNSEEN = 1e-9
@@ -43,8 +44,8 @@ UNSEEN = 1e-9
 SPARED = tuple(10.0**-k for k in range(3, 12))
 
 
-def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
-    """Return max over θ of ‖C (e^{jθ} − A)⁻¹ B + D‖₂, infinite where A is not stable.
+def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> tuple[float, float]:
+    """Return max over θ of ‖C (e^{jθ} − A)⁻¹ B + D‖₂ and its θ in [0, π]; infinite where A is not stable.
 
     Notes
     -----
@@ -52,10 +53,10 @@ def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
     the Hamiltonian matrix of γ has the eigenvalue jω (Boyd, Balakrishnan and Kabamba, 1989).
     """
     if not b.size or not c.size:
-        return 0.0
+        return 0.0, 0.0
     values = np.linalg.eigvals(a)
     if len(a) and np.abs(values).max() >= 1:
-        return np.inf
+        return np.inf, 0.0
     a_c, b_c, c_c, d_c = _on_axis(a, b, c, d)
 
     def gains(angles: Floats) -> Floats:
@@ -69,7 +70,7 @@ def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
         lower = c_c.T @ (np.eye(len(c)) + d_c @ r @ d_c.T) @ c_c
         return np.block([[a_h, b_c @ r @ b_c.T], [-lower, -a_h.T]])
 
-    return _highest(gains, hamiltonian, values)[0]
+    return _highest(gains, hamiltonian, values)
 
 
 def least_real(a: Floats, b: Floats, c: Floats, d: Floats, weight: Floats) -> tuple[float, float]:
@@ -182,23 +183,27 @@ def proves_gain(a: Matrix, b: Matrix, c: Matrix, d: Matrix, level: float) -> boo
     return dissipates(a, b, RADII.subtract(given, lost))
 
 
-def proves_positive(a: Matrix, b: Matrix, c: Matrix, d: Matrix, weight: Matrix) -> bool:
+def proves_positive(
+    a: Matrix, b: Matrix, c: Matrix, d: Matrix, weight: Matrix, *, spared: Sequence[float] = SPARED
+) -> bool:
     """Say whether a loop is proved stable and He(C (e^{jθ} − A)⁻¹ B + D) + W proved positive for all θ.
 
     Parameters
     ----------
     a, b, c, d, weight
         The loop's matrices and W (2, …) with their radii.
+    spared
+        As for `dissipates`.
     """
     n, m = a.shape[-1], b.shape[-1]
     supply = np.zeros((2, n + m, n + m))
     supply[:, n:, :n], supply[:, :n, n:] = c, np.swapaxes(c, -1, -2)
     whole = RADII.add(d, weight)
     supply[:, n:, n:] = RADII.add(whole, np.swapaxes(whole, -1, -2))
-    return dissipates(a, b, supply)
+    return dissipates(a, b, supply, spared=spared)
 
 
-def dissipates(a: Matrix, b: Matrix, supply: Matrix) -> bool:
+def dissipates(a: Matrix, b: Matrix, supply: Matrix, *, spared: Sequence[float] = SPARED) -> bool:
     """Say whether a loop is proved stable and proved to store less than it is supplied, whatever comes in.
 
     Parameters
@@ -208,6 +213,9 @@ def dissipates(a: Matrix, b: Matrix, supply: Matrix) -> bool:
     supply
         S (2, n + m, n + m), symmetric, with its radii; its first block must not be above 0 (nothing is
         supplied to a loop that is left alone), or nothing is said of stability.
+    spared
+        Parts of the storage that are left over for rounding, one after the other: less than the supply is
+        above what is lost, relatively.
 
     Notes
     -----
@@ -222,7 +230,7 @@ def dissipates(a: Matrix, b: Matrix, supply: Matrix) -> bool:
     # What nothing comes of needs some storage, too, for that of all to be positive.
     sizes = np.diag(first)
     sizes = np.maximum(sizes, UNSEEN * sizes.max(initial=0.0) or 1.0)
-    for part in SPARED:
+    for part in spared:
         p = _storage(*plain, part * sizes)
         if p is not None and _serves(a, b, supply, (p + p.T) / 2):
             return True

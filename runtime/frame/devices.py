@@ -152,7 +152,7 @@ def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands
     Raises
     ------
     ApcError
-        E910 a peer without a device, or with several that a hand might hold.
+        E931 a peer without a device, or with several that a hand might hold.
     """
     unit_of = {one.name: one.unit for one in system.parameters}
     numbers = resolve(system)
@@ -170,17 +170,17 @@ def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands
             or f"{group.name} has no {part or 'device: every mass of it is a copy that others are told of'}"
         )
         hint = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
-        raise ApcError(Mistake("E910", Place(system.origin.topology), f"{option}: {why}", hint=hint))
+        raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {why}", hint=hint))
     return found
 
 
 def refuse_hands(system: CompiledSystem, option: str) -> None:
-    """Refuse a scene that has hands already: ApcError E911."""
+    """Refuse a scene that has hands already: ApcError E932."""
     for group in system.groups:
         for hand in system.kinds[group.kind].hands:
             what = f"{option}: {group.name} has a hand already, {hand}"
             hint = f"a scene without {hand}, or no {option}"
-            raise ApcError(Mistake("E911", Place(system.origin.topology), what, hint=hint))
+            raise ApcError(Mistake("E932", Place(system.origin.topology), what, hint=hint))
 
 
 def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> CompiledSystem:
@@ -189,7 +189,7 @@ def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> Compi
     Raises
     ------
     ApcError
-        E910 as `devices_of`, E911 hands in the scene.
+        E931 as `devices_of`, E932 hands in the scene.
     """
     refuse_hands(system, option)
     devices = devices_of(system, option=option)
@@ -206,7 +206,7 @@ def held(system: CompiledSystem, *, option: str) -> CompiledSystem:
     Raises
     ------
     ApcError
-        E910 as `devices_of`, E911 hands in the scene.
+        E931 as `devices_of`, E932 hands in the scene.
     """
     refuse_hands(system, option)
     devices = devices_of(system, option=option)

@@ -30,8 +30,9 @@ OPTION = "--hands passive"
 STABLE, UNSTABLE = "stable with any passive hands", "unstable with some passive hands"
 UNDECIDED, NEVER = "undecided", "unstable with some passive hands, however much damping there is"
 
-# How far below the least that is found, relatively, what is proved may lie: the first that can be proved.
-WIDTHS = tuple(10.0**-k for k in (12, 10, 8, 6, 4))
+# How far below the least that is found, relatively, what is proved may lie, the first that can be proved; and
+# what part of that a proof may leave over for rounding.
+WIDTHS, SPARED = (1e-9, 1e-7, 1e-5), (0.03, 1e-3)
 
 # Two frequencies fit a motion alike, relatively.
 ALIKE = 1e-6
@@ -106,7 +107,7 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
     Raises
     ------
     ApcError
-        E910 a peer without a device; E911 hands in the scene; E912 a device that is touched otherwise than by
+        E931 a peer without a device; E932 hands in the scene; E933 a device that is touched otherwise than by
         samples and held forces, or too many intervals; and those of `analysis.analyze`.
 
     Notes
@@ -171,7 +172,7 @@ def _judge(loop: PortLoop) -> PassiveMode:
     return PassiveMode(
         name=loop.name,
         multiplicity=loop.multiplicity,
-        passive=True if low > 0 else False if high < 0 else None,
+        passive=True if low >= 0 else False if high < 0 else None,
         damping=float(dampings.pop()) if len(dampings) == 1 else None,
         more=-least if known else None,
         error=max(high - least, least - low) if known else None,
@@ -194,9 +195,12 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     for width in WIDTHS:
         shift = least - width * scale
         less = RADII.subtract(loop.weight, RADII.exact(shift * np.eye(len(loop.weight[0]))))
-        if proves_positive(*matrices, less):
+        if proves_positive(*matrices, less, spared=[part * width for part in SPARED]):
             low = shift
             break
+    else:
+        if least > 0 and proves_positive(*matrices, loop.weight):
+            low = 0.0
     return least, _asymmetry(loop, low), _draws(loop, angle), angle
 
 

@@ -98,7 +98,7 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     Raises
     ------
     ApcError
-        E910 no device, or none that can be cut out; E912 too many intervals or states.
+        E931 no device, or none that can be cut out; E933 too many intervals or states.
     """
     groups, exchange = lifted_groups(system, prepared=prepared)
     unit_of = {one.name: one.unit for one in system.parameters}
@@ -108,13 +108,13 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
         if not isinstance(device, Device):
             what = f"{option}: {device or f'{group.name} has no device'}"
             hint = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
-            raise ApcError(Mistake("E910", Place(system.origin.topology), what, hint=hint))
+            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
         felt = _felt_velocity(group, device)
         if felt:
             return felt
         if why := _other_touch(group, device):
             hint = "a coupler that acts by sample and hold, as SampledSpringDamper"
-            raise ApcError(Mistake("E912", Place(system.origin.topology), f"{option}: {why}", hint=hint))
+            raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {why}", hint=hint))
         own, one = _ported(group, device)
         ported.append(own)
         touched[id(own.schedule)] = one
@@ -227,7 +227,7 @@ def _loops(
     if states > MOST_STATES:
         what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and intervals"
         hint = f"equal peers on complete graphs or rings, or {MOST_STATES:,} in all"
-        raise ApcError(Mistake("E912", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
     return (dense_loop(groups, exchange),), False
 
 
@@ -249,7 +249,7 @@ def _port_loop(
     if len(into) > MOST_INTERVALS:
         what = f"devices are sampled and pushed over {len(into):,} intervals of a frame"
         hint = f"{MOST_INTERVALS:,} at most"
-        raise ApcError(Mistake("E912", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
     # A device is where it was as the frame began, and the intervals before have moved it since.
     sums, of = np.zeros((len(into), len(into))), np.zeros((len(into), len(sites)))
     scale, start = np.zeros(len(into)), 0
@@ -271,7 +271,7 @@ def _port_loop(
     if aside is None:
         what = "with its devices clamped the scene has a motion that nothing holds back"
         hint = "couplers that hold each object to a device"
-        raise ApcError(Mistake("E912", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
     forces = RADII.add(RADII.multiply(answered, aside), RADII.multiply(at_once, RADII.exact(of)))
     static = forces[:, [int(np.flatnonzero(of[:, k])[0]) for k in range(len(sites))]]
     b = RADII.subtract(

@@ -362,7 +362,7 @@ def harmless(of: HeldParts) -> int | None:
     nominal = [part.heard.frame(lost=False) for part in of.parts]
     if any(enclose_eigenvalues(value_of(one), radius_of(one))[1].high >= 1 for one in nominal):
         return None
-    gain = max(peak_gain(*map(value_of, part.off)) for part in of.parts) * of.weight
+    gain = max(peak_gain(*map(value_of, part.off))[0] for part in of.parts) * of.weight
     if gain >= 2:
         return 0
     most = MANY

@@ -1,0 +1,564 @@
+"""What a hand feels: how its device answers a force, and how a push arrives at another hand.
+
+Takes: a `CompiledSystem`, a device, frequencies.
+Gives: `Feel`, `feel`; `Slow`, `Extremes`, `Noise`; `Device port` names: `find_port`.
+Guarantees: at each frequency the answer is exact for the sampled, held and sent signals of the scene, with a
+bound on its rounding; nothing is folded: a frequency beyond half the fastest clock is refused.
+Does not: look at how a hand answers back (see `passivity`), or at packets that are lost or late.
+
+Peers' answers are put together from those of modes: with all n peers of a class alike, or one against their
+mean, a push at one of them is 1/n of the first and 1 − 1/n of the second.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared, lifted_groups, prepare
+from apc.analysis.analysis import analyze as judge
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.timings import part
+from apc.eigen.closing import Loop
+from apc.eigen.modes import arrange, dense_loop
+from apc.eigen.peer_group import MOST_STATES, PeerGroup
+from apc.eigen.rigid import find_rigid_modes
+from apc.finite_equations import finite_equations
+from apc.frame.devices import Device, find_device
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange
+from apc.frame.parameters import resolve
+from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
+from apc.hands.response import Carried, Pushed, open_site, pushed_loop, spectra
+from apc.network.nominal import left_out
+from apc.result import Result
+from apc.threads import single_threaded
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+# The harmonics of the frame rate that are looked at beside the fundamental.
+ALIASES = (0, 1, -1)
+
+# Points of a circle about s = 0, and its radii in 1/s, one after the other half as large.
+AROUND, RADIUS, HALVINGS = 16, 4.0, 10
+
+# Intervals of a peer times its states, of what is kicked and read in a frame.
+MOST_KICKS = 4000
+
+
+@dataclass(frozen=True, slots=True)
+class Slow:
+    """What is felt of slow motions: Z = stiffness/s + damping + mass · s + …, in SI, each ± its `errors`."""
+
+    mass: float
+    damping: float
+    stiffness: float
+    errors: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Extremes:
+    """H∞ norms of one mode: of the velocity of devices, and of how far a copy is from the others, a newton.
+
+    `on_ticks` with forces held, and motions read, at the instants at which something happens; `sampled_data`
+    with forces of any course. `of` is what moves; a copy's is None in a mode in which all move alike.
+    """
+
+    mode: str
+    of: str
+    on_ticks: Peak
+    sampled_data: Peak
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Root mean squares over all ticks of a frame, for white noise from tick to tick at every peer of its own.
+
+    `error_m` of a copy less the mean of the others', `velocity_m_s` of a device: for forces of 1 N rms at
+    hands, or samples of positions off by 1 m rms (a sensor of steps q is off by q/√12). None in a scene that
+    drifts for it.
+    """
+
+    source: str
+    error_m: float | None
+    velocity_m_s: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Feel(Result):
+    """What is felt at a device, and what of a push there arrives at another, at frequencies (k,) in Hz.
+
+    `impedance` in N·s/m is force by velocity, where hands push and others are free; `transmitted_admittance`
+    in m/s/N is the other device's velocity by the force here, `error_per_force` in m/N how far the copy of
+    the object here is from the mean of the others'. All are complex, the fundamental's. `alias` is the
+    largest of what else comes at the device, at frequencies a frame rate apart, beside the fundamental.
+    `bound` is what any of them may be off by, relatively.
+    """
+
+    shown_by = "hands:feel"
+
+    topology: str
+    at: str
+    between: str
+    copy: str
+    frequency_hz: Floats
+    impedance: Complex
+    transmitted_admittance: Complex
+    error_per_force: Complex
+    alias: Floats
+    bound: Floats
+    low_frequency: Slow | None
+    hinf: tuple[Extremes, ...]
+    h2: tuple[Noise, ...]
+    stable: bool | None
+    linearized: bool
+    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """A device: its peer, counted from 0 over all groups, and the part, "" for the only one there is."""
+
+    peer: int
+    part: str
+
+
+_PORT = re.compile(r"(?:(?P<group>[^.\[\]]+)\[(?P<number>[0-9]{1,9})\])?\.?(?P<part>.*)\Z")
+
+
+def find_port(system: CompiledSystem, text: str, option: str) -> Port:
+    """Return the device that a name such as `left[1].device` means.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    text, option
+        The name, and where it was given.
+
+    Raises
+    ------
+    ApcError
+        E936 no such peer or part.
+    """
+    counts = [group.count for group in system.groups]
+    starts = np.cumsum([0, *counts]).tolist()
+    names = [group.name for group in system.groups]
+    matched = _PORT.match(text)
+    assert matched is not None
+    group, number, own = matched["group"], matched["number"], matched["part"]
+    if group is None:
+        first, _, rest = own.partition(".")
+        if first in names:
+            group, number, own = first, "1", rest
+    parts = sorted({name.name.rpartition(".")[0] for kind in system.kinds for name in kind.states})
+    example = f'{option} "{names[0]}[1].{parts[0] if parts else "device"}"'
+    if group is not None and group not in names:
+        what = f"{option}: no group of peers is called {group[:40]}"
+        hint = nearest(group, names)
+        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint or example))
+    place = 0 if group is None else names.index(group)
+    peer = int(number or 1)
+    if not 1 <= peer <= counts[place]:
+        what = f"{option}: {names[place]} has {counts[place]:,} peers, counted from 1; there is no {peer}"
+        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=example))
+    if own and own not in parts:
+        what = f"{option}: nothing that moves is called {own[:40]}"
+        hint = nearest(own, parts)
+        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint or example))
+    return Port(starts[place] + peer - 1, own)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Modes:
+    """A scene as modes of which any device may be pushed: `common` first, then each class apart.
+
+    `class_of` gives the site of `common` that a peer is in; `bases` are the modes' rigid motions.
+    """
+
+    loops: tuple[Pushed, ...]
+    bases: tuple[Floats, ...]
+    common: int
+    apart: dict[int, int]
+    class_of: dict[int, int]
+    members: tuple[int, ...]
+
+
+@part("feel")
+def feel(
+    system: CompiledSystem,
+    frequencies: Sequence[float] | Floats,
+    *,
+    at: str = "",
+    between: str = "",
+    unstable: bool = False,
+    quick: bool = False,
+    prepared: Prepared | None = None,
+) -> Feel:
+    """Say what a hand feels.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    frequencies
+        (k,), in Hz, above 0 and at most half the rate of the fastest clock.
+    at, between
+        The device that is pushed, and another whose motion is asked for: `left[1].device`. The first peer's,
+        and the next one's, if not given.
+    unstable
+        Whether the map of an unstable scene is wanted, which has no response in time.
+    quick
+        Leave out what is told beside the responses.
+    prepared
+        From `analysis.prepare`, of this system with any numbers.
+
+    Raises
+    ------
+    ApcError
+        E931 a peer without a device; E934 an unstable scene; E935 a frequency beyond half the fastest clock,
+        or none above 0; E936 a name that means nothing; E933 a scene too large.
+    """
+    found = np.asarray(frequencies, dtype=np.float64).ravel()
+    port = find_port(system, at, "--at")
+    other = find_port(system, between, "--between") if between else Port(_next(system, port), "")
+    _check_frequencies(system, found)
+    prepared = prepared or prepare(system)
+    verdict = judge(system, prepared=prepared)
+    if verdict.stable is False and not unstable:
+        what = (
+            f"the scene is unstable (spectral radius {verdict.spectral_radius:.6g}): what a push makes of it "
+            "grows, and it has no response in time"
+        )
+        hint = "--unstable, for that of the map from force to motion"
+        raise ApcError(Mistake("E934", Place(system.origin.topology), what, hint=hint))
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        modes, exchange = _modes(system, prepared, port, other)
+        responses = _Responses(modes, port.peer, other.peer)
+        s = 2j * np.pi * found
+        own, across, error, alias = responses.at(s, ALIASES)
+        one = 1 / own[0]
+        bound = np.max([off / np.abs(value) for value, off in (own, across, error) if value.any()], axis=0)
+        steady = verdict.stable is not False and not quick
+        slow = responses.slow() if not quick else None
+        hinf = _extremes(modes, responses) if steady else ()
+        h2 = _noise(system, modes, responses) if steady else ()
+    linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
+    notes = () if verdict.stable is not False else ("of the map: the scene is unstable",)
+    return Feel(
+        topology=system.name,
+        at=f"{exchange.peer_name(port.peer)}.{responses.device.part}",
+        between="" if other.peer == port.peer else f"{exchange.peer_name(other.peer)}.{responses.other.part}",
+        copy=responses.copy,
+        frequency_hz=found,
+        impedance=one,
+        transmitted_admittance=across[0],
+        error_per_force=error[0],
+        alias=alias,
+        bound=bound * 1.01,
+        low_frequency=slow,
+        hinf=hinf,
+        h2=h2,
+        stable=verdict.stable,
+        linearized=not linear,
+        left_out=left_out(system, linear=linear),
+        notes=notes,
+    )
+
+
+def _next(system: CompiledSystem, port: Port) -> int:
+    """Return the peer after one, itself if it is alone."""
+    return (port.peer + 1) % sum(group.count for group in system.groups)
+
+
+def _check_frequencies(system: CompiledSystem, found: Floats) -> None:
+    """Refuse frequencies that no response is told of: ApcError E935."""
+    timings = resolve(system).timings
+    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
+    period = min(timings[clock.period] for clock in system.clocks if clock.name in used)
+    most = float(1 / (2 * period))
+    place = Place(system.origin.topology)
+    hint = f'--to "{most:.6g} Hz"'
+    if not found.size or not np.isfinite(found).all() or found.min() <= 0:
+        got = "none" if not found.size else f"{found.min():.6g} Hz"
+        raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, '--from "0.1 Hz"'))
+    if found.max() > most:
+        what = f"{found.max():.6g} Hz is beyond half the fastest clock, where samples can't tell it from a slower one"
+        raise ApcError(Mistake("E935", place, what, hint=hint))
+
+
+def _modes(
+    system: CompiledSystem, prepared: Prepared, port: Port, other: Port
+) -> tuple[_Modes, Exchange]:
+    """Open all peers of a scene, and put them together to modes."""
+    groups, exchange = lifted_groups(system, prepared=prepared)
+    unit_of = {one.name: one.unit for one in system.parameters}
+    opened, sites = [], {}
+    for group in groups:
+        wanted = {one.peer: one.part for one in (other, port)}
+        names = {wanted[peer] for peer in wanted if peer in group.peers}
+        device = find_device(
+            group.jacobians, group.parameters, unit_of, group.listening, part=max(names, default="")
+        )
+        if isinstance(device, str) or (device is None and names):
+            what = device or f"{group.name} has no device"
+            hint = "--at with the part that is held, as user[1].device"
+            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+        kicks = len(group.schedule.events) * len(group.site.a)
+        if kicks > MOST_KICKS:
+            what = f"a frame of {group.name} has too many events and states: {kicks:,} together"
+            hint = f"{MOST_KICKS:,} at most"
+            raise ApcError(Mistake("E933", Place(system.origin.topology), what, hint=hint))
+        own, site = open_site(group, device)
+        opened.append(own)
+        sites[id(own.schedule)] = site
+    plain, wide = _arranged(system, groups, exchange), _arranged(system, opened, exchange)
+    common = wide[0]
+    class_of = {
+        peer: place
+        for place, site in enumerate(common.sites)
+        for peer in (port.peer, other.peer)
+        if peer in site.peers
+    }
+    counts = tuple(site.count if common.name == "common" else 1 for site in common.sites)
+    loops = tuple(
+        pushed_loop(loop, sites, counts if number == 0 else (1,)) for number, loop in enumerate(wide)
+    )
+    apart = {}
+    for number, loop in enumerate(wide[1:], 1):
+        for place, site in enumerate(common.sites):
+            if loop.sites[0].name == site.name:
+                apart[place] = number
+    bases = tuple(find_rigid_modes(loop).basis for loop in plain)
+    return _Modes(loops, bases, 0, apart, class_of, counts), exchange
+
+
+def _arranged(
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange
+) -> tuple[Loop, ...]:
+    """Return a scene as one loop of classes of peers that move alike, and one of each class apart; or whole."""
+    found = arrange(groups, exchange)
+    if found.loops[0].name in ("common", "single"):
+        return found.loops
+    states = sum(group.count * len(group.lifted.z_names) for group in groups)
+    if states > MOST_STATES:
+        what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and readings"
+        hint = f"peers on complete graphs, or {MOST_STATES:,} in all"
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
+    return (dense_loop(groups, exchange),)
+
+
+@dataclass(frozen=True, slots=True)
+class _Weights:
+    """What a quantity of the pushed peer is, over (site, state): of all classes' means, and of its own apart."""
+
+    common: dict[tuple[int, int], float]
+    apart: dict[tuple[int, int], float]
+
+
+class _Responses:
+    """The answers to a push of one peer, put together from those of modes."""
+
+    def __init__(self, modes: _Modes, peer: int, other: int) -> None:
+        self.modes = modes
+        self.peer, self.across = peer, other
+        self.own, self.to = modes.class_of[peer], modes.class_of[other]
+        common = modes.loops[modes.common]
+        device, found = common.sites[self.own].device, common.sites[self.to].device
+        assert device is not None and found is not None
+        self.device: Device = device
+        self.other: Device = found
+        self.copies = [_copy(site.group) for site in common.sites]
+        named = self.copies[self.own]
+        self.copy = named[0] if named else ""
+
+    def at(self, s: Complex, aliases: Sequence[int] = (0,)) -> tuple[Carried, Carried, Carried, Floats]:
+        """Return the velocities here and there, the copy's error, and the largest alias here (k,)."""
+        common = self.modes.loops[self.modes.common]
+        n = self.modes.members[self.own]
+        copies = [(place, one[1], 0) for place, one in enumerate(self.copies) if one]
+        here, own = self.device.velocity, self.copies[self.own]
+        wanted = [(self.own, here, alias) for alias in aliases]
+        wanted = [*wanted, (self.to, self.other.velocity, 0), *copies]
+        together = [_scaled(one, 1 / n) for one in spectra(common, self.own, wanted, s)]
+        velocity, (there, *rest) = together[: len(aliases)], together[len(aliases) :]
+        parts = dict(zip([place for place, _, _ in copies], rest, strict=True))
+        apart: list[Carried] = []
+        if n > 1:
+            loop = self.modes.loops[self.modes.apart[self.own]]
+            rows = [(0, here, alias) for alias in aliases] + ([(0, own[1], 0)] if own else [])
+            apart = spectra(loop, 0, rows, s)
+            velocity = [_plus(a, _scaled(b, 1 - 1 / n)) for a, b in zip(velocity, apart, strict=False)]
+            if self.own == self.to:
+                there = _plus(there, _scaled(apart[0], 1 - 1 / n if self.peer == self.across else -1 / n))
+        error = self._error(parts, apart[-1] if own and n > 1 else None, len(s))
+        sizes = np.abs([one[0] for one in velocity])
+        return velocity[0], there, error, sizes[1:].max(axis=0, initial=0.0) / sizes[0]
+
+    @property
+    def velocity_weights(self) -> _Weights:
+        """What the velocity of the pushed peer is, in the modes."""
+        one = {(self.own, self.device.velocity): 1.0}
+        return _Weights(one, {(0, self.device.velocity): 1.0})
+
+    @property
+    def error_weights(self) -> _Weights | None:
+        """What the error of the pushed peer's copy is, in the modes; None without any."""
+        others = self._others()
+        total = sum(others.values())
+        own = self.copies[self.own]
+        if own is None or not total:
+            return None
+        common = {(self.own, own[1]): 1.0}
+        for place, many in others.items():
+            copy = self.copies[place]
+            assert copy is not None
+            common[place, copy[1]] = common.get((place, copy[1]), 0.0) - many / total
+        return _Weights(
+            {key: weight for key, weight in common.items() if abs(weight) > UNIT}, {(0, own[1]): 1 + 1 / total}
+        )
+
+    def _others(self) -> dict[int, int]:
+        """Return how many others have a copy of the pushed peer's, class by class."""
+        return {
+            place: self.modes.members[place] - (place == self.own)
+            for place, one in enumerate(self.copies)
+            if one and one[0] == self.copy
+        }
+
+    def _error(self, parts: dict[int, Carried], apart: Carried | None, count: int) -> Carried:
+        """Return how far the copy here is from the mean of all others' of its name."""
+        others = self._others()
+        total = sum(others.values())
+        nothing = np.zeros(count, complex), np.zeros(count)
+        if not total:
+            return nothing
+        found = parts[self.own]
+        for place, many in others.items():
+            found = _plus(found, _scaled(parts[place], -many / total))
+        if apart is not None:
+            # One peer less the mean of its class moves by 1 − 1/n here, and by −1/n at each of the others.
+            n = self.modes.members[self.own]
+            found = _plus(found, _scaled(apart, (1 - 1 / n) * (1 + 1 / total)))
+        return found
+
+    def slow(self) -> Slow | None:
+        """Return mass, damping and stiffness at low frequency, None where they can't be told.
+
+        Notes
+        -----
+        s Z(s) has no pole within a circle about 0, so its Taylor coefficients are the means of its values on
+        the circle against powers of s (Cauchy); those of two circles differ by what is left out.
+        """
+        before: Floats | None = None
+        radius = RADIUS
+        for _ in range(HALVINGS):
+            s = radius * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
+            (velocity, off), _, _, _ = self.at(s)
+            values = s / velocity
+            doubt = np.abs(values) * float((off / np.abs(velocity)).max())
+            found = np.array([(values / s**power).mean().real for power in range(3)])
+            rounding = np.array([doubt.max() / radius**power for power in range(3)])
+            if before is not None:
+                errors = np.abs(found - before) + rounding
+                if (errors <= 1e-6 * np.maximum(np.abs(found), np.abs(found[1]) * radius ** (1 - np.arange(3)))).all():
+                    return Slow(found[2], found[1], found[0], (errors[2], errors[1], errors[0]))
+            before, radius = found, radius / 2
+        return None
+
+
+def _copy(group: PeerGroup) -> tuple[str, int] | None:
+    """Return what a peer tells others the position of, and which state that is; None if nothing."""
+    kind = group.jacobians.kind
+    for send, sending in zip(group.site.sends, kind.sends, strict=True):
+        for row, unit in zip(send.x, sending.units, strict=True):
+            places = np.flatnonzero(row)
+            if unit == "m" and len(places) == 1 and row[places[0]] == 1:
+                place = int(places[0])
+                return kind.states[place].name.rpartition(".")[0], place
+    return None
+
+
+def _scaled(one: Carried, share: float) -> Carried:
+    return one[0] * share, one[1] * abs(share) + 2.0**-52 * np.abs(one[0] * share)
+
+
+def _plus(one: Carried, other: Carried) -> Carried:
+    value = one[0] + other[0]
+    return value, one[1] + other[1] + 2.0**-52 * np.abs(value)
+
+
+def _extremes(modes: _Modes, responses: _Responses) -> tuple[Extremes, ...]:
+    """Return the H∞ norms of the modes that the pushed peer is in."""
+    found = []
+    for number in (modes.common, modes.apart.get(responses.own)):
+        if number is None:
+            continue
+        loop, basis = modes.loops[number], modes.bases[number]
+        site = responses.own if number == modes.common else 0
+        rows = [("velocity", responses.device.velocity)]
+        copy = responses.copies[responses.own]
+        if number != modes.common and copy is not None:
+            rows.append(("error", copy[1]))
+        for name, row in rows:
+            peaks = (one(loop, site, site, row, basis) for one in (tick_peak, sampled_data_peak))
+            found.append(Extremes(loop.name, name, *peaks))
+    return tuple(found)
+
+
+def _noise(system: CompiledSystem, modes: _Modes, responses: _Responses) -> tuple[Noise, ...]:
+    """Return what white noise at all peers does to the pushed peer."""
+    ticks = _ticks(system, float(modes.loops[0].frame))
+    if ticks is None:
+        return ()
+    found = []
+    for source, sensors in (("hands", False), ("sensors", True)):
+        velocity = _variance(modes, responses, ticks, responses.velocity_weights, sensors=sensors)
+        error = _variance(modes, responses, ticks, responses.error_weights, sensors=sensors)
+        found.append(Noise(source, *(None if one is None else one**0.5 for one in (error, velocity))))
+    return tuple(found)
+
+
+def _variance(
+    modes: _Modes, responses: _Responses, ticks: list[Fraction], weights: _Weights | None, *, sensors: bool
+) -> float | None:
+    """Return the variance of states of the pushed peer, each class's noise its own at each of its peers."""
+    if weights is None:
+        return None
+    total = 0.0
+    loop, basis = modes.loops[modes.common], modes.bases[modes.common]
+    held = [place for place, site in enumerate(loop.sites) if site.device is not None]
+    if weights.common:
+        sources = {place: 1 / modes.members[place] for place in held}
+        found = noise_variance(loop, ticks, sources, weights.common, basis, sensors=sensors)
+        if found is None:
+            return None
+        total += found
+    number = modes.apart.get(responses.own)
+    if number is not None and weights.apart:
+        sources = {0: 1 - 1 / modes.members[responses.own]}
+        found = noise_variance(
+            modes.loops[number], ticks, sources, weights.apart, modes.bases[number], sensors=sensors
+        )
+        if found is None:
+            return None
+        total += found
+    return total
+
+
+def _ticks(system: CompiledSystem, frame: float) -> list[Fraction] | None:
+    """Return when in a frame the fastest clock ticks, None where a frame does not begin with a tick."""
+    timings = resolve(system).timings
+    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
+    clock = min((one for one in system.clocks if one.name in used), key=lambda one: timings[one.period])
+    if timings[clock.phase] % timings[clock.period]:
+        return None
+    return [number * timings[clock.period] for number in range(round(frame / float(timings[clock.period])))]

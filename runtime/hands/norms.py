@@ -1,0 +1,203 @@
+"""How much a scene makes of what hands do: H∞ and H2 norms of its modes.
+
+Takes: a mode whose peers may be pushed (`response.Pushed`), and its rigid motions.
+Gives: `Peak`, `tick_peak`, `sampled_data_peak`; `noise_variance`.
+Guarantees: no grid of frequencies decides anything; an output that a rigid motion shows in has no norm.
+Does not: prove it: norms are right to what rounding leaves, some 1e-12 of them, and to `error`.
+
+On ticks, a force is held from one instant at which anything happens to the next, and what comes of it is read
+at these. Of the motion in between, force and motion are taken at Gauss nodes of each interval, as polynomials
+whose norms these give exactly: what is left out falls faster than any power of their number (Bamieh and
+Pearson, IEEE Trans. Autom. Control 37 (1992) 418, reduce the same operator; its H∞ norm is that of this map).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.eigen.dissipation import peak_gain
+from apc.eigen.relative import relative, relative_coordinates
+from apc.frame.discretize import exponential_rows
+from apc.frame.radius import value_of
+from apc.hands.response import Pushed, Site
+from apc.threads import load_pool
+
+Floats = NDArray[np.float64]
+
+# Gauss nodes of an interval, and how many more tell how far the norm is off.
+NODES, MORE = 4, 2
+
+# What counts as none of a rigid motion in an output, relatively.
+UNSEEN = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """An H∞ norm, in SI a newton, ± `error`, and the frequency in Hz where the gain is so large."""
+
+    norm: float
+    error: float
+    frequency_hz: float
+
+
+def tick_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats) -> Peak:
+    """Return the norm on ticks of the map from a force at all devices of a site to a state of another.
+
+    Parameters
+    ----------
+    loop, pushed, of, row
+        The mode, the site that is pushed, and which state of which site is read.
+    basis
+        The rigid motions (n, d) of the mode.
+    """
+    site, other = loop.sites[pushed], loop.sites[of]
+    inputs = np.zeros((loop.k.shape[-1], len(site.seconds)))
+    for place, seconds in enumerate(site.seconds):
+        kick = _lanes(site, float(seconds), 1)[:, 0] / float(seconds) ** 0.5
+        inputs[loop.kicks[pushed][place, :-1], place] = kick
+    reads = loop.reads[of][:, row]
+    outputs = np.zeros((len(reads), loop.c.shape[-2]))
+    outputs[range(len(reads)), reads] = [float(one) ** 0.5 for one in other.seconds]
+    return _peak(loop, inputs, outputs, np.zeros((len(reads), inputs.shape[1])), basis)
+
+
+def sampled_data_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats) -> Peak:
+    """Return the norm of the same map from forces of any course to motions between ticks as well.
+
+    Parameters
+    ----------
+    loop, pushed, of, row, basis
+        As for `tick_peak`.
+    """
+    few, many = (_with_nodes(loop, pushed, of, row, basis, nodes) for nodes in (NODES, NODES + MORE))
+    error = abs(many.norm - few.norm) + 1e-12 * many.norm
+    return Peak(many.norm, error if np.isfinite(many.norm) else 0.0, many.frequency_hz)
+
+
+def _with_nodes(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, nodes: int) -> Peak:
+    """Return the norm with so many Gauss nodes an interval."""
+    site, other = loop.sites[pushed], loop.sites[of]
+    at, weights = np.polynomial.legendre.leggauss(nodes)
+    at, weights = (at + 1) / 2, weights / 2
+    # A force of one value at its node and none at the others, as coefficients of σ^i/i!, σ from 0 to 1.
+    powers = at[:, None] ** np.arange(nodes) / np.cumprod([1, *range(1, nodes)])
+    forces = np.linalg.inv(powers) / np.sqrt(weights)
+    columns = nodes * len(site.seconds)
+    inputs = np.zeros((loop.k.shape[-1], columns))
+    for place, seconds in enumerate(site.seconds):
+        own = slice(place * nodes, (place + 1) * nodes)
+        lanes = _lanes(site, float(seconds), nodes) @ forces / float(seconds) ** 0.5
+        inputs[loop.kicks[pushed][place, :-1], own] = lanes
+    rows = nodes * len(other.seconds)
+    outputs, through = np.zeros((rows, loop.c.shape[-2])), np.zeros((rows, columns))
+    known: dict[Fraction, tuple[Floats, Floats]] = {}
+    for place, seconds in enumerate(other.seconds):
+        if seconds not in known:
+            known[seconds] = _within(other, float(seconds), at, row, forces)
+        own = slice(place * nodes, (place + 1) * nodes)
+        seen, pushes = known[seconds]
+        scale = np.sqrt(weights * float(seconds))[:, None]
+        outputs[own, loop.reads[of][place]] = scale * seen
+        if pushed == of:
+            through[own, own] = scale * pushes / float(seconds) ** 0.5
+    return _peak(loop, inputs, outputs, through, basis)
+
+
+def _lanes(site: Site, seconds: float, count: int) -> Floats:
+    """Return γ_i (n_x, count) of an interval, σ^i/i! in units of it."""
+    n = len(site.states)
+    generator = np.zeros((1, n + count, n + count))
+    generator[0, :n, :n] = value_of(site.a) * seconds
+    generator[0, :n, n] = site.push[0] * seconds
+    generator[0, range(n, n + count - 1), range(n + 1, n + count)] = 1.0
+    return np.asarray(exponential_rows(generator, np.zeros((1, n + count, 0)), 1.0).matrix[0, :n, n:])
+
+
+def _within(
+    site: Site, seconds: float, at: Floats, row: int, forces: Floats
+) -> tuple[Floats, Floats]:
+    """Return a state within an interval at σ (q,), over states and holds (q, n_x + n_u) and forces (q, q)."""
+    n, count = len(site.states), len(at)
+    seen, pushed = [], []
+    for share in at.tolist():
+        step = exponential_rows(value_of(site.a)[None], value_of(site.b)[None], seconds * share).matrix[0]
+        seen.append(step[row])
+        # σ^i/i! up to a share of the interval: in units of that share, so many powers of it smaller.
+        lanes = _lanes(site, seconds * share, count) * share ** np.arange(count)
+        pushed.append(lanes[row] @ forces)
+    return np.array(seen).reshape(count, n + value_of(site.b).shape[1]), np.array(pushed)
+
+
+def _peak(loop: Pushed, inputs: Floats, outputs: Floats, through: Floats, basis: Floats) -> Peak:
+    """Return the norm of a map from inputs over kicks to outputs over what is read."""
+    m, k, c, d = map(value_of, (loop.m, loop.k, loop.c, loop.d))
+    b, c_y = k @ inputs, outputs @ c
+    at = relative_coordinates(basis)
+    if basis.size and np.abs(c_y @ basis).max() > UNSEEN * np.abs(c_y).max() * np.abs(basis).max():
+        return Peak(np.inf, 0.0, 0.0)
+    gain, angle = peak_gain(
+        relative(m, at), b[at.rest] - at.weights @ b[at.held], c_y[:, at.rest], outputs @ d @ inputs + through
+    )
+    return Peak(gain, 1e-12 * gain, angle / (2 * np.pi * float(loop.frame)))
+
+
+def noise_variance(
+    loop: Pushed, ticks: Sequence[Fraction], sources: Mapping[int, float], outputs: Mapping[tuple[int, int], float], basis: Floats, *, sensors: bool
+) -> float | None:
+    """Return the variance, over the ticks of a frame on the average, of what white noise makes of some states.
+
+    Parameters
+    ----------
+    loop
+        The mode.
+    ticks
+        When in a frame noise is drawn anew, in seconds, from 0 on.
+    sources
+        The variance of each site's noise, by site.
+    outputs
+        What the states are weighed by, by site and state.
+    basis
+        The mode's rigid motions (n, d).
+    sensors
+        Whether noise is on the samples of devices' positions, in m, and not on their forces, in N.
+
+    Returns
+    -------
+    None where a rigid motion that noise drives shows in the states: it drifts.
+    """
+    m, k, c, d = map(value_of, (loop.m, loop.k, loop.c, loop.d))
+    columns = []
+    for site, variance in sources.items():
+        own = loop.sites[site]
+        inputs = np.zeros((k.shape[1], len(ticks)))
+        for place, (seconds, start) in enumerate(zip(own.seconds, own.starts, strict=True)):
+            drawn = bisect_right(ticks, start) - 1
+            if sensors:
+                inputs[loop.kicks[site][place, -1], drawn] = variance**0.5
+            else:
+                inputs[loop.kicks[site][place, :-1], drawn] = variance**0.5 * _lanes(own, float(seconds), 1)[:, 0]
+        columns.append(inputs)
+    inputs = np.concatenate(columns, axis=1)
+    (first, _), *_ = outputs
+    starts = loop.sites[first].starts
+    rows = [place for place, start in enumerate(starts) if start in ticks]
+    read = np.zeros((len(rows), c.shape[0]))
+    for (site, state), weight in outputs.items():
+        for line, place in enumerate(rows):
+            read[line, loop.reads[site][place, state]] += weight
+    at = relative_coordinates(basis)
+    b, seen = k @ inputs, read @ c
+    if basis.size and np.abs(seen @ basis).max() > UNSEEN * np.abs(seen).max() * np.abs(basis).max():
+        return None
+    root = b[at.rest] - at.weights @ b[at.held]
+    linalg = load_pool("scipy.linalg")
+    moments = linalg.solve_discrete_lyapunov(relative(m, at), root @ root.T)
+    seen = seen[:, at.rest]
+    through = read @ d @ inputs
+    return float((np.einsum("ij,jk,ik->i", seen, moments, seen) + (through**2).sum(axis=1)).mean())
