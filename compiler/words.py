@@ -56,7 +56,9 @@ def measured(value: float, error: float, unit: str = "1") -> str:
             break
         place = whole.adjusted()
     digits = max(exact.adjusted() - place, 0)
-    text = f"{shown:f}" if -5 < exact.adjusted() < _DIGITS else _scientific(shown, digits)
+    text = (
+        "0" if not shown else f"{shown:f}" if -5 < exact.adjusted() < _DIGITS else _scientific(shown, digits)
+    )
     return f"{with_unit(text, unit)} ± {float(whole):.0e}"
 
 

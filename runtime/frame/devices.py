@@ -222,7 +222,9 @@ def held(system: CompiledSystem, *, option: str) -> CompiledSystem:
 
 
 @functools.lru_cache(maxsize=64)
-def _with_hand(kind: Kind, position: int, velocity: int, inverse_inertia: Any, names: tuple[str, ...]) -> Kind:
+def _with_hand(
+    kind: Kind, position: int, velocity: int, inverse_inertia: Any, names: tuple[str, ...]
+) -> Kind:
     """Return a kind whose device carries a hand: (m + m_h) v' = m v'₀ − b_h v − k_h (x − x₀)."""
     own = len(kind.parameters)
 

@@ -111,25 +111,23 @@ RADII = Arithmetic(
 
 
 def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
-    """Return X of M X = R for all M (2, n, n) and R (2, n, m) within their radii; None where rounding hides it.
+    """Return X of M X = R for all M (2, n, n) and R (2, n, m) within their radii; None where it has no bound.
 
     Notes
     -----
-    With an inverse Y in floats and F = I − Y M, an X in floats is off by (I − F)⁻¹ Y (R − M X): by its size
-    |Y (R − M X)|, and ‖F‖/(1 − ‖F‖) of the largest of its column.
+    With an inverse Y in floats and F = I − Y M, an X in floats is off by E ≤ B + |F| E, B = |Y (R − M X)|;
+    with |F| B ≤ θ B, entry by entry, that is at most B/(1 − θ).
     """
     n = matrix.shape[-1]
     try:
         inverse = np.linalg.inv(value_of(matrix))
     except np.linalg.LinAlgError:
         return None
-    found = inverse @ value_of(right)
-    exact = _exact(inverse)
+    found, exact = inverse @ value_of(right), _exact(inverse)
     wrong = RADII.subtract(_exact(np.eye(n)), _multiply(exact, matrix))
-    norm = float((np.abs(value_of(wrong)) + radius_of(wrong)).sum(axis=1).max(initial=0.0)) * (1 + n * UNIT)
-    if not norm < 0.5:
-        return None
     left = _multiply(exact, RADII.subtract(right, _multiply(matrix, _exact(found))))
-    off = np.abs(value_of(left)) + radius_of(left)
-    off = (off + 2 * norm * off.max(axis=0, initial=0.0)) * (1 + 8 * UNIT)
-    return with_radius(found, off)
+    off = np.abs(value_of(left)) + radius_of(left) + np.finfo(np.float64).tiny
+    share = float(((np.abs(value_of(wrong)) + radius_of(wrong)) @ off / off).max(initial=0.0)) * (
+        1 + n * UNIT
+    )
+    return with_radius(found, off * (1 + 8 * UNIT) / (1 - share)) if share < 0.5 else None

@@ -1,7 +1,7 @@
 """What a hand feels: how its device answers a force, and how a push arrives at another hand.
 
 Takes: a `CompiledSystem`, a device, frequencies.
-Gives: `Feel`, `feel`; `Slow`, `Extremes`, `Noise`; `Device port` names: `find_port`.
+Gives: `Feel`, `feel`; `Slow`, `Extremes`, `Noise`; `Port`, `find_port`; `read_frequencies`, `fastest`.
 Guarantees: at each frequency the answer is exact for the sampled, held and sent signals of the scene, with a
 bound on its rounding; nothing is folded: a frequency beyond half the fastest clock is refused.
 Does not: look at how a hand answers back (see `passivity`), or at packets that are lost or late.
@@ -37,6 +37,7 @@ from apc.frame.parameters import resolve
 from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
 from apc.hands.response import Carried, Pushed, open_site, pushed_loop, spectra
 from apc.network.nominal import left_out
+from apc.option_value import option_value
 from apc.result import Result
 from apc.threads import single_threaded
 
@@ -48,6 +49,12 @@ ALIASES = (0, 1, -1)
 
 # Points of a circle about s = 0, and its radii in 1/s, one after the other half as large.
 AROUND, RADIUS, HALVINGS = 16, 4.0, 10
+
+# What of slow motions two circles may tell differently, beside the largest.
+SETTLED = 1e-6
+
+# The highest frequency in Hz, where none is named: hands feel more, and do less.
+HIGHEST = 60.0
 
 # Intervals of a peer times its states, of what is kicked and read in a frame.
 MOST_KICKS = 4000
@@ -79,7 +86,7 @@ class Extremes:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Root mean squares over all ticks of a frame, for white noise from tick to tick at every peer of its own.
+    """Root mean squares over the ticks of a frame, for noise of each peer's own, white from tick to tick.
 
     `error_m` of a copy less the mean of the others', `velocity_m_s` of a device: for forces of 1 N rms at
     hands, or samples of positions off by 1 m rms (a sensor of steps q is off by q/√12). None in a scene that
@@ -243,7 +250,7 @@ def feel(
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         modes, exchange = _modes(system, prepared, port, other)
         responses = _Responses(modes, port.peer, other.peer)
-        s = 2j * np.pi * found
+        s: Complex = 2j * np.pi * found
         own, across, error, alias = responses.at(s, ALIASES)
         one = 1 / own[0]
         bound = np.max([off / np.abs(value) for value, off in (own, across, error) if value.any()], axis=0)
@@ -274,6 +281,38 @@ def feel(
     )
 
 
+def read_frequencies(
+    system: CompiledSystem, listed: str | None, low: str, high: str | None, points: int
+) -> Floats:
+    """Return the frequencies that options name, in Hz: those listed, or points between two at equal ratios.
+
+    Raises
+    ------
+    ApcError
+        E935 none above 0, or the lowest above the highest; those of `option_value`.
+    """
+    if listed is not None:
+        texts = [one.strip() for one in listed.split(",") if one.strip()]
+        values = [float(option_value("--frequencies", one, what="frequency", unit="Hz")) for one in texts]
+        return np.array(values)
+    first = float(option_value("--from", low, what="frequency", unit="Hz"))
+    last = min(HIGHEST, fastest(system) / 2)
+    if high is not None:
+        last = float(option_value("--to", high, what="frequency", unit="Hz"))
+    if not 0 < first < last:
+        what = f"from {first:.6g} Hz to {last:.6g} Hz there is nothing above 0 Hz"
+        hint = '--from "0.1 Hz" --to "60 Hz"'
+        raise ApcError(Mistake("E935", Place("--from"), what, hint=hint))
+    return np.geomspace(first, last, points)
+
+
+def fastest(system: CompiledSystem) -> float:
+    """Return the rate of the fastest clock in Hz."""
+    timings = resolve(system).timings
+    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
+    return float(1 / min(timings[clock.period] for clock in system.clocks if clock.name in used))
+
+
 def _next(system: CompiledSystem, port: Port) -> int:
     """Return the peer after one, itself if it is alone."""
     return (port.peer + 1) % sum(group.count for group in system.groups)
@@ -281,23 +320,18 @@ def _next(system: CompiledSystem, port: Port) -> int:
 
 def _check_frequencies(system: CompiledSystem, found: Floats) -> None:
     """Refuse frequencies that no response is told of: ApcError E935."""
-    timings = resolve(system).timings
-    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
-    period = min(timings[clock.period] for clock in system.clocks if clock.name in used)
-    most = float(1 / (2 * period))
+    most = fastest(system) / 2
     place = Place(system.origin.topology)
     hint = f'--to "{most:.6g} Hz"'
     if not found.size or not np.isfinite(found).all() or found.min() <= 0:
         got = "none" if not found.size else f"{found.min():.6g} Hz"
         raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, '--from "0.1 Hz"'))
     if found.max() > most:
-        what = f"{found.max():.6g} Hz is beyond half the fastest clock, where samples can't tell it from a slower one"
+        what = f"{found.max():.6g} Hz is beyond half the fastest clock: samples take it for a slower one"
         raise ApcError(Mistake("E935", place, what, hint=hint))
 
 
-def _modes(
-    system: CompiledSystem, prepared: Prepared, port: Port, other: Port
-) -> tuple[_Modes, Exchange]:
+def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> tuple[_Modes, Exchange]:
     """Open all peers of a scene, and put them together to modes."""
     groups, exchange = lifted_groups(system, prepared=prepared)
     unit_of = {one.name: one.unit for one in system.parameters}
@@ -334,17 +368,15 @@ def _modes(
     )
     apart = {}
     for number, loop in enumerate(wide[1:], 1):
-        for place, site in enumerate(common.sites):
-            if loop.sites[0].name == site.name:
+        for place, alike in enumerate(common.sites):
+            if loop.sites[0].name == alike.name:
                 apart[place] = number
     bases = tuple(find_rigid_modes(loop).basis for loop in plain)
     return _Modes(loops, bases, 0, apart, class_of, counts), exchange
 
 
-def _arranged(
-    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange
-) -> tuple[Loop, ...]:
-    """Return a scene as one loop of classes of peers that move alike, and one of each class apart; or whole."""
+def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
+    """Return one loop of all classes of equal peers, and one of each class apart; or all peers in one."""
     found = arrange(groups, exchange)
     if found.loops[0].name in ("common", "single"):
         return found.loops
@@ -358,7 +390,7 @@ def _arranged(
 
 @dataclass(frozen=True, slots=True)
 class _Weights:
-    """What a quantity of the pushed peer is, over (site, state): of all classes' means, and of its own apart."""
+    """What a quantity of the pushed peer is over (site, state): of classes' means, and of its own apart."""
 
     common: dict[tuple[int, int], float]
     apart: dict[tuple[int, int], float]
@@ -423,7 +455,8 @@ class _Responses:
             assert copy is not None
             common[place, copy[1]] = common.get((place, copy[1]), 0.0) - many / total
         return _Weights(
-            {key: weight for key, weight in common.items() if abs(weight) > UNIT}, {(0, own[1]): 1 + 1 / total}
+            {key: weight for key, weight in common.items() if abs(weight) > UNIT},
+            {(0, own[1]): 1 + 1 / total},
         )
 
     def _others(self) -> dict[int, int]:
@@ -458,21 +491,24 @@ class _Responses:
         s Z(s) has no pole within a circle about 0, so its Taylor coefficients are the means of its values on
         the circle against powers of s (Cauchy); those of two circles differ by what is left out.
         """
-        before: Floats | None = None
-        radius = RADIUS
+        before, radius = None, RADIUS
+        best: Slow | None = None
+        least = SETTLED
         for _ in range(HALVINGS):
             s = radius * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
             (velocity, off), _, _, _ = self.at(s)
-            values = s / velocity
-            doubt = np.abs(values) * float((off / np.abs(velocity)).max())
+            values, powers = s / velocity, radius ** np.arange(3)
+            doubt = float((np.abs(values) * off / np.abs(velocity)).max())
             found = np.array([(values / s**power).mean().real for power in range(3)])
-            rounding = np.array([doubt.max() / radius**power for power in range(3)])
             if before is not None:
-                errors = np.abs(found - before) + rounding
-                if (errors <= 1e-6 * np.maximum(np.abs(found), np.abs(found[1]) * radius ** (1 - np.arange(3)))).all():
-                    return Slow(found[2], found[1], found[0], (errors[2], errors[1], errors[0]))
+                off = np.abs(found - before) + doubt / powers
+                # At this speed, none matters that is far smaller than the largest.
+                share = float((off * powers).max() / np.abs(found * powers).max())
+                if share < least:
+                    least, (k, b, m), (off_k, off_b, off_m) = share, found.tolist(), off.tolist()
+                    best = Slow(m, b, k, (off_m, off_b, off_k))
             before, radius = found, radius / 2
-        return None
+        return best
 
 
 def _copy(group: PeerGroup) -> tuple[str, int] | None:

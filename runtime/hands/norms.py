@@ -119,9 +119,7 @@ def _lanes(site: Site, seconds: float, count: int) -> Floats:
     return np.asarray(exponential_rows(generator, np.zeros((1, n + count, 0)), 1.0).matrix[0, :n, n:])
 
 
-def _within(
-    site: Site, seconds: float, at: Floats, row: int, forces: Floats
-) -> tuple[Floats, Floats]:
+def _within(site: Site, seconds: float, at: Floats, row: int, forces: Floats) -> tuple[Floats, Floats]:
     """Return a state within an interval at σ (q,), over states and holds (q, n_x + n_u) and forces (q, q)."""
     n, count = len(site.states), len(at)
     seen, pushed = [], []
@@ -148,9 +146,15 @@ def _peak(loop: Pushed, inputs: Floats, outputs: Floats, through: Floats, basis:
 
 
 def noise_variance(
-    loop: Pushed, ticks: Sequence[Fraction], sources: Mapping[int, float], outputs: Mapping[tuple[int, int], float], basis: Floats, *, sensors: bool
+    loop: Pushed,
+    ticks: Sequence[Fraction],
+    sources: Mapping[int, float],
+    outputs: Mapping[tuple[int, int], float],
+    basis: Floats,
+    *,
+    sensors: bool,
 ) -> float | None:
-    """Return the variance, over the ticks of a frame on the average, of what white noise makes of some states.
+    """Return the variance of what white noise makes of some states, on the average over the ticks of a frame.
 
     Parameters
     ----------
@@ -181,7 +185,9 @@ def noise_variance(
             if sensors:
                 inputs[loop.kicks[site][place, -1], drawn] = variance**0.5
             else:
-                inputs[loop.kicks[site][place, :-1], drawn] = variance**0.5 * _lanes(own, float(seconds), 1)[:, 0]
+                inputs[loop.kicks[site][place, :-1], drawn] = (
+                    variance**0.5 * _lanes(own, float(seconds), 1)[:, 0]
+                )
         columns.append(inputs)
     inputs = np.concatenate(columns, axis=1)
     (first, _), *_ = outputs

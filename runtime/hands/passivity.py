@@ -227,11 +227,11 @@ def _draws(loop: PortLoop, angle: float) -> float:
     e^{jθ} is a rational point of the circle; complex numbers are pairs of real ones.
     """
     value, off = value_of(loop.static), radius_of(loop.static)
-    if (np.abs(value - value.T) > off + off.T).any() or np.linalg.eigvalsh(value + value.T).min() < -4 * float(
-        (off + off.T).sum()
-    ):
+    if (np.abs(value - value.T) > off + off.T).any() or np.linalg.eigvalsh(
+        value + value.T
+    ).min() < -4 * float((off + off.T).sum()):
         return -UNIT
-    n, m = loop.b.shape[-2:]
+    n = len(loop.b[0])
     tangent = np.tan(angle / 2) if angle < 3.0 else None
     cosine, sine = (
         ((1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2))

@@ -2,8 +2,8 @@
 
 Takes: a `CompiledSystem`.
 Gives: `PortLoop`, `port_loops`.
-Guarantees: exact for any motion of the hands: where nothing samples a device and no force on it switches, only
-how far it went counts, and the least that its damping takes of that. Matrices carry the radius of their
+Guarantees: exact for any motion of the hands: where nothing samples a device and no force on it switches,
+only how far it went counts, and the least that its damping takes of that. Matrices carry the radius of their
 rounding.
 Does not: say whether energy can be drawn (see `passivity`).
 
@@ -38,7 +38,7 @@ from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.lift import lift
 from apc.frame.ports import Ports, with_holds, with_ports
-from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
+from apc.frame.radius import RADII, solve, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
 from apc.frame.site import LinearSite
 
@@ -65,10 +65,11 @@ class Touched:
 class PortLoop:
     """A mode's map from how far devices move to what pushes them back, less its pole at rest.
 
-    `a`, `b`, `c`, `d` (2, …) are over the states of the scene with clamped devices; `weight` (2, m, m) is what
-    is added to the Hermitian part: dampers, and the pole's. Inputs and outputs are scaled: 1 more on the
-    diagonal of `weight` is 1 N·s/m more at each device. `static` (2, k, k) is the stiffness of the pole between
-    the k kinds of devices, of all peers together. `seconds` are the intervals', `starts` when they begin.
+    `a`, `b`, `c`, `d` (2, …) are over the states of the scene with clamped devices; `weight` (2, m, m) is
+    what is added to the Hermitian part: dampers, and the pole's. Inputs and outputs are scaled: 1 more on the
+    diagonal of `weight` is 1 N·s/m more at each device. `static` (2, k, k) is the stiffness of the pole
+    between the k kinds of devices, of all peers together. `seconds` are the intervals', `starts` when they
+    begin.
     """
 
     name: str
@@ -129,8 +130,8 @@ def _felt_velocity(group: PeerGroup, device: Device) -> str:
         for row in np.flatnonzero(tick.x[:, device.velocity].astype(np.bool_)):
             name = partition.outputs[row]
             return (
-                f"{name} samples the velocity of {device.part}: a hand that moves it just then, and no further, "
-                f"is pushed by any force at no cost"
+                f"{name} samples the velocity of {device.part}, and a hand that moves it just then, and "
+                "hardly at all, gets any force for nothing"
             )
     for sending, send in zip(kind.sends, group.exact.sends, strict=True):
         if send.x[:, device.velocity].astype(np.bool_).any():
@@ -179,15 +180,15 @@ def _ported(group: PeerGroup, device: Device) -> tuple[PeerGroup, Touched]:
 
 def _boundaries(site: LinearSite, schedule: Schedule, device: Device) -> list[int]:
     """Return the instants, in quanta, at which a device is sampled or a force on it switches, and 0."""
-    found, now = {0}, 0
+    found, now, counts = {0}, 0, False
     for event in schedule.events:
         match event:
             case Propagate(duration):
                 now += duration
             case Tick(partition, _, _):
-                counts = site.ticks[partition].x[:, device.position].astype(np.bool_).any()
+                counts = bool(site.ticks[partition].x[:, device.position].astype(np.bool_).any())
             case Send(partition, _):
-                counts = site.sends[partition].x[:, device.position].astype(np.bool_).any()
+                counts = bool(site.sends[partition].x[:, device.position].astype(np.bool_).any())
             case Act(hold, _):
                 counts = bool(site.b[device.velocity, hold])
         if not isinstance(event, Propagate) and counts and now < schedule.frame:
@@ -209,8 +210,10 @@ def _driven(site: LinearSite, device: Device) -> LinearSite:
         sends=tuple(replace(send, x=send.x[:, kept]) for send in site.sends),
     )
     found = with_holds(smaller, np.zeros((len(kept), 1), dtype=number))
-    for whole, part in zip((*site.ticks, *site.sends), (*found.ticks, *found.sends), strict=True):
-        part.u[:, -1] = whole.x[:, device.position]
+    for tick, whole in zip(found.ticks, site.ticks, strict=True):
+        tick.u[:, -1] = whole.x[:, device.position]
+    for send, sent in zip(found.sends, site.sends, strict=True):
+        send.u[:, -1] = sent.x[:, device.position]
     return found
 
 
@@ -265,9 +268,7 @@ def _port_loop(
     placed, pushed = whole[:, rest[:, None], into], whole[:, out[:, None], into]
     answered = RADII.multiply(RADII.exact(np.diag(many)), whole[:, out[:, None], rest])
     at_once = RADII.multiply(RADII.exact(np.diag(many)), pushed)
-    aside = solve(
-        RADII.subtract(RADII.exact(np.eye(len(rest))), a), RADII.multiply(placed, RADII.exact(of))
-    )
+    aside = solve(RADII.subtract(RADII.exact(np.eye(len(rest))), a), RADII.multiply(placed, RADII.exact(of)))
     if aside is None:
         what = "with its devices clamped the scene has a motion that nothing holds back"
         hint = "couplers that hold each object to a device"

@@ -41,6 +41,9 @@ Matrix = NDArray[Any]
 # Numbers with what they may be off by.
 Carried = tuple[Complex, Floats]
 
+# Less than any number of interest, in SI.
+LEAST = 1e-250
+
 # A series ends where its terms, of the largest |s τ|, are less than this.
 SERIES = 1e-18
 
@@ -73,9 +76,9 @@ class Site:
 class Pushed:
     """A mode whose peers may be pushed: ξ⁺ = M ξ + K κ, and C ξ + D κ (2, …) is what is read, κ the kicks.
 
-    `kicks` and `reads` say for each site which of κ are its, interval by interval: what is added to its states as
-    one ends, and what samples of its device's position are off by from its beginning on (r, n_x + 1); and which
-    of what is read are its states and holds as one begins (r, n_x + n_u).
+    `kicks` and `reads` say for each site which of κ are its, interval by interval: what its states get as one
+    ends, and what samples of its device's position are off by from its beginning on (r, n_x + 1); and
+    which of what is read are its states and holds as one begins (r, n_x + n_u).
     """
 
     name: str
@@ -248,7 +251,10 @@ def _motion(loop: Pushed, of: int, read: Carried, s: Complex, alias: int, *, pus
     doubt = (off * (np.abs(weight) + loose) + np.abs(value) * (loose + charge * np.abs(weight))).sum(axis=1)
     driven = _product((total, doubt / frame * (1 + charge)), site.b)
     if pushed and alias == 0:
-        driven = driven[0] + site.push[0], driven[1] + site.push[1] + 2 * UNIT * np.abs(driven[0] + site.push[0])
+        driven = (
+            driven[0] + site.push[0],
+            driven[1] + site.push[1] + 2 * UNIT * np.abs(driven[0] + site.push[0]),
+        )
     return _steady(site.a, (at, 4 * UNIT * np.abs(at)), driven)
 
 
@@ -266,7 +272,7 @@ def _lasting(s: Complex, seconds: float) -> Carried:
     with np.errstate(all="ignore"):
         direct = np.expm1(x) / x
     series = 1 + x / 2 * (1 + x / 3 * (1 + x / 4 * (1 + x / 5 * (1 + x / 6 * (1 + x / 7)))))
-    value = seconds * np.where(small, series, direct)
+    value: Complex = seconds * np.where(small, series, direct)
     return value, 16 * UNIT * seconds * np.exp(np.maximum(x.real, 0.0))
 
 
@@ -324,24 +330,21 @@ def _steady(matrix: Matrix, at: Carried, driven: Carried) -> Carried:
 
     Notes
     -----
-    With an inverse Y in floats and F = 1 − Y (z − M), x in floats is off by at most |Y| (|residual| + radii)
-    and ‖F‖/(1 − ‖F‖) of its largest.
+    With an inverse Y in floats and F = 1 − Y (z − M), x in floats is off by e ≤ b + |F| e, b = |Y| (|residual|
+    + radii); with |F| b ≤ θ b, entry by entry, that is at most b/(1 − θ).
     """
     real, radius = value_of(matrix), radius_of(matrix)
     n = len(real)
     z, off = at
     system = z[:, None, None] * np.eye(n) - real
     inverse = np.linalg.inv(system)
-    value = np.matmul(inverse, driven[0][:, :, None])[:, :, 0]
-    size, units = np.abs(inverse), np.abs(value)
-    charge = (n + 6) * UNIT
-    wrong = np.abs(np.matmul(inverse, system) - np.eye(n)).sum(axis=2)
+    value = np.matmul(inverse, driven[0][:, :, None])
+    size, charge = np.abs(inverse), (n + 6) * UNIT
     loose = off[:, None, None] * np.eye(n) + radius + charge * np.abs(system)
-    wrong = (wrong + np.matmul(size, loose).sum(axis=2)).max(axis=1)
-    residual = np.abs(driven[0] - np.matmul(system, value[:, :, None])[:, :, 0])
-    residual += driven[1] + np.matmul(loose, units[:, :, None])[:, :, 0] + charge * np.abs(driven[0])
-    bound = np.matmul(size, residual[:, :, None])[:, :, 0]
-    lost = wrong >= 0.5
-    bound += (2 * wrong * bound.max(axis=1))[:, None]
-    bound[lost] = np.inf
-    return value, bound * (1 + charge)
+    wrong = np.abs(np.matmul(inverse, system) - np.eye(n)) + np.matmul(size, loose)
+    residual = np.abs(driven[0][:, :, None] - np.matmul(system, value)) + np.matmul(loose, np.abs(value))
+    residual += (driven[1] + charge * np.abs(driven[0]))[:, :, None]
+    bound = np.matmul(size, residual) + LEAST
+    share = (np.matmul(wrong, bound) / bound).max(axis=(1, 2))
+    bound *= np.where(share < 0.5, (1 + charge) / (1 - share), np.inf)[:, None, None]
+    return value[:, :, 0], bound[:, :, 0]

@@ -1,0 +1,100 @@
+"""The command `apc feel`.
+
+Takes: words of a command line. Gives: text on stdout.
+Guarantees: with --json, stdout holds one JSON document and nothing else.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from apc.cli.options import (
+    Command,
+    WholeNumber,
+    beside,
+    file_argument,
+    file_option,
+    json_option,
+    print_result,
+    set_option,
+    tell,
+)
+from apc.threads import start_single_threaded
+
+
+@click.command("feel", cls=Command)
+@file_argument
+@set_option
+@click.option(
+    "--at", default="", metavar="PEER.PART", help="The device a hand holds: left[1].device. The first peer's."
+)
+@click.option(
+    "--between",
+    default="",
+    metavar="A:B",
+    help="Two devices, push and arrival: left[1].device:right[1].device.",
+)
+@click.option(
+    "--from", "low", default="0.1 Hz", show_default=True, metavar='"F Hz"', help="The lowest frequency."
+)
+@click.option("--to", "high", metavar='"F Hz"', help="The highest; 60 Hz, or half the fastest clock.")
+@click.option(
+    "--points", type=WholeNumber(2, 1_000_000), default=200, show_default=True, help="How many between."
+)
+@click.option("--frequencies", metavar='"F Hz, …"', help='These instead: "1 Hz, 5 Hz".')
+@click.option(
+    "--unstable", is_flag=True, help="Of an unstable scene, which has no response in time, that of the map."
+)
+@click.option("--nyquist", is_flag=True, help="Draw Nyquist's plot, not Bode's.")
+@file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
+@json_option
+def feel_command(
+    file: str | None,
+    settings: tuple[str, ...],
+    at: str,
+    between: str,
+    low: str,
+    high: str | None,
+    points: int,
+    frequencies: str | None,
+    unstable: bool,
+    nyquist: bool,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Say what a hand feels at its device, and what of it arrives at another.
+
+    The impedance (force by velocity, in N*s/m) at each frequency, all other
+    hands free; mass, damping and stiffness of slow motions; the velocity at
+    another device and how far the copies of the object are apart, a newton;
+    the largest gains at any frequency; what noise does. FILE is a topology
+    or a compiled model.
+
+    \b
+        apc feel --at "user[1].device" --frequencies "1 Hz, 5 Hz"
+        apc feel --from "0.1 Hz" --to "60 Hz" --out bode.svg
+    """
+    start_single_threaded()
+    from apc.hands.feel import feel, read_frequencies
+    from apc.inputs import open_scene
+    from apc.present.hands import check_feel_path, write_feel
+
+    if out is not None:
+        check_feel_path(out)
+    system = open_scene(file, settings, {"--out": out})
+    first, colon, second = between.partition(":")
+    found = feel(
+        system,
+        read_frequencies(system, frequencies, low, high, points),
+        at=at or first if colon else at,
+        between=second if colon else between,
+        unstable=unstable,
+    )
+    if out is not None:
+        write_feel(out, found, nyquist=nyquist)
+    print_result(found, as_json=as_json, err=beside(out))
+    if out is not None and not as_json:
+        tell(f"\n{out} is written", err=beside(out))

@@ -1,0 +1,287 @@
+"""What hands do and feel, as text, plain data, a picture and a table.
+
+Takes: a `PassiveHands` or a `Feel`. Gives: of each its text and document; `feel_picture`, `write_feel`.
+Guarantees: what the answer leaves out stands first; no digit beyond its bound.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apc.compiler.files import check_target, write_text
+from apc.compiler.words import known_digits, measured, wrapped
+from apc.distribution import program_version
+from apc.optional import need
+from apc.present.forms import document, json_text, note
+from apc.present.pictures import FORMATS, write_figure
+from apc.suffixes import check_suffix
+from apc.tables import SUFFIXES, Column, Row, check_table_path, write_table
+
+if TYPE_CHECKING:
+    from apc.hands.feel import Extremes, Feel
+    from apc.hands.passivity import PassiveHands, PassiveMode
+
+# Lines of a table of frequencies in a terminal.
+SHOWN = 12
+
+# Digits of a table's numbers, at most.
+DIGITS = 6
+
+LINEARIZED = ", linearized at its start"
+
+
+def passive_text(found: PassiveHands) -> str:
+    """Return whether a scene is stable with any passive hands, in words and numbers."""
+    lines = [f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}"]
+    for text in found.left_out:
+        lines += note(text)
+    lines.append("")
+    if found.why:
+        lines += wrapped(f"{found.why}.", "  ", "  ")
+        hint = (
+            "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
+        )
+        lines += wrapped(hint, "  ", "  ")
+    worst = found.worst
+    if worst is not None and not found.why:
+        lines += wrapped(_worst(found, worst), "  ", "  ")
+    lines += ["", f"  devices clamped  spectral radius {measured(found.clamped_radius, found.clamped_error)}"]
+    if found.proof:
+        lines.append(f"  proof            {found.proof}")
+    if found.modes:
+        rows = [("  mode", "damping", "needed", "at", "stiffness at rest", ""), *map(_mode, found.modes)]
+        widths = [max(len(row[column]) for row in rows) for column in range(6)]
+        lines.append("")
+        lines += [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ]
+    return "\n".join(lines)
+
+
+def _worst(found: PassiveHands, worst: PassiveMode) -> str:
+    """Say how the devices move that take most energy out, or need most damping."""
+    moved = "all alike" if worst.name in ("common", "single") else f"in the mode {worst.name}"
+    if worst.more is None:
+        held = "with its devices clamped the scene is unstable, and no damping of theirs helps"
+        return f"Devices that move {moved}: {held}."
+    enough = f"With {worst.more:.4g} N*s/m more damping at each device they can't"
+    if found.stable:
+        return (
+            "Whatever gives back no more energy than it was given may hold the devices. Of their damping "
+            f"{-worst.more:.4g} N*s/m could be spared, with the least left as they move {moved} at "
+            f"{worst.frequency_hz:.4g} Hz."
+        )
+    if found.stable is False:
+        return (
+            f"Hands that move the devices {moved} at {worst.frequency_hz:.4g} Hz get energy out of the scene "
+            f"for ever, and can make it shake. {enough}."
+        )
+    return (
+        f"Rounding leaves open whether hands get energy out, moving {moved} at {worst.frequency_hz:.4g} Hz."
+    )
+
+
+def _mode(one: PassiveMode) -> tuple[str, ...]:
+    name = f"  {one.name}" + (f" × {one.multiplicity:,}" if one.multiplicity > 1 else "")
+    damping = "they differ" if one.damping is None else f"{one.damping:.6g} N*s/m"
+    if one.more is None:
+        needed = "none is enough"
+    elif one.needed is None:
+        needed = f"{one.more:+.6g} N*s/m"
+    else:
+        needed = f"{known_digits(one.needed, one.error or 0.0, DIGITS)} N*s/m"
+    at = "" if one.frequency_hz is None else f"{one.frequency_hz:.5g} Hz"
+    stiffness = (
+        "" if one.stiffness is None else f"{abs(one.stiffness) if abs(one.stiffness) > 1e-6 else 0:.5g} N/m"
+    )
+    verdict = {True: "passive", False: "not passive", None: "undecided"}[one.passive]
+    return name, damping, needed, at, stiffness, "not passive" if one.more is None else verdict
+
+
+def passive_document(found: PassiveHands) -> dict[str, Any]:
+    """Return the same as plain data."""
+    modes = [{**document(one), "damping_needed": document(one.needed)} for one in found.modes]
+    whole: dict[str, Any] = {"hands": "passive", **document(found, {"modes": modes})}
+    return whole
+
+
+def feel_text(found: Feel) -> str:
+    """Return what is felt at a device, in words and numbers."""
+    lines = [f"{found.topology}: what a hand feels at {found.at}{LINEARIZED if found.linearized else ''}"]
+    for text in (*found.notes, *found.left_out):
+        lines += note(text)
+    lines.append("")
+    slow = found.low_frequency
+    if slow is not None:
+        lines += [
+            "  Of slow motions, the other hands free:",
+            f"  mass             {measured(slow.mass, slow.errors[0], 'kg')}",
+            f"  damping          {measured(slow.damping, slow.errors[1], 'N*s/m')}",
+            f"  stiffness        {measured(slow.stiffness, slow.errors[2], 'N/m')}",
+            "",
+        ]
+    rows = [("frequency", "impedance", "phase", "arrives", "copies apart", "alias"), *_rows_shown(found)]
+    rows.insert(1, ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", ""))
+    widths = [max(len(row[column]) for row in rows) for column in range(6)]
+    lines += ["  " + "  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    told = [
+        f"arrives: at {found.between}" if found.between else "",
+        f"copies: of {found.copy}" if found.copy else "",
+    ]
+    if any(told):
+        lines += ["", *wrapped("; ".join(one for one in told if one), "  ", "  ")]
+    if found.hinf:
+        lines += ["", "  Largest gain at any frequency (H∞), forces of any course:"]
+        lines += [_extreme(one) for one in found.hinf]
+    for one in found.h2:
+        values = [
+            f"copies apart {one.error_m * 1e3:.5g} mm" if one.error_m is not None else "",
+            f"velocity {one.velocity_m_s * 1e3:.5g} mm/s" if one.velocity_m_s is not None else "",
+        ]
+        what = "1 N rms of every hand" if one.source == "hands" else "1 m rms of every device's samples"
+        words = f"{', '.join(one for one in values if one) or 'it drifts'} (rms) for {what}, new at each tick"
+        lines += ["", *wrapped(words, "  ", "    ")]
+    return "\n".join(lines)
+
+
+def _rows_shown(found: Feel) -> Iterator[tuple[str, ...]]:
+    """Yield some lines of the table, the first and the last among them."""
+    count = len(found.frequency_hz)
+    for place in sorted({round(one) for one in np.linspace(0, count - 1, min(SHOWN, count))}):
+        off = float(found.bound[place])
+        numbers = (
+            abs(found.impedance[place]),
+            abs(found.transmitted_admittance[place]) * 1e3,
+            abs(found.error_per_force[place]) * 1e3,
+        )
+        size, arrives, apart = (known_digits(float(one), float(one) * off, DIGITS) for one in numbers)
+        phase = f"{np.degrees(np.angle(found.impedance[place])):.2f}"
+        yield (
+            f"{found.frequency_hz[place]:.5g}",
+            size,
+            phase,
+            arrives if found.between else "",
+            apart if found.copy else "",
+            f"{found.alias[place]:.1e}",
+        )
+
+
+def _extreme(one: Extremes) -> str:
+    """Return a line of a norm."""
+    peak = one.sampled_data
+    unit = "m/s/N" if one.of == "velocity" else "m/N"
+    what = f"{one.mode}, {'velocity' if one.of == 'velocity' else 'copies apart'}"
+    if not np.isfinite(peak.norm):
+        return f"  {what:<26}  without end: it drifts"
+    size = measured(peak.norm, peak.error + 1e-11 * peak.norm, unit)
+    return f"  {what:<26}  {size} at {peak.frequency_hz:.5g} Hz"
+
+
+def feel_document(found: Feel) -> dict[str, Any]:
+    """Return the same as plain data, in SI; complex numbers as pairs."""
+    slow = found.low_frequency
+    fields: dict[str, Any] = {
+        "low_frequency": None if slow is None else document(slow),
+        "hinf": {f"{one.mode} {one.of}": document(one) for one in found.hinf},
+        "h2": {one.source: document(one) for one in found.h2},
+    }
+    for name in ("impedance", "transmitted_admittance", "error_per_force"):
+        fields[name] = [document(complex(one)) for one in getattr(found, name).tolist()]
+    whole: dict[str, Any] = document(found, fields)
+    return whole
+
+
+def feel_picture(found: Feel, kind: str = "bode") -> Any:
+    """Draw the impedance, and what arrives elsewhere, as Bode's plot or Nyquist's; return the Figure."""
+    figures = need("matplotlib.figure", "plot")
+    if kind == "nyquist":
+        figure = figures.Figure(figsize=(4.2, 4.0), layout="constrained")
+        ax = figure.subplots()
+        ax.plot(found.impedance.real, found.impedance.imag, color="#000000")
+        ax.axvline(0.0, color="#999999", linewidth=0.6)
+        ax.axhline(0.0, color="#999999", linewidth=0.6)
+        ax.set_xlabel("real part of the impedance (N·s/m)")
+        ax.set_ylabel("imaginary part (N·s/m)")
+        for place in (0, len(found.frequency_hz) - 1):
+            at = found.impedance[place]
+            ax.annotate(f"{found.frequency_hz[place]:.3g} Hz", (at.real, at.imag), fontsize=8)
+        ax.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
+        return figure
+    figure = figures.Figure(figsize=(5.2, 5.2), layout="constrained")
+    size, phase = figure.subplots(2, 1, sharex=True)
+    size.loglog(found.frequency_hz, np.abs(found.impedance), color="#000000", label="impedance (N·s/m)")
+    if found.between:
+        size.loglog(
+            *(found.frequency_hz, 1e3 * np.abs(found.transmitted_admittance)),
+            color="#0072B2",
+            linestyle="--",
+            label=f"velocity at {found.between} (mm/s/N)",
+        )
+    if found.copy and np.any(found.error_per_force):
+        size.loglog(
+            *(found.frequency_hz, 1e3 * np.abs(found.error_per_force)),
+            color="#D55E00",
+            linestyle="-.",
+            label=f"copies of {found.copy} apart (mm/N)",
+        )
+    size.legend(fontsize=8, frameon=False)
+    size.set_ylabel("magnitude")
+    phase.semilogx(found.frequency_hz, np.degrees(np.angle(found.impedance)), color="#000000")
+    phase.set_ylabel("phase of the impedance (°)")
+    phase.set_xlabel("frequency (Hz)")
+    phase.set_yticks(range(-90, 91, 45)) if np.abs(np.angle(found.impedance)).max() <= np.pi / 2 else None
+    size.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
+    return figure
+
+
+def check_feel_path(path: Path) -> str:
+    """Refuse a file that can't be written, or of no known format; return its suffix."""
+    suffix = check_suffix(path, (*FORMATS, *SUFFIXES, ".json"), "--out")
+    check_target(path)
+    if suffix in SUFFIXES:
+        check_table_path(path, "--out")
+    elif suffix in FORMATS:
+        need("matplotlib.figure", "plot")
+    return suffix
+
+
+def write_feel(path: Path, found: Feel, *, nyquist: bool = False) -> None:
+    """Write responses to a picture, a table or JSON, by the suffix."""
+    suffix = check_feel_path(path)
+    if suffix in FORMATS:
+        write_figure(feel_picture(found, "nyquist" if nyquist else "bode"), path)
+    elif suffix in SUFFIXES:
+        made = {"apc": program_version(), "at": found.at, "left_out": list(found.left_out)}
+        write_table(path, _columns(), _rows(found), made)
+    else:
+        write_text(path, json_text(found.to_dict()))
+
+
+def _columns() -> list[Column]:
+    """Return the columns of a table of responses."""
+    names = (
+        ("frequency", "Hz"),
+        ("impedance real", "N*s/m"),
+        ("impedance imaginary", "N*s/m"),
+        ("transmitted admittance real", "m/s/N"),
+        ("transmitted admittance imaginary", "m/s/N"),
+        ("error per force real", "m/N"),
+        ("error per force imaginary", "m/N"),
+        ("alias", ""),
+        ("bound", ""),
+    )
+    return [Column(name, unit) for name, unit in names]
+
+
+def _rows(found: Feel) -> Iterator[Row]:
+    """Yield a row a frequency."""
+    for place, frequency in enumerate(found.frequency_hz.tolist()):
+        numbers = (found.impedance[place], found.transmitted_admittance[place], found.error_per_force[place])
+        parts = [float(part) for one in numbers for part in (one.real, one.imag)]
+        yield (frequency, *parts, float(found.alias[place]), float(found.bound[place]))
