@@ -120,7 +120,11 @@ def load_or_compile(path: Path) -> CompiledSystem:
 
 @part("read")
 def open_scene(
-    file: str | None, settings: Sequence[str], outputs: Mapping[str, Path | None] | None = None
+    file: str | None,
+    settings: Sequence[str],
+    outputs: Mapping[str, Path | None] | None = None,
+    *,
+    hands: str = "free",
 ) -> CompiledSystem:
     """Return the compiled model that a command means.
 
@@ -132,6 +136,8 @@ def open_scene(
         Parameters to change, each `NAME=QUANTITY`.
     outputs
         What the command will write, by the option that says so: see `check_outputs`.
+    hands
+        How hands are to be taken, see `devices.with_hands`.
 
     Raises
     ------
@@ -141,6 +147,10 @@ def open_scene(
     path = Path(file) if file else find_input(compiled_too=True)
     system = load_or_compile(path)
     check_outputs(path, (name for name, _ in system.origin.texts), outputs or {})
+    if hands != "free":
+        from apc.frame.devices import with_hands
+
+        system = with_hands(system, hands)
     if not settings:
         return system
     from apc.frame.overrides import apply, parse_override

@@ -10,8 +10,10 @@ from __future__ import annotations
 import click
 
 from apc.analysis.methods import AUTO, METHODS
-from apc.cli.options import Command, file_argument, json_option, print_result, set_option
+from apc.cli.options import Command, file_argument, hands_option, json_option, print_result, set_option
 from apc.cli.progress import at_work
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
 
 # Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
@@ -49,6 +51,7 @@ SECONDS_A_PEER = 1e-4
     is_flag=True,
     help="Repeat the analysis under every order of events that coincide.",
 )
+@hands_option
 @json_option
 def analyze_command(
     file: str | None,
@@ -57,6 +60,7 @@ def analyze_command(
     certify: bool,
     box: tuple[str, ...],
     every_convention: bool,
+    hands: str,
     as_json: bool,
 ) -> None:
     """Say whether a scene is stable, by how much, and in which modes.
@@ -72,7 +76,10 @@ def analyze_command(
     from apc.answer import answer
     from apc.inputs import open_scene
 
-    system = open_scene(file, settings)
+    system = open_scene(file, settings, hands=hands)
+    if hands == "passive":
+        _judge_passive(system, method, box, every_convention=every_convention, as_json=as_json)
+        return
     ranges = []
     if box:
         from apc.analysis.box import parse_range
@@ -82,3 +89,16 @@ def analyze_command(
     with at_work(f"analysing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
         found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)
     print_result(found, as_json=as_json)
+
+
+def _judge_passive(
+    system: CompiledSystem, method: str, box: tuple[str, ...], *, every_convention: bool, as_json: bool
+) -> None:
+    """Say whether a scene is stable with any passive hands."""
+    from apc.hands.passivity import passive_hands
+
+    asked = {"--method": method != AUTO, "--box": bool(box), "--conventions": every_convention}
+    for option in (name for name, given in asked.items() if given):
+        what = f"{option} and --hands passive don't go together: what hands can draw has no modes of its own"
+        raise ApcError(Mistake("E930", Place("--hands"), what, hint=f"--hands clamped {option}"))
+    print_result(passive_hands(system), as_json=as_json)

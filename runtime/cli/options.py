@@ -1,8 +1,8 @@
 """What commands have in common: FILE, the options `--set` and `--json`, and how a result is printed.
 
 Takes: a result.
-Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `in_option`, `json_option`,
-`WholeNumber`; `print_result`, `tell`, `beside`.
+Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `in_option`, `hands_option`,
+`json_option`, `WholeNumber`; `print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
@@ -39,6 +39,15 @@ in_option = click.option(
     type=click.Choice(("mean-square", "nominal")),
     help="What stable means. mean-square: second moments die out over the network as it is, the default "
     "where a link is unreliable; nominal: motions die out if every packet takes its nominal delay.",
+)
+hands_option = click.option(
+    "--hands",
+    default="free",
+    show_default=True,
+    metavar="HANDS",
+    help="What holds the devices. free: nothing but what the scene says. clamped: they are held fast. held: "
+    "each by a hand of hand.mass, hand.damping and hand.stiffness, 0 unless --set. passive: stable means "
+    "stable with all hands that give back no more energy than they got.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 

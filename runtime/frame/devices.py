@@ -1,7 +1,7 @@
 """What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
-Gives: `Device`, `find_device`, `devices_of`; `clamped`, `held`, `HAND`; `refuse_hands`.
+Gives: `Device`, `find_device`, `devices_of`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -23,11 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind, Parameter, Ports, Receive
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.parameters import exact_numbers, resolve
 from apc.frame.start import Listening, start_arguments
+
+# How hands can be taken: as the scene has them, holding devices fast, or as a mass, damper and spring each;
+# and as all that give back no more energy than they got, which changes no scene.
+FREE, CLAMPED, HELD, PASSIVE = HANDS = ("free", "clamped", "held", "passive")
 
 # What the parameters of a hand that is put on every device are named after, and what each is.
 HAND = "hand"
@@ -181,6 +185,37 @@ def refuse_hands(system: CompiledSystem, option: str) -> None:
             what = f"{option}: {group.name} has a hand already, {hand}"
             hint = f"a scene without {hand}, or no {option}"
             raise ApcError(Mistake("E932", Place(system.origin.topology), what, hint=hint))
+
+
+def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
+    """Return a scene with hands of a kind, its name saying so.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    hands
+        "free": as it is. "clamped": its devices are held fast. "held": a hand of `hand.mass`, `hand.damping`
+        and `hand.stiffness` on each, 0 at first. "passive": as it is, and refused if it has hands.
+
+    Raises
+    ------
+    ApcError
+        E930 no such hands; E931 no device; E932 hands in the scene.
+    """
+    option = f"--hands {hands}"
+    if hands not in HANDS:
+        what = f"{hands[:40]} are no hands ({', '.join(HANDS)})"
+        raise ApcError(
+            Mistake("E930", Place("--hands"), what, hint=nearest(hands, HANDS) or "--hands clamped")
+        )
+    if hands == PASSIVE:
+        refuse_hands(system, option)
+    if hands in (FREE, PASSIVE):
+        return system
+    if hands == CLAMPED:
+        return replace(clamped(system, option=option), name=f"{system.name}, devices clamped")
+    return replace(held(system, option=option), name=f"{system.name}, devices held")
 
 
 def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> CompiledSystem:

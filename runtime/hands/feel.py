@@ -250,7 +250,7 @@ def feel(
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         modes, exchange = _modes(system, prepared, port, other)
         responses = _Responses(modes, port.peer, other.peer)
-        s: Complex = 2j * np.pi * found
+        s = np.asarray(2j * np.pi * found, dtype=np.complex128)
         own, across, error, alias = responses.at(s, ALIASES)
         one = 1 / own[0]
         bound = np.max([off / np.abs(value) for value, off in (own, across, error) if value.any()], axis=0)

@@ -272,7 +272,7 @@ def _lasting(s: Complex, seconds: float) -> Carried:
     with np.errstate(all="ignore"):
         direct = np.expm1(x) / x
     series = 1 + x / 2 * (1 + x / 3 * (1 + x / 4 * (1 + x / 5 * (1 + x / 6 * (1 + x / 7)))))
-    value: Complex = seconds * np.where(small, series, direct)
+    value = np.asarray(seconds * np.where(small, series, direct), dtype=np.complex128)
     return value, 16 * UNIT * seconds * np.exp(np.maximum(x.real, 0.0))
 
 
@@ -330,8 +330,8 @@ def _steady(matrix: Matrix, at: Carried, driven: Carried) -> Carried:
 
     Notes
     -----
-    With an inverse Y in floats and F = 1 − Y (z − M), x in floats is off by e ≤ b + |F| e, b = |Y| (|residual|
-    + radii); with |F| b ≤ θ b, entry by entry, that is at most b/(1 − θ).
+    With an inverse Y in floats and F = 1 − Y (z − M), x in floats is off by e ≤ b + |F| e, b being |Y| times
+    residual and radii; with |F| b ≤ θ b, entry by entry, that is at most b/(1 − θ).
     """
     real, radius = value_of(matrix), radius_of(matrix)
     n = len(real)
