@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -446,6 +447,73 @@ def test_spring_damper_arm_holds_its_point() -> None:
     assert found == pytest.approx((-70 * (0.05 - 0.02) - 7 * 0.3) / 2, rel=1e-14)
     assert rates(system, {"device.x": 0.02})["device.v"] == 0
     assert apc.analyze(system).spectral_radius == pytest.approx(math.exp(-7 / 4), rel=1e-12)
+
+
+# Least, nominal and largest mass in kg, damping in N·s/m and stiffness in N/m of Fu and Cavusoglu's tables II
+# and III, M, b2 and k2; and nominal stiffness and damping of the fingers, k1 and b1.
+STYLUS_ARMS = {
+    "StylusArmSideways": ((0.14, 0.218, 0.57), (3.68, 4.645, 10.29), (63, 78.75, 151), (379.5, 1.839)),
+    "StylusArmForward": ((0.016, 0.204, 0.43), (13.1, 18.06, 27.6), (214, 271.7, 533), (769.9, 0.776)),
+}
+
+
+def in_a_second(system: CompiledSystem) -> list[complex]:
+    """Return the eigenvalues of a frame of a second, which is what a scene without clocks has."""
+    return sorted((mode.eigenvalue for mode in apc.analyze(system).modes), key=lambda z: (z.imag, z.real))
+
+
+def swings(mass: float, damping: float, stiffness: float) -> list[complex]:
+    """Return exp(s 1 s) of both roots s of mass s² + damping s + stiffness, in the order of `in_a_second`."""
+    root = cmath.sqrt(damping**2 - 4 * mass * stiffness)
+    found = [cmath.exp((sign * root - damping) / (2 * mass)) for sign in (1, -1)]
+    return sorted(found, key=lambda z: (z.imag, z.real))
+
+
+@pytest.mark.parametrize("stiffness", [70.0, 3.0])  # swings, creeps
+def test_mass_spring_damper_arm_moves_with_a_device_as_one_mass(stiffness: float) -> None:
+    system = held(
+        "type: MassSpringDamperArm, flange: device, mass: 500 g, damping: 4 N*s/m,"
+        f" stiffness: {stiffness} N/m, position: 20 mm"
+    )
+    assert in_a_second(system) == pytest.approx(swings(2 + 0.5, 3 + 4, stiffness), rel=1e-12)
+    assert rates(system, {"device.x": 0.02}) == {"device.x": 0, "device.v": 0}
+
+
+@pytest.mark.parametrize("name", STYLUS_ARMS)
+def test_stylus_arms_have_the_published_values_and_keep_to_their_limits(name: str) -> None:
+    part = f"type: {name}, flange: device"
+    system = held(part)
+    *ranges, _ = STYLUS_ARMS[name]
+    units = {"mass": "kg", "damping": "N*s/m", "stiffness": "N/m"}
+    for (word, unit), (low, nominal, high) in zip(units.items(), ranges, strict=True):
+        assert values(system)[f"it.{word}"] == nominal
+        for limit, beyond in ((low, 0.999 * low), (high, 1.001 * high)):
+            assert values(held(f"{part}, {word}: {limit} {unit}"))[f"it.{word}"] == limit
+            (line,) = told(held, f"{part}, {word}: {beyond} {unit}")
+            assert f" E207 {word} wants {limit:g} {unit} or " in line
+    (_, m, _), (_, b, _), (_, k, _) = ranges
+    assert in_a_second(system) == pytest.approx(swings(2 + m, 3 + b, k), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", STYLUS_ARMS)
+def test_stylus_arms_hold_a_device_through_fingers_that_give(name: str) -> None:
+    (_, m, _), (_, b, _), (_, k, _), (stiffness, damping) = STYLUS_ARMS[name]
+    system = compiled(
+        f"{ONE_MASS}couplers:\n  fingers: {{type: SpringDamper, a: device, stiffness: {stiffness} N/m,"
+        f" damping: {damping} N*s/m}}\nhands:\n  it: {{type: {name}, flange: fingers.b}}\n"
+    )
+    force = stiffness * (0.001 - 0.004) + damping * (0.2 + 0.1)
+    assert rates(
+        system, {"device.x": 0.001, "device.v": 0.2, "it.hand.x": 0.004, "it.hand.v": -0.1}
+    ) == pytest.approx(
+        {
+            "device.x": 0.2,
+            "device.v": (-force - 3 * 0.2) / 2,
+            "it.hand.x": -0.1,
+            "it.hand.v": (force - k * 0.004 + b * 0.1) / m,
+        },
+        rel=1e-13,
+    )
 
 
 # ---- devices ----
