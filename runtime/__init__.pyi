@@ -26,6 +26,9 @@ from .api import (
     critical as critical,
 )
 from .api import (
+    feel as feel,
+)
+from .api import (
     judge_network as judge_network,
 )
 from .api import (
@@ -36,6 +39,9 @@ from .api import (
 )
 from .api import (
     paper_route as paper_route,
+)
+from .api import (
+    passive_hands as passive_hands,
 )
 from .api import (
     prove_box as prove_box,
@@ -67,6 +73,8 @@ from .api import (
 from .benchmark.bench import Bench as Bench
 from .compiler.compiled import CompiledSystem as CompiledSystem
 from .compiler.errors import ApcError as ApcError
+from .hands.feel import Feel as Feel
+from .hands.passivity import PassiveHands as PassiveHands
 from .moments.network import NetworkVerdict as NetworkVerdict
 from .regions.region import Region as Region
 from .simulation.trajectory import Trajectory as Trajectory

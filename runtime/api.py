@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from apc.analysis.methods import Method
     from apc.analysis.paper import PaperRoute
     from apc.benchmark.bench import Bench
+    from apc.hands.feel import Feel
+    from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
     from apc.regions.region import Region
     from apc.simulation.trajectory import Trajectory
@@ -194,6 +196,64 @@ def critical(
     from apc.vary import critical as crossings
 
     return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper, criterion=criterion)
+
+
+def passive_hands(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+) -> PassiveHands:
+    """Say whether a scene is stable with every passive hand at every device, and how much damping that takes.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+
+    Raises
+    ------
+    ApcError
+        A peer has no device, or a hand already; a device is touched otherwise than by samples and holds.
+    """
+    from apc.hands import passivity
+
+    return passivity.passive_hands(_model(model, set))
+
+
+def feel(
+    model: CompiledSystem | str | Path,
+    frequencies: Sequence[float],
+    *,
+    set: Mapping[str, str] | None = None,
+    at: str = "",
+    between: str = "",
+    unstable: bool = False,
+) -> Feel:
+    """Say what a hand feels at its device, and what of a push arrives at another.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    frequencies
+        (k,), in Hz, at most half the rate of the fastest clock.
+    at, between
+        The device that is pushed, such as "left[1].device", and another: the first peer's and the next one's.
+    unstable
+        Whether of an unstable scene, which has no response in time, that of its map is wanted.
+
+    Returns
+    -------
+    Feel
+        Impedance, transmitted admittance and error between copies, complex (k,), in SI, with a bound; mass,
+        damping and stiffness of slow motions; H∞ and H2 norms.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.hands import feel as felt
+
+    return felt.feel(_model(model, set), frequencies, at=at, between=between, unstable=unstable)
 
 
 def judge_network(

@@ -91,8 +91,10 @@ def least_real(a: Floats, b: Floats, c: Floats, d: Floats, weight: Floats) -> tu
     On the axis it becomes a Hamiltonian matrix, whose point at infinity must not be the least: that is
     θ = π, or θ = 0 of −A and −B.
     """
-    if not b.size:
+    if not weight.size:
         return np.inf, 0.0
+    if not b.size or not c.size:  # nothing is remembered: the same at every frequency
+        return float(np.linalg.eigvalsh((d + d.T) / 2 + weight)[0]), 0.0
     values = np.linalg.eigvals(a)
     if len(a) and np.abs(values).max() >= 1:
         return -np.inf, 0.0

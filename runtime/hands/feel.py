@@ -342,7 +342,9 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
         device = find_device(
             group.jacobians, group.parameters, unit_of, group.listening, part=max(names, default="")
         )
-        if isinstance(device, str) or (device is None and names):
+        if isinstance(device, str) and not names:  # it is neither pushed nor asked for
+            device = None
+        if names and not isinstance(device, Device):
             what = device or f"{group.name} has no device"
             hint = "--at with the part that is held, as user[1].device"
             raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))

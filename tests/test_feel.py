@@ -1,0 +1,259 @@
+"""What a hand feels: against a program that plays it tick by tick, closed forms and published numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.analysis.analysis import prepare
+from apc.compiler.errors import ApcError
+from apc.hands.feel import feel
+from tests.handled import Users, response
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
+
+# Ten frequencies in Hz, from where hands move objects to where they hold them still.
+TEN = (0.7, 1.3, 2.9, 5.1, 9.7, 14.3, 21.7, 33.1, 47.9, 58.3)
+
+
+def users(count: int, stiffness: float) -> str:
+    """Return the paper's scene of so many users."""
+    pairs = ("count: 3", f"count: {count}"), ("stiffness: 500", f"stiffness: {stiffness}")
+    return replaced(AVERAGE, *pairs)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_responses_agree_with_a_force_played_tick_by_tick(count: int) -> None:
+    found = feel(compiled(users(count, 500)), TEN, quick=True)
+    for place, hertz in enumerate(TEN):
+        here, there, apart = response(Users(count, 500.0), hertz)
+        # What has not died out after 700 frames is 0.957^700, the spectral radius being that.
+        assert found.impedance[place] == pytest.approx(1 / here, rel=1e-9)
+        assert found.transmitted_admittance[place] == pytest.approx(there, rel=1e-7)
+        assert found.error_per_force[place] == pytest.approx(apart, rel=1e-8)
+    assert (found.bound < 1e-7).all()
+
+
+def test_a_lone_mass_feels_like_itself() -> None:
+    """No tick, no network: Z = b + jωm."""
+    text = ONE_MASS + (
+        "clocks: {tick: 1 ms}\n"
+        "couplers: {idle: {type: SampledSpringDamper, a: device, b: ground, stiffness: 0 N/m, clock: tick}}\n"
+    )
+    found = feel(compiled(text), [0.5, 50.0, 400.0])
+    expected = 3 + 2j * np.pi * found.frequency_hz * 2
+    np.testing.assert_allclose(found.impedance, expected, rtol=1e-13)
+    assert (found.alias < 1e-13).all()
+    assert found.low_frequency is not None
+    slow = found.low_frequency
+    assert slow.mass == pytest.approx(2, abs=slow.errors[0])
+    assert slow.damping == pytest.approx(3, abs=slow.errors[1])
+    assert slow.stiffness == pytest.approx(0, abs=slow.errors[2])
+    # |v/F| = 1/|b + jωm| is largest at rest, where it is 1/b.
+    (peak,) = found.hinf
+    assert peak.sampled_data.norm == pytest.approx(1 / 3, rel=1e-9)
+    # Each tick's 1 N rms: v⁺ = e^{−bT/m} v + (1 − e^{−bT/m})/b F, whose variance is (1 − a)²/(b²(1 − a²)).
+    decay = math.exp(-3e-3 / 2)
+    hands = next(one for one in found.h2 if one.source == "hands")
+    assert hands.velocity_m_s == pytest.approx((1 - decay) / 3 / math.sqrt(1 - decay**2), rel=1e-12)
+    assert hands.error_m is None
+
+
+# Made by an independent program, which follows harmonics and takes norms by bisection and fast sampling:
+# impedance at 1 Hz and 20 Hz; at 20 Hz velocity arriving, error (mm), alias; H∞ of velocity (common,
+# difference) and of the error, on ticks and sampled-data, H2 of the error.
+PUBLISHED = (
+    (
+        2,
+        31.421742168544554 - 3.3876062890766288j,
+        2.8592040243375085 + 2.501112875788781j,
+        0.0021133002420831992 + 0.023942180696575152j,
+        0.5703125704277588 + 0.35294215416033314j,
+        5.694904214390054e-06,
+        (0.299461433180675, 0.4729889334388661, 0.0044765666646593835),
+        (0.2992905102319901, 0.47273015454639244, 0.004476973205710274),
+        0.0005390507317470898,
+    ),
+    (
+        3,
+        39.655654182833935 - 15.869521752731785j,
+        2.453730629411063 + 0.3608592678348613j,
+        -0.07244933505096336 + 0.01377432068631149j,
+        0.6092476744197959 + 2.1403332416937313j,
+        1.7167909309578182e-05,
+        (0.2572214868033621, 0.4963166390275006, 0.0030187083157676695),
+        (0.2570494795651829, 0.49599920916108703, 0.0030189582169522842),
+        0.0004575212195884317,
+    ),
+)
+
+
+@pytest.mark.parametrize("known", PUBLISHED)
+def test_numbers_of_an_independent_program(known: tuple[object, ...]) -> None:
+    count, at_one, at_twenty, arrives, apart, alias, ticks, sampled, rms = known
+    found = feel(compiled(users(int(str(count)), 500)), [1.0, 20.0])
+    assert found.impedance[0] == pytest.approx(at_one, rel=1e-11)
+    assert found.impedance[1] == pytest.approx(at_twenty, rel=1e-11)
+    assert found.transmitted_admittance[1] == pytest.approx(arrives, rel=1e-11)
+    assert found.error_per_force[1] * 1e3 == pytest.approx(apart, rel=1e-11)
+    assert found.alias[1] == pytest.approx(alias, rel=1e-8)
+    # Its norms are good to 3e-10 (on ticks) and 5e-10 of themselves.
+    assert [one.on_ticks.norm for one in found.hinf] == pytest.approx(ticks, rel=1e-9)
+    assert [one.sampled_data.norm for one in found.hinf] == pytest.approx(sampled, rel=1e-9)
+    assert found.h2[0].error_m == pytest.approx(rms, rel=1e-12)
+
+
+@pytest.mark.parametrize(("text", "others"), [(AVERAGE, 1), (MESH, 2)])
+def test_a_network_feels_viscous(text: str, others: int) -> None:
+    """Copies lag what they hear by half the network's hold and its delay: K ((T_n − T_c)/2 + T_d) of damping.
+
+    A hand that moves slowly moves all three users' devices and copies, of 5 N·s/m each, and three networks.
+    """
+    found = feel(compiled(text), [1.0]).low_frequency
+    assert found is not None
+    expected = 3 * (5 + 5 + others * 500 * ((8e-3 - 1e-3) / 2 + 8e-3))
+    assert found.damping == pytest.approx(expected, rel=2e-3)
+
+
+def test_a_million_users_and_groups_are_as_right_as_all_peers_in_one() -> None:
+    """Two groups of two: classes and differences against one loop of all four, on the same graph as arcs."""
+    groups = replaced(
+        AVERAGE, ("user: {count: 3}", "left: {count: 2, set: {device.mass: 0.2 kg}}\n  right: {count: 2}")
+    )
+    arcs = replaced(
+        groups,
+        (
+            "delay: 8 ms}",
+            "delay: 8 ms, graph: {edges: [[1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]}}",
+        ),
+    )
+    for at, between in (("left[1]", "left[2]"), ("left[2]", "right[1]"), ("right[1]", "left[1]")):
+        one = feel(compiled(groups), [1.0, 17.0], at=at, between=between, quick=True)
+        other = feel(compiled(arcs), [1.0, 17.0], at=at, between=between, quick=True)
+        np.testing.assert_allclose(one.impedance, other.impedance, rtol=1e-10)
+        np.testing.assert_allclose(one.transmitted_admittance, other.transmitted_admittance, rtol=1e-9)
+        np.testing.assert_allclose(one.error_per_force, other.error_per_force, rtol=1e-10)
+    many = feel(compiled(users(1_000_000, 500)), [1.0], quick=True)
+    assert abs(many.transmitted_admittance[0]) < 1e-5
+    assert many.bound[0] < 1e-4
+
+
+def test_noise_of_sensors_is_that_of_ticks_played() -> None:
+    """White noise on samples: 4,000 frames of two users played, whose rms is known to some 3 %."""
+    system = compiled(users(2, 500))
+    (_, sensors) = feel(system, [1.0]).h2
+    told = Users(2, 500.0)
+    a, b, _ = told.equations
+    from scipy.linalg import expm
+
+    step = expm(np.block([[a, b], [np.zeros((2, 6))]]) * told.tick)[:4]
+    random = np.random.default_rng(1)
+    z, contact, pull = np.zeros((2, 4)), np.zeros(2), np.zeros(2)
+    packets = [np.zeros(2)] * 2
+    squares = []
+    for _ in range(4000):
+        packets = [z[:, 2].copy(), packets[0]]
+        for _ in range(8):
+            squares.append((z[0, 2] - z[1, 2]) ** 2)
+            acting, pulling = contact, pull
+            contact = told.contact * (z[:, 0] + random.standard_normal(2) - z[:, 2])
+            pull = told.coupling * (packets[1][::-1] - z[:, 2])
+            z = np.column_stack([z, acting, pulling]) @ step.T
+    assert sensors.error_m == pytest.approx(math.sqrt(np.mean(squares)), rel=0.05)
+
+
+def test_an_unstable_scene_has_no_response_in_time_but_its_map_has_one(tmp_path: Path) -> None:
+    system = compiled(users(3, 1200))
+    with pytest.raises(ApcError, match="E934"):
+        feel(system, [1.0])
+    found = feel(system, [1.0], unstable=True)
+    assert found.notes
+    assert not found.hinf
+    below = feel(compiled(users(3, 1090)), [1.0])
+    assert abs(found.impedance[0] / below.impedance[0] - 1) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("options", "code"),
+    [
+        ({"frequencies": [501.0]}, "E935"),
+        ({"frequencies": [0.0]}, "E935"),
+        ({"frequencies": []}, "E935"),
+        ({"frequencies": [math.nan]}, "E935"),
+        ({"frequencies": [1.0], "at": "nobody[1]"}, "E936"),
+        ({"frequencies": [1.0], "at": "user[4]"}, "E936"),
+        ({"frequencies": [1.0], "at": "user[0].device"}, "E936"),
+        ({"frequencies": [1.0], "at": "user[1].cub"}, "E936"),
+        ({"frequencies": [1.0], "at": "contact"}, "E936"),
+    ],
+)
+def test_what_can_t_be_felt_is_refused(options: dict[str, object], code: str) -> None:
+    with pytest.raises(ApcError, match=code):
+        feel(compiled(AVERAGE), **options)  # type: ignore[arg-type] # of several kinds
+
+
+def test_a_peer_without_a_device_is_told_so() -> None:
+    text = "topology: bare\nclocks: {tick: 8 ms, fast: 1 ms}\npeers: {user: {count: 2}}\n" + (
+        "masses: {cube: {mass: 1 kg, damping: 1 N*s/m, shared: true}}\n"
+        "couplers: {c: {type: AveragePosition, object: cube, stiffness: 9 N/m, clock: fast, link: lan}}\n"
+        "links: {lan: {clock: tick, delay: 8 ms}}\n"
+    )
+    with pytest.raises(ApcError, match="E931"):
+        feel(compiled(text), [1.0])
+    found = feel(compiled(text), [1.0], at="user[1].cube")  # but a hand may hold the object itself
+    assert found.at == "user[1].cube"
+
+
+def test_the_command_line_says_what_python_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = tmp_path / "three.yaml"
+    scene.write_text(AVERAGE, encoding="utf-8")
+    words = [
+        "feel",
+        "three.yaml",
+        "--between",
+        "user[1].device:user[3].device",
+        "--frequencies",
+        "1 Hz, 5 Hz",
+    ]
+    assert run([*words, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    found = apc.feel(str(scene), [1.0, 5.0], between="user[3]")
+    assert document["frequency_hz"] == [1.0, 5.0]
+    assert complex(*document["impedance"][1]) == found.impedance[1]
+    assert document["between"] == "user[3].device"
+    assert document["low_frequency"]["damping"] == pytest.approx(47.25, rel=1e-3)
+    assert set(document) >= {
+        "at",
+        "transmitted_admittance",
+        "error_per_force",
+        "alias",
+        "bound",
+        "hinf",
+        "h2",
+    }
+    assert run([*words, "--out", "table.csv"]) == 0
+    text = capsys.readouterr().out
+    assert all(len(line) <= 80 for line in text.splitlines())
+    rows = Path("table.csv").read_text(encoding="utf-8").splitlines()
+    assert float(rows[2].split(",")[1]) == found.impedance[1].real
+    assert run(["feel", "three.yaml", "--to", "600 Hz"]) == 1
+    assert "E935" in capsys.readouterr().err
+    assert run(["feel", "three.yaml", "--from", "2 Hz", "--to", "1 Hz"]) == 1
+    assert "E935" in capsys.readouterr().err
+    assert run(["feel", "three.yaml", "--out", "bode.txt"]) == 1
+    assert "E878" in capsys.readouterr().err
+
+
+def test_lost_packets_are_left_out_and_that_is_said_first() -> None:
+    system = apc.compile(SCENES / "lossy-average.yaml")
+    found = feel(system, [1.0], quick=True)
+    assert "packet loss" in str(found).splitlines()[1]
+    assert prepare(system) is not None
