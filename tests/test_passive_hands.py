@@ -48,8 +48,8 @@ def test_a_wall_needs_what_colgate_and_schenkel_say(ticks: int) -> None:
 def test_a_force_that_switches_between_ticks_costs_more_than_its_delay(ticks: int) -> None:
     """Forces act half a tick after samples, and then some ticks more; a hand hurries through the first half.
 
-    By A and B in the halves of a tick, steadily, S = A + B, it loses b (A² + B²)/τ, gains K S ((n + ½) S + A):
-    the best A = S/2 + K S τ/(4 b) leaves b/(2τ) = K (n + 1) + K² τ/(8 b).
+    By A and B in the halves of a tick, steadily, S = A + B, it loses b (A² + B²)/τ and gains K S ((n + ½) S
+    + A): the best A = S/2 + K S τ/(4 b) leaves b/(2τ) = K (n + 1) + K² τ/(8 b).
     """
     text = sampled_wall(800, ticks).replace(f"delay: {ticks} ms", f"delay: {ticks}.5 ms")
     (mode,) = passive_hands(compiled(text)).modes

@@ -74,12 +74,15 @@ def analyze_command(
     """
     start_single_threaded()
     from apc.answer import answer
+    from apc.frame.devices import HANDS, published
     from apc.inputs import open_scene
 
     system = open_scene(file, settings, hands=hands)
     if hands == "passive":
         _judge_passive(system, method, box, every_convention=every_convention, as_json=as_json)
         return
+    if hands not in HANDS:  # one of the library: all that were measured
+        box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
     ranges = []
     if box:
         from apc.analysis.box import parse_range

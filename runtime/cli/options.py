@@ -47,7 +47,8 @@ hands_option = click.option(
     metavar="HANDS",
     help="What holds the devices. free: nothing but what the scene says. clamped: they are held fast. held: "
     "each by a hand of hand.mass, hand.damping and hand.stiffness, 0 unless --set. passive: stable means "
-    "stable with all hands that give back no more energy than they got.",
+    "stable with all hands that give back no more energy than they got. Or a hand of the library, such as "
+    "StylusArmForward.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 

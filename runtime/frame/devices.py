@@ -1,7 +1,8 @@
 """What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
-Gives: `Device`, `find_device`, `devices_of`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`.
+Gives: `Device`, `find_device`, `devices_of`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`;
+`published`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -16,7 +17,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi
 import numpy as np
@@ -26,8 +27,12 @@ from apc.compiler.compiled import CompiledSystem, Kind, Parameter, Ports, Receiv
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.overrides import apply, parse_override
 from apc.frame.parameters import exact_numbers, resolve
 from apc.frame.start import Listening, start_arguments
+
+if TYPE_CHECKING:
+    from apc.compiler.components.component import Component
 
 # How hands can be taken: as the scene has them, holding devices fast, or as a mass, damper and spring each;
 # and as all that give back no more energy than they got, which changes no scene.
@@ -196,7 +201,8 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
         The compiled scene.
     hands
         "free": as it is. "clamped": its devices are held fast. "held": a hand of `hand.mass`, `hand.damping`
-        and `hand.stiffness` on each, 0 at first. "passive": as it is, and refused if it has hands.
+        and `hand.stiffness` on each, 0 at first. "passive": as it is, and refused if it has hands. Or one of
+        the library, of its usual numbers (see `published`).
 
     Raises
     ------
@@ -205,10 +211,10 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
     """
     option = f"--hands {hands}"
     if hands not in HANDS:
-        what = f"{hands[:40]} are no hands ({', '.join(HANDS)})"
-        raise ApcError(
-            Mistake("E930", Place("--hands"), what, hint=nearest(hands, HANDS) or "--hands clamped")
-        )
+        usual = {name: numbers[2] for name, numbers in published(hands).items()}
+        one = held(system, option=option)
+        one = apply(one, [parse_override(one, f"{name}={value}") for name, value in usual.items()])
+        return replace(one, name=f"{system.name}, hands {hands}")
     if hands == PASSIVE:
         refuse_hands(system, option)
     if hands in (FREE, PASSIVE):
@@ -335,3 +341,42 @@ def _rewritten(
     ports = None if kind.ports is None else Ports(kind.ports.parts, again(kind.ports.port))
     derivative = again(kind.derivative, rates)
     return replace(kind, derivative=derivative, clocks=clocks, sends=sends, ports=ports)
+
+
+def published(name: str) -> dict[str, tuple[str, str, str]]:
+    """Return the parameters of a hand of the library: least, largest and usual value of each, with units.
+
+    Parameters
+    ----------
+    name
+        A component whose `mass`, `damping` and `stiffness` have bounds on either side, and defaults between.
+
+    Raises
+    ------
+    ApcError
+        E930 the library has no such component, or it says no such bounds.
+    """
+    # The library reads YAML, which no analysis of a compiled model does otherwise.
+    from apc.compiler.components.library import Library
+
+    known = Library()
+    found = {one: ranges for one in known.component_names if (ranges := _ranges(known.component(one)))}
+    if name not in found:
+        listed = (*HANDS, *found)
+        what = f"{name[:40]} are no hands ({', '.join(listed)})"
+        near = nearest(name, listed)
+        raise ApcError(Mistake("E930", Place("--hands"), what, hint=f"--hands {near or CLAMPED}"))
+    return found[name]
+
+
+def _ranges(component: Component | None) -> dict[str, tuple[str, str, str]]:
+    """Return the bounds and defaults of a hand's mass, damping and stiffness, nothing if they have none."""
+    numbers = {} if component is None else {one.name: one for one in component.numbers}
+    found = {}
+    for name, unit, _ in _NUMBERS:
+        one = numbers.get(name)
+        if one is None or one.minimum is None or one.maximum is None or one.default is None:
+            return {}
+        low, high, usual = (f"{float(v)!r} {unit}" for v in (one.minimum, one.maximum, one.default))
+        found[f"{HAND}.{name}"] = low, high, usual
+    return found
