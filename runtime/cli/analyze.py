@@ -49,6 +49,12 @@ SECONDS_A_PEER = 1e-4
     is_flag=True,
     help="Repeat the analysis under every order of events that coincide.",
 )
+@click.option(
+    "--buzz",
+    "with_buzz",
+    is_flag=True,
+    help="Predict how one-sided contacts buzz, and play the scene for up to 80 s to lay it beside.",
+)
 @json_option
 def analyze_command(
     file: str | None,
@@ -57,6 +63,7 @@ def analyze_command(
     certify: bool,
     box: tuple[str, ...],
     every_convention: bool,
+    with_buzz: bool,
     as_json: bool,
 ) -> None:
     """Say whether a scene is stable, by how much, and in which modes.
@@ -66,7 +73,8 @@ def analyze_command(
     dies out. A motion of all peers together, which nothing hinders, is left
     out of it and named. Beside the verdict stand what moves the radius most,
     how far each coupler and delay may grow, and for contacts that push and
-    never pull, which of them make it unstable.
+    never pull, which of them make it unstable, and whether they may open and
+    close at will.
     """
     start_single_threaded()
     from apc.answer import answer
@@ -80,5 +88,12 @@ def analyze_command(
         ranges = [parse_range(system, text) for text in box]
     listed = sum(group.count for group in system.groups if group.columns)
     with at_work(f"analysing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
-        found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)
+        found = answer(
+            system,
+            method=method,
+            certify=certify,
+            box=ranges,
+            every_convention=every_convention,
+            with_buzz=with_buzz,
+        )
     print_result(found, as_json=as_json)
