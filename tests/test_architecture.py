@@ -73,8 +73,8 @@ HOUSE = (
     (
         "apc.analysis",
         """
-        methods switches sectors plan selfcheck analysis needs box box_proof openloop paper conventions
-        contact_modes switching describing
+        methods switches pushes plan selfcheck analysis needs box box_proof openloop paper conventions
+        contact_modes opened alternating switching describing
         """,
     ),
     (

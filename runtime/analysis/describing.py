@@ -21,8 +21,8 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.analysis.sectors import Push
-from apc.analysis.switching import with_gain
+from apc.analysis.opened import with_gain
+from apc.analysis.pushes import Push
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import close_loop
 from apc.eigen.modes import arrange
@@ -77,7 +77,7 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
     system
         The compiled scene.
     groups
-        From `switching.contact_groups`.
+        From `opened.contact_groups`.
     """
     exchange = build_exchange(system, resolve(system).timings)
 

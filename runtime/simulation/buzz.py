@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.contact_modes import EVERYONE, ContactModes, contact_modes
 from apc.analysis.describing import Predicted, predict
-from apc.analysis.sectors import Push
-from apc.analysis.switching import contact_groups
+from apc.analysis.opened import contact_groups
+from apc.analysis.pushes import Push
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part

@@ -121,7 +121,7 @@ def push_of(
         alone = alone and not (aside > ROUNDED * np.abs(slopes).max(axis=1)).any()
         at = values - along * (line @ start + offset)
         breaks += [-float(at[k] / along[k]) for k in range(1, len(along)) if along[k]]
-    size = max(map(abs, (*breaks, offset))) or 1.0
+    size = max(float(np.abs(line) @ np.abs(start)), *map(abs, (*breaks, offset))) or 1.0
     sector = "depends on more than one number, such as a depth and its rate"
     if alone and breaks:
         sector = _sector(force_at, sorted(breaks), size)
