@@ -31,6 +31,7 @@ ROUNDED = 1e-9
 
 # How far from its breaks a force is looked at, in sizes of what it is made of.
 FAR = 3.0
+NEAR_AND_FAR = (-FAR, -1.0, -0.5, -0.1, 0.1, 0.5, 1.0, FAR)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +39,7 @@ class Push:
     """A part's force: output `output` of clock partition `partition`, y where it is on.
 
     y = `slopes` · (x, u, m) + `offset`; the first `states` slopes are those of x. `sector` is "" where the
-    force is φ(y) in a sector, else says why not. `one_sided` says that far outside it is 0, far inside y.
+    force is φ(y) in a sector, else says why not. `one_sided` says that, along its slopes, it is max(0, y).
     """
 
     part: str
@@ -125,11 +126,11 @@ def push_of(
     sector = "depends on more than one number, such as a depth and its rate"
     if alone and breaks:
         sector = _sector(force_at, sorted(breaks), size)
-    far = [abs(force_at(by * FAR * size) - max(by, 0) * FAR * size) for by in (-2, -1, 1, 2)]
+    off = [abs(force_at(by * size) - max(by, 0) * size) for by in NEAR_AND_FAR]
     return Push(
         *(part.name, partition, row, line, offset, sizes[0]),
         sector=sector and f"{part.name} {sector}",
-        one_sided=max(far) <= ROUNDED * FAR * size,
+        one_sided=max(off) <= ROUNDED * size,
     )
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -40,8 +40,8 @@ Floats = NDArray[np.float64]
 # these seconds; and the part of it, at the end, that is measured.
 GROWTHS, SHORTEST, LONGEST, MEASURED = 40, 8.0, 80.0, 4
 
-# Peers whose contacts are measured.
-MOST_PEERS = 20
+# Peers whose contacts are measured; ticks of all peers that are played, some ten seconds' worth.
+MOST_PEERS, MOST_PLAYED = 20, 2 * 10**7
 
 # A swing below this part of the depth is none. If it changes by more than this over what is measured, it has
 # not come to its end.
@@ -51,6 +51,8 @@ QUIET, SETTLED = 1e-4, 0.02
 # steady swing leaves after its own frequency and its multiples is far less. Of two lines sums and differences
 # of so many times each are no third.
 MOST_LINES, MULTIPLES, SECOND, MIXED = 6, 12, 0.1, 3
+
+BY_CHANCE = "predicted with every packet on time, played with lost and late ones"
 
 # Points of a spectrum between two frequencies that can be told apart.
 FINER = 8
@@ -144,14 +146,28 @@ def buzz(
                 raise _refused(system, f"{one.part} pulls, too, or is limited")
     measured = _contacts(system, groups)
     predicted = predict(system, groups)
-    modes = modes or contact_modes(system, prepared=prepared)
-    radius = next(mode.spectral_radius for mode in modes.modes if mode.name == EVERYONE)
-    frame = float(prepared.schedules[0].frame_s)
-    rate = abs(math.log(radius)) / frame if radius > 0 else math.inf
-    duration = min(max(GROWTHS / rate if rate else math.inf, SHORTEST), LONGEST)
+    seconds = _seconds(system, prepared, modes)
     names = [one.name for one in measured] + [state for one in measured for state in one.states]
-    played = simulate(system, duration=Fraction(math.ceil(duration)), signals=tuple(dict.fromkeys(names)))
-    return _compare(system.name, predicted, played, measured)
+    played = simulate(system, duration=seconds, signals=tuple(dict.fromkeys(names)))
+    found = _compare(system.name, predicted, played, measured)
+    if all(link.channel is None for link in system.links):
+        return found
+    return replace(found, notes=(*found.notes, BY_CHANCE))
+
+
+def _seconds(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None) -> Fraction:
+    """Return how long to play: until the swing has come to what it is, if that can be waited for."""
+    modes = modes or contact_modes(system, prepared=prepared)
+    radius = next((mode.spectral_radius for mode in modes.modes if mode.name == EVERYONE), 1.0)
+    frame = float(prepared.schedules[0].frame_s)
+    rate = abs(math.log(radius)) / frame if 0 < radius < math.inf else 0.0
+    wanted = min(max(GROWTHS / rate if rate else math.inf, SHORTEST), LONGEST)
+    timings = {one.name: one.value for one in system.timings}
+    tick = min(float(timings[clock.period]) for clock in system.clocks)
+    most = MOST_PLAYED * tick / system.peers
+    if most < SHORTEST:
+        raise _refused(system, f"{system.peers:,} peers are too many to play for {SHORTEST:g} s")
+    return Fraction(math.floor(min(wanted, most)))
 
 
 def _refused(system: CompiledSystem, why: str) -> ApcError:
