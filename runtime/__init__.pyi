@@ -4,6 +4,7 @@ from .analysis.box_proof import BoxProof as BoxProof
 from .analysis.contact_modes import ContactModes as ContactModes
 from .analysis.conventions import Conventions as Conventions
 from .analysis.paper import PaperRoute as PaperRoute
+from .analysis.switching import Switching as Switching
 from .api import (
     analyze as analyze,
 )
@@ -12,6 +13,9 @@ from .api import (
 )
 from .api import (
     bench as bench,
+)
+from .api import (
+    buzz as buzz,
 )
 from .api import (
     compile as compile,
@@ -70,6 +74,9 @@ from .api import (
 from .api import (
     sweep as sweep,
 )
+from .api import (
+    switching as switching,
+)
 from .benchmark.bench import Bench as Bench
 from .compiler.compiled import CompiledSystem as CompiledSystem
 from .compiler.errors import ApcError as ApcError
@@ -77,6 +84,7 @@ from .hands.feel import Feel as Feel
 from .hands.passivity import PassiveHands as PassiveHands
 from .moments.network import NetworkVerdict as NetworkVerdict
 from .regions.region import Region as Region
+from .simulation.buzz import Buzz as Buzz
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.sweep import Sweep as Sweep
 from .vary.critical import Critical as Critical

@@ -24,8 +24,10 @@ from apc.vary.sensitivity import Sensitivities, sensitivities, varied
 
 if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
+    from apc.analysis.switching import Switching
     from apc.frame.names import Range
     from apc.moments.network import NetworkVerdict
+    from apc.simulation.buzz import Buzz
 
 # How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
 # well-conditioned frame stay below 1e-12; beyond ten times that, floats have lost what derivatives need.
@@ -46,6 +48,8 @@ class Answer(Result):
     `conventions` holds the analyses under every order of coincident events, or under those that could be had
     in passing; `detailed` says that they were asked for. `box` is the proof over a box of parameters, where
     one was asked for. `network` is the verdict over the network as it is, None where all packets are on time.
+    `switching` says whether contacts may open and close at will, None where nothing switches; `buzz` is None
+    where it was not asked for.
     """
 
     shown_by = "analysis:answer"
@@ -55,6 +59,8 @@ class Answer(Result):
     sensitivities: Sensitivities
     margins: Margins
     contact_modes: ContactModes | None
+    switching: Switching | None
+    buzz: Buzz | None
     conventions: Conventions
     detailed: bool
     box: BoxProof | None
@@ -93,6 +99,7 @@ def answer(
     certify: bool = False,
     box: Sequence[Range] = (),
     every_convention: bool = False,
+    with_buzz: bool = False,
 ) -> Answer:
     """Analyse a system and look at what stands beside the verdict.
 
@@ -108,11 +115,13 @@ def answer(
         Ranges of parameters over which to prove stability as well.
     every_convention
         Repeat the analysis under every order of coincident events, however long it takes.
+    with_buzz
+        Predict the buzz of one-sided contacts, and play the scene to lay it beside.
 
     Raises
     ------
     ApcError
-        As `analysis.analyze` and `box_proof.prove_box`.
+        As `analysis.analyze`, `box_proof.prove_box` and `buzz.buzz`.
     """
     prepared = prepare(system)
     found = judge(system, method=method, certify=certify, prepared=prepared)
@@ -126,6 +135,8 @@ def answer(
         sensitivities=sensitivities_of(system, prepared, found),
         margins=_margins(system, prepared, found),
         contact_modes=modes,
+        switching=_switching(system, prepared, modes) if modes else None,
+        buzz=_buzz(system, prepared, modes) if with_buzz else None,
         conventions=compared,
         detailed=every_convention,
         box=_prove_box(system, box) if box else None,
@@ -139,6 +150,20 @@ def _over_network(system: CompiledSystem, prepared: Prepared, *, certify: bool) 
     from apc.moments.network import judge_network
 
     return judge_network(system, prepared, certify=certify)
+
+
+def _switching(system: CompiledSystem, prepared: Prepared, modes: ContactModes) -> Switching:
+    """Return whether contacts may switch at will; imported here, as most scenes have none."""
+    from apc.analysis.switching import switching
+
+    return switching(system, modes, prepared=prepared)
+
+
+def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None) -> Buzz:
+    """Return the buzz of contacts; imported here, as few analyses ask for it."""
+    from apc.simulation.buzz import buzz
+
+    return buzz(system, prepared=prepared, modes=modes)
 
 
 def _prove_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:

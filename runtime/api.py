@@ -22,11 +22,13 @@ if TYPE_CHECKING:
     from apc.analysis.conventions import Conventions
     from apc.analysis.methods import Method
     from apc.analysis.paper import PaperRoute
+    from apc.analysis.switching import Switching
     from apc.benchmark.bench import Bench
     from apc.hands.feel import Feel
     from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
     from apc.regions.region import Region
+    from apc.simulation.buzz import Buzz
     from apc.simulation.trajectory import Trajectory
     from apc.sweeps.sweep import Sweep
     from apc.vary.critical import Critical
@@ -336,6 +338,39 @@ def contact_modes(
     from apc.analysis import contact_modes as switched
 
     return switched.contact_modes(_model(model, set))
+
+
+def switching(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Switching:
+    """Say whether a scene is proved stable however its contacts open and close, tick by tick.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    """
+    from apc.analysis import contact_modes as switched
+    from apc.analysis import switching as at_will
+
+    system = _model(model, set)
+    return at_will.switching(system, switched.contact_modes(system))
+
+
+def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Buzz:
+    """Predict the buzz of a scene's one-sided contacts, and play it beside.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+
+    Raises
+    ------
+    ApcError
+        E864 no contact that pushes from tick to tick and never pulls.
+    """
+    from apc.simulation import buzz as cycles
+
+    return cycles.buzz(_model(model, set))
 
 
 def prove_box(

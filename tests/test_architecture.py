@@ -73,8 +73,8 @@ HOUSE = (
     (
         "apc.analysis",
         """
-        methods switches plan selfcheck analysis needs box box_proof openloop paper conventions
-        contact_modes
+        methods switches pushes plan selfcheck analysis needs box box_proof openloop paper conventions
+        contact_modes opened alternating switching describing
         """,
     ),
     (
@@ -91,16 +91,16 @@ HOUSE = (
         delays lags search mean_square critical margins sensitivity
         """,
     ),
-    ("apc", "answer"),
     ("apc.sweeps", "grid quantities work store cluster sweep"),
     (
         "apc.simulation",
         """
         settings integrate propagate flow quadrature forcing
         signals pairs program writing native hearing population machine stepwise
-        simulation blocks accuracy summary trajectory ensemble
+        simulation blocks accuracy summary trajectory ensemble buzz
         """,
     ),
+    ("apc", "answer"),
     (
         "apc.regions",
         """

@@ -130,6 +130,7 @@ E850 runtime runtime/analysis: a method can't serve a scene
 E861 runtime/analysis: a scene has not the paper's form
 E862 runtime/analysis: the paper's matrices would be too large
 E863 runtime/analysis: a part takes too many decisions
+E864 runtime/simulation: no one-sided contact whose buzz could be predicted
 E870 runtime/simulation: a motion can't be played exactly
 E871 runtime/simulation: a motion can't be integrated any further
 E872 runtime/simulation: an equation has no solution while a scene is played

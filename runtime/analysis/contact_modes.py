@@ -23,7 +23,7 @@ from apc.compiler.timings import part
 from apc.eigen.spectrum import UNSTABLE
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import linearize
-from apc.frame.parameters import resolve
+from apc.frame.parameters import Numbers, resolve
 from apc.result import Result
 
 EVERYONE = "on at every peer"
@@ -110,16 +110,38 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
     switched = [find_switches(kind) for kind in system.kinds]
     hidden = dict.fromkeys(one.kind.name for one in switched if not one.walkable)
     notes = tuple(f"not looked into: {name}, which has a nonlinear loop" for name in hidden)
-    numbers = resolve(system)
-    parts: list[tuple[SwitchingPart, ...]] = []
-    for index, one in enumerate(switched):
-        rows = [numbers.parameters[g][0] for g, group in enumerate(system.groups) if group.kind == index]
-        parts.append(switching_parts(one, rows[0]) if rows else ())
+    parts = parts_of_kinds(system, switched, resolve(system))
     names = tuple(dict.fromkeys(part.name for listed in parts for part in listed))
     has = [frozenset(part.name for part in parts[group.kind]) for group in system.groups]
     scene = _Scene(system, prepared, switched, parts)
     modes = [scene.analyze(name, setting) for name, setting in _settings(system, names, has)] if names else []
     return ContactModes(system.name, names, tuple(modes), notes)
+
+
+def parts_of_kinds(
+    system: CompiledSystem, switched: Sequence[SwitchedKind], numbers: Numbers
+) -> list[tuple[SwitchingPart, ...]]:
+    """Return the switching parts of each kind, as they are of the first of its peers.
+
+    Raises
+    ------
+    ApcError
+        E863 a part that takes too many decisions.
+    """
+    parts: list[tuple[SwitchingPart, ...]] = []
+    for index, one in enumerate(switched):
+        rows = [numbers.parameters[g][0] for g, group in enumerate(system.groups) if group.kind == index]
+        parts.append(switching_parts(one, rows[0]) if rows else ())
+    return parts
+
+
+def settings(parts: Sequence[SwitchingPart], *, on: bool) -> dict[int, bool]:
+    """Return the settings of all decisions of some parts, each wholly on or wholly off."""
+    return {
+        place: value
+        for part in parts
+        for place, value in zip(part.decisions, part.on if on else part.off, strict=True)
+    }
 
 
 def _settings(

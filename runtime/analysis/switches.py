@@ -41,10 +41,11 @@ _POINTS = {"eq": 0.0, "ne": 1.0}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """A decision: its symbol, and the names of what it changes."""
+    """A decision: its symbol, the names of what it changes, and `guard`, which is zero where it is taken."""
 
     symbol: Any  # casadi.SX
     changes: tuple[str, ...]
+    guard: Any  # casadi.SX
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,7 +166,7 @@ def find_switches(kind: Kind) -> SwitchedKind:
         for one in opened:
             if casadi.depends_on(one.output, symbol):
                 changed |= dict.fromkeys(_changed(kind, one, symbol, opening.operands[number]))
-        decisions.append(Decision(symbol, tuple(changed)))
+        decisions.append(Decision(symbol, tuple(changed), _guard(opening.operands[number])))
     return SwitchedKind(kind, tuple(decisions), opened, walkable=True)
 
 
@@ -241,6 +242,11 @@ def bind(switched: SwitchedKind, base: SiteJacobians, settings: Mapping[int, boo
         By the place of the decision; what is left out is off.
     """
     return replace(jacobians(_bound(switched, settings)), kind=base.kind, pattern=base.pattern)
+
+
+def _guard(operands: Sequence[Any]) -> Any:
+    """Return what is zero where a decision between two operands, or on the sign of one, is taken."""
+    return operands[0] - operands[1] if len(operands) > 1 else operands[0]
 
 
 def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...]]]:

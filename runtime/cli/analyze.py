@@ -51,6 +51,12 @@ SECONDS_A_PEER = 1e-4
     is_flag=True,
     help="Repeat the analysis under every order of events that coincide.",
 )
+@click.option(
+    "--buzz",
+    "with_buzz",
+    is_flag=True,
+    help="Predict how one-sided contacts buzz, and play the scene for up to 80 s to lay it beside.",
+)
 @hands_option
 @json_option
 def analyze_command(
@@ -60,6 +66,7 @@ def analyze_command(
     certify: bool,
     box: tuple[str, ...],
     every_convention: bool,
+    with_buzz: bool,
     hands: str,
     as_json: bool,
 ) -> None:
@@ -70,7 +77,8 @@ def analyze_command(
     dies out. A motion of all peers together, which nothing hinders, is left
     out of it and named. Beside the verdict stand what moves the radius most,
     how far each coupler and delay may grow, and for contacts that push and
-    never pull, which of them make it unstable.
+    never pull, which of them make it unstable, and whether they may open and
+    close at will.
     """
     start_single_threaded()
     from apc.answer import answer
@@ -79,7 +87,9 @@ def analyze_command(
 
     system = open_scene(file, settings, hands=hands)
     if hands == "passive":
-        _judge_passive(system, method, box, every_convention=every_convention, as_json=as_json)
+        asked = {"--method": method != AUTO, "--box": bool(box), "--conventions": every_convention}
+        asked["--buzz"] = with_buzz
+        _judge_passive(system, [name for name, given in asked.items() if given], as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
@@ -90,18 +100,22 @@ def analyze_command(
         ranges = [parse_range(system, text) for text in box]
     listed = sum(group.count for group in system.groups if group.columns)
     with at_work(f"analysing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
-        found = answer(system, method=method, certify=certify, box=ranges, every_convention=every_convention)
+        found = answer(
+            system,
+            method=method,
+            certify=certify,
+            box=ranges,
+            every_convention=every_convention,
+            with_buzz=with_buzz,
+        )
     print_result(found, as_json=as_json)
 
 
-def _judge_passive(
-    system: CompiledSystem, method: str, box: tuple[str, ...], *, every_convention: bool, as_json: bool
-) -> None:
-    """Say whether a scene is stable with any passive hands."""
+def _judge_passive(system: CompiledSystem, asked: list[str], *, as_json: bool) -> None:
+    """Say whether a scene is stable with any passive hands; refuse what is asked for besides."""
     from apc.hands.passivity import passive_hands
 
-    asked = {"--method": method != AUTO, "--box": bool(box), "--conventions": every_convention}
-    for option in (name for name, given in asked.items() if given):
+    for option in asked:
         what = f"{option} and --hands passive don't go together: what hands can draw has no modes of its own"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint=f"--hands clamped {option}"))
     print_result(passive_hands(system), as_json=as_json)

@@ -1,8 +1,8 @@
 """A whole system as few and small loops instead of one large one.
 
 Takes: the groups of equal peers of a scene, and the exchange between them.
-Gives: `Split`, `split`; `Arrangement`, `arrange`; `complete_loops`, `dense_loop`, `dense`,
-`split_exchangeable`; `couple`, `complete_degrees`.
+Gives: `Split`, `split`; `Arrangement`, `arrange`; `loops_at_right_angles`; `complete_loops`, `dense_loop`,
+`dense`, `split_exchangeable`; `couple`, `complete_degrees`.
 Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
 `dense`, whatever the number of peers. Weights are exact; a mean over nobody, or of weights that add up to 0,
 raises.
@@ -106,6 +106,32 @@ def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
         note = f"{len(parts)} systems, as peers that can change places move alike or apart"
         return Arrangement("modes", parts, (note,))
     return Arrangement("dense", parts, (f"all peers as one system: {reason}",))
+
+
+def loops_at_right_angles(
+    groups: Sequence[PeerGroup], exchange: Exchange, most: int
+) -> tuple[Loop, ...] | str:
+    """Split a scene into loops at right angles to one another, all peers alike the first, or say why not.
+
+    Parameters
+    ----------
+    groups, exchange
+        As for `split`.
+    most
+        How many peers on a graph that isn't complete are not too many.
+    """
+    graphs = {way.link for way in used_ways(group.schedule for group in groups)}
+    graphs = {link for link in graphs if not exchange.is_complete(link)}
+    if not graphs:
+        return complete_loops(groups, exchange)
+    count = sum(group.count for group in groups)
+    if count > most:
+        return f"{count:,} peers on a graph that is not complete are too many: {most} are the most"
+    if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
+        found = arrange(groups, exchange)
+        if found.method == "modes":
+            return found.loops
+    return split_exchangeable(dense_loop(groups, exchange), exchange)
 
 
 def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:

@@ -36,10 +36,9 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
 from apc.eigen.dissipation import peak_gain, proves_gain
 from apc.eigen.enclosure import enclose_eigenvalues
-from apc.eigen.modes import arrange, complete_loops, dense_loop, split_exchangeable
-from apc.eigen.peer_group import PeerGroup, used_ways
+from apc.eigen.modes import loops_at_right_angles
+from apc.eigen.peer_group import PeerGroup
 from apc.frame.discretize import UNIT
-from apc.frame.exchange import Exchange
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way
 from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
@@ -182,7 +181,9 @@ def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts | str:
         As for `worst_case`.
     """
     scene = held_scene(system, prepared)
-    loops = scene if isinstance(scene, str) else _loops(scene.groups, scene.exchange)
+    loops = (
+        scene if isinstance(scene, str) else loops_at_right_angles(scene.groups, scene.exchange, MOST_STATES)
+    )
     if isinstance(scene, str) or isinstance(loops, str):
         return str(loops)
     lossy = scene.lossy
@@ -196,22 +197,6 @@ def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts | str:
             return "a packet follows from another one of its frame"
         parts.append(part)
     return HeldParts(tuple(parts), weight)
-
-
-def _loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...] | str:
-    """Split a scene into loops at right angles to one another, all peers alike the first, or say why not."""
-    graphs = {way.link for way in used_ways(group.schedule for group in groups)}
-    graphs = {link for link in graphs if not exchange.is_complete(link)}
-    if not graphs:
-        return complete_loops(groups, exchange)
-    count = sum(group.count for group in groups)
-    if count > MOST_STATES:
-        return f"{count:,} peers on a graph that is not complete are too many: {MOST_STATES} are the most"
-    if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
-        found = arrange(groups, exchange)
-        if found.method == "modes":
-            return found.loops
-    return split_exchangeable(dense_loop(groups, exchange), exchange)
 
 
 def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> HeldPart | None:

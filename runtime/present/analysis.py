@@ -12,7 +12,7 @@ import math
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from math import isnan
+from math import floor, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from apc.analysis.conventions import Conventions, Outcome
     from apc.analysis.needs import Needs, SiteNeeds
     from apc.analysis.paper import NamedMatrix, PaperRoute
+    from apc.analysis.switching import Switching
     from apc.answer import Answer
     from apc.compiler.compiled import CompiledSystem
     from apc.eigen.spectrum import Mode
@@ -44,6 +45,7 @@ HEADINGS = ("magnitude", "shape", "times", "frequency", "damping", "moves most")
 LINEARIZED = ", linearized at its start"
 
 MOST_NAMED = 30  # columns of a contact mode's name; a longer one has a line of its own
+NOT_PLAYED = "not predicted and played: --buzz"
 SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
 
 _NOUNS = {"determinant": "determinant", "krylov": "sparse system"}
@@ -163,6 +165,10 @@ def answer_text(found: Answer) -> str:
         parts.insert(0, str(found.network))
     if found.contact_modes is not None:
         parts.append(str(found.contact_modes))
+    if found.switching is not None:
+        parts.append(str(found.switching))
+    if found.buzz is not None:
+        parts.append(str(found.buzz))
     if found.detailed:
         parts.append(str(found.conventions))
     elif found.conventions.warning:
@@ -180,6 +186,9 @@ def answer_document(found: Answer) -> dict[str, Any]:
         "margins": document(found.margins.rows),
         "margins_note": found.margins.note,
         "contact_modes": found.contact_modes.to_dict() if found.contact_modes else None,
+        "switching": found.switching.to_dict() if found.switching else None,
+        "buzz": found.buzz.to_dict() if found.buzz else None,
+        "buzz_note": "" if found.buzz else NOT_PLAYED,
         "warnings": [found.conventions.warning] if found.conventions.warning else [],
     }
     if found.detailed:
@@ -364,6 +373,26 @@ def contact_modes_document(found: ContactModes) -> dict[str, Any]:
         "modes": [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes],
         "notes": list(found.notes),
     }
+
+
+def switching_text(found: Switching) -> str:
+    """Return whether contacts may open and close at will, in words."""
+    reach = found.reach
+    if found.stable:
+        said = "proved stable by the circle criterion"
+    else:
+        said = f"{'cannot be proved' if found.stable is False else 'not decided'}: {found.reason}"
+    if reach is not None and math.isfinite(reach):
+        times = f"{floor(reach * 10**DECIMALS) / 10**DECIMALS:.6g}"
+        said += f"; the criterion holds for contacts up to {times} times as stiff"
+    elif reach is not None:
+        said += "; the criterion holds however stiff the contacts"
+    return "\n".join(wrapped(f"{found.topology}, contacts that open and close at will: {said}", "", "  "))
+
+
+def switching_document(found: Switching) -> dict[str, Any]:
+    """Return whether contacts may open and close at will, as plain data."""
+    return {"stable": found.stable, **document(found)}
 
 
 def _analysed(found: ContactMode | Outcome, instead: dict[str, Any], *more: str) -> dict[str, Any]:

@@ -19,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.timings import part
-from apc.compiler.words import counted, wrapped
+from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
-from apc.present.forms import document, json_text
+from apc.present.forms import document, json_text, note
 from apc.present.pictures import check_format, write_figure
 from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
+    from apc.simulation.buzz import Buzz
     from apc.simulation.ensemble import Ensemble, MeanSquare, Statistics
     from apc.simulation.signals import Signal
     from apc.simulation.trajectory import Played, Provenance, Trajectory
@@ -59,6 +60,33 @@ _WORDS = {
     "moves on": "At the end some position still moves on.",
     "diverges": "{stopped} leaves the range of numbers after {stopped_at}.",
 }
+
+
+def buzz_text(found: Buzz) -> str:
+    """Return a buzz as it is predicted beside what was played."""
+    known = found.predicted
+    played = in_hertz(found.lines[0].frequency_hz) if found.lines else "–"
+    title = f"{found.topology}: the buzz of its contacts, predicted beside {found.played_s:g} s played"
+    rows = [("frequency", in_hertz(known.frequency_hz) if known else "–", played)]
+    share = f"{known.in_contact:.1%}" if known else "–"
+    for one in found.contacts:
+        depth = "–" if one.predicted_depth_m is None else f"{one.predicted_depth_m * 1e3:.4g} mm"
+        rows += [
+            (f"{one.name}: depth", depth, f"{one.depth_m * 1e3:.4g} mm"),
+            (f"{one.name}: in contact", share, f"{one.in_contact:.1%}"),
+        ]
+    width = max(len(name) for name, _, _ in rows)
+    lines = [*wrapped(title), "", f"  {'':<{width}}  {'predicted':>10}  {'played':>10}"]
+    lines += [f"  {name:<{width}}  {one:>10}  {other:>10}" for name, one, other in rows]
+    for text in (*((found.reason,) if found.reason else ()), *found.notes):
+        lines += note(text)
+    return "\n".join(lines)
+
+
+def buzz_document(found: Buzz) -> dict[str, Any]:
+    """Return a buzz as plain data."""
+    told: dict[str, Any] = document(found)
+    return told
 
 
 def played_text(found: Played) -> str:

@@ -1,0 +1,126 @@
+"""The buzz of one-sided contacts, predicted: their describing function in the linear loop.
+
+Takes: a `CompiledSystem` whose peers have one-sided contacts.
+Gives: `Predicted`, `predict`; `gain_of`, `load_of`.
+Guarantees: the gain at which the loop is marginal is found to rounding.
+Does not: see a second frequency, or that contacts share a motion otherwise than their loads; say whether the
+motion gets there (play it: see `simulation.buzz`).
+
+A contact f = max(0, y) that moves as y = Y (β + cos ωt), −1 < β < 1, pushes at ω as a linear one of the gain
+g(β), on the mean by Y m(β), and is closed for the share s(β) of the time (Gelb and Vander Velde, 1968):
+
+    g = ½ + [asin β + β √(1 − β²)]/π    m = [√(1 − β²) + β (π/2 + asin β)]/π    s = ½ + asin(β)/π
+
+All contacts move with one β where each moves as far as its load presses: g(β) is then the gain at which the
+loop with linear contacts is marginal, ω its frequency, and Y m(β) the load.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+
+from apc.analysis.opened import with_gain
+from apc.analysis.pushes import Push
+from apc.compiler.compiled import CompiledSystem
+from apc.eigen.closing import close_loop
+from apc.eigen.modes import arrange
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.spectrum import Spectrum, solve_spectrum
+from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.parameters import resolve
+
+# Gains tried between 0 and 1 on the way from 1 down, and halvings of the cell where the radius crosses 1.
+CELLS, HALVINGS = 32, 50
+
+# A motion slower than this part of a turn a frame doesn't swing.
+STILL = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """A limit cycle as the describing function has it.
+
+    `gain` is the share of the contact's stiffness at which the loop is marginal, `bias` β, `in_contact` the
+    share of the time. `attracts` says that the motion comes back to it: with contacts always closed it is
+    unstable, with weaker ones stable; otherwise what swings less dies out, and what swings more grows.
+    """
+
+    frequency_hz: float
+    gain: float
+    bias: float
+    in_contact: float
+    attracts: bool
+
+    @property
+    def peak_to_peak(self) -> float:
+        """What a contact's y swings by, in all, under a load of 1."""
+        return 2 / load_of(self.bias)
+
+
+def gain_of(bias: float) -> float:
+    """Return g(β)."""
+    return 0.5 + (math.asin(bias) + bias * math.sqrt(1 - bias * bias)) / math.pi
+
+
+def load_of(bias: float) -> float:
+    """Return m(β)."""
+    return (math.sqrt(1 - bias * bias) + bias * (math.pi / 2 + math.asin(bias))) / math.pi
+
+
+def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ...]]]) -> Predicted | str:
+    """Predict the buzz of a scene, or say why there is none to predict.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    groups
+        From `opened.contact_groups`.
+    """
+    exchange = build_exchange(system, resolve(system).timings)
+
+    def at(gain: float) -> Spectrum:
+        return _spectrum(groups, exchange, gain)
+
+    closed = at(1.0).spectral_radius
+    above = 1.0
+    for cell in range(CELLS - 1, 0, -1):
+        below = cell / CELLS
+        if (at(below).spectral_radius > 1) != (closed > 1):
+            break
+        above = below
+    else:
+        word = "unstable" if closed > 1 else "stable"
+        return f"no buzz: with contacts of any part of their stiffness it is {word}"
+    for _ in range(HALVINGS):
+        middle = (below + above) / 2
+        if not below < middle < above:
+            break
+        if (at(middle).spectral_radius > 1) == (closed > 1):
+            above = middle
+        else:
+            below = middle
+    found = at(above)
+    frequency = max(
+        (mode.frequency_hz for mode in found.modes if abs(mode.magnitude - 1) < STILL), default=0.0
+    )
+    if not frequency:
+        return f"no buzz: with contacts of {above:.6g} of their stiffness it drifts away without swinging"
+    bias = _bias(above)
+    return Predicted(frequency, above, bias, 0.5 + math.asin(bias) / math.pi, closed > 1)
+
+
+def _spectrum(groups: list[tuple[PeerGroup, tuple[Push, ...]]], exchange: Exchange, gain: float) -> Spectrum:
+    """Solve the scene with linear contacts of a part of their stiffness."""
+    weaker = [with_gain(group, pushes, Fraction(gain)) for group, pushes in groups]
+    return solve_spectrum([close_loop(loop) for loop in arrange(weaker, exchange).loops])
+
+
+def _bias(gain: float) -> float:
+    """Return the β of a gain, which grows with it."""
+    low, high = -1.0, 1.0
+    while low < (middle := (low + high) / 2) < high:
+        low, high = (middle, high) if gain_of(middle) < gain else (low, middle)
+    return high

@@ -1,0 +1,153 @@
+"""What a switching part makes of the motion: the number it follows, and whether its force is in a sector.
+
+Takes: a `SwitchedKind`, a `SwitchingPart` of it, a parameter vector.
+Gives: `Push`, `push_of`.
+Guarantees: what is called a sector is one between any two points: f = φ(y) with 0 ≤ Δφ ≤ Δy, y a linear
+combination of states, holds and memories at a tick; found in the equations, whatever the part is called.
+Does not: serve forces that act at every moment.
+
+y is measured as the part's own force: φ has slope 1 where it is on. A one-sided spring f = K max(0, d) has
+y = K d and φ(y) = max(0, y).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.switches import SwitchedKind, SwitchingPart
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.start import start_values
+
+Floats = NDArray[np.float64]
+
+# What rounding may make of a slope or value that is computed from a few others, relatively.
+ROUNDED = 1e-9
+
+# How far from its breaks a force is looked at, in sizes of what it is made of.
+FAR = 3.0
+NEAR_AND_FAR = (-FAR, -1.0, -0.5, -0.1, 0.1, 0.5, 1.0, FAR)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Push:
+    """A part's force: output `output` of clock partition `partition`, y where it is on.
+
+    y = `slopes` · (x, u, m) + `offset`; the first `states` slopes are those of x. `sector` is "" where the
+    force is φ(y) in a sector, else says why not. `one_sided` says that, along its slopes, it is max(0, y).
+    """
+
+    part: str
+    partition: int
+    output: int
+    slopes: Floats  # (n_x + n_u + n_m,)
+    offset: float
+    states: int
+    sector: str
+    one_sided: bool
+
+
+def push_of(
+    switched: SwitchedKind, part: SwitchingPart, site: SiteJacobians, parameters: Floats
+) -> Push | str:
+    """Return a part's force where it is on, or why it is none that is computed from tick to tick.
+
+    Parameters
+    ----------
+    switched, part
+        The kind with its decisions, and one of its parts.
+    site
+        The kind's Jacobians.
+    parameters
+        The vector (n_p,) of a peer.
+    """
+    symbols = [switched.decisions[place].symbol for place in part.decisions]
+    touched = [
+        (one, row)
+        for one in switched.functions
+        for row in range(one.output.numel())
+        if any(casadi.depends_on(one.output[row], symbol) for symbol in symbols)
+    ]
+    if any(one.where[0] == "derivative" for one, _ in touched):
+        return f"{part.name} acts at every moment, not from tick to tick"
+    if any(one.where[0] != "tick" for one, _ in touched):
+        return f"{part.name} depends on each of the others by itself"
+    if len(touched) > 1:
+        return f"{part.name} is more than one force"
+    (opened, row), partition = touched[0], touched[0][0].where[1]
+    *inputs, heard, p, t = opened.inputs
+    moving = casadi.vertcat(*inputs)
+    guards = [switched.decisions[place].guard for place in part.decisions]
+    everything = casadi.vertcat(opened.output[row], *guards)
+    if casadi.depends_on(everything, heard) or casadi.depends_on(everything, t):
+        return f"{part.name} depends on what is heard or on time"
+    slopes = casadi.jacobian(everything, moving)
+    if casadi.depends_on(slopes, moving):
+        return f"{part.name} is not linear where it pushes"
+    others = [one.symbol for place, one in enumerate(switched.decisions) if place not in part.decisions]
+    if any(casadi.depends_on(everything, other) for other in others):
+        return f"{part.name} depends on what another part decides"
+    decided = casadi.vertcat(*symbols)
+    pieces = casadi.Function("pieces", [moving, p, decided], [everything, casadi.densify(slopes)])
+    x, u, m = start_values(site, parameters.tolist())
+    start = np.array([*x, *u, *m[partition]], dtype=np.float64)
+
+    def piece(setting: Sequence[bool]) -> tuple[Floats, Floats]:
+        """Return force and guards at the start with these decisions, and their slopes."""
+        values, slopes = pieces(start, parameters, [float(one) for one in setting])
+        return np.asarray(values).ravel(), np.asarray(slopes).reshape(-1, len(start))
+
+    values, steepest = piece(part.on)
+    line, square = steepest[0], float(steepest[0] @ steepest[0])
+    if not square or not np.isfinite(square):
+        return f"{part.name} follows no motion"
+    offset = float(values[0] - line @ start)
+    tick, sizes = switched.kind.clocks[partition].tick, [one.numel() for one in inputs]
+
+    def force_at(y: float) -> float:
+        """Return the force where y is so much, by a motion along its slopes."""
+        at = np.split(start + (y - offset - line @ start) / square * line, np.cumsum(sizes)[:-1])
+        return float(np.asarray(tick(*at, [0.0] * heard.numel(), parameters, 0.0)).ravel()[row])
+
+    breaks, alone = [], True
+    for setting in itertools.product((False, True), repeat=len(symbols)):
+        values, slopes = piece(setting)
+        along = slopes @ line / square
+        aside = np.abs(slopes - along[:, None] * line).max(axis=1)
+        alone = alone and not (aside > ROUNDED * np.abs(slopes).max(axis=1)).any()
+        at = values - along * (line @ start + offset)
+        breaks += [-float(at[k] / along[k]) for k in range(1, len(along)) if along[k]]
+    size = max(float(np.abs(line) @ np.abs(start)), *map(abs, (*breaks, offset))) or 1.0
+    sector = "depends on more than one number, such as a depth and its rate"
+    if alone and breaks:
+        sector = _sector(force_at, sorted(breaks), size)
+    off = [abs(force_at(by * size) - max(by, 0) * size) for by in NEAR_AND_FAR]
+    return Push(
+        *(part.name, partition, row, line, offset, sizes[0]),
+        sector=sector and f"{part.name} {sector}",
+        one_sided=max(off) <= ROUNDED * size,
+    )
+
+
+def _sector(force_at: Callable[[float], float], breaks: Sequence[float], size: float) -> str:
+    """Say why a force that is straight between its breaks is in no sector, "" if it is.
+
+    `size` is that of the numbers y is made of.
+    """
+    ends = [one for k, one in enumerate(breaks) if not k or one - breaks[k - 1] > ROUNDED * size]
+    lines = []
+    for low, high in itertools.pairwise([ends[0] - FAR * size, *ends, ends[-1] + FAR * size]):
+        one, other = low + (high - low) / 3, high - (high - low) / 3
+        slope = (force_at(other) - force_at(one)) / (other - one)
+        lines.append((slope, force_at(one) - slope * one))
+    if any(not -ROUNDED <= slope <= 1 + ROUNDED for slope, _ in lines):
+        return "falls, or grows faster in some piece than where it is on"
+    for at, (before, after) in zip(ends, itertools.pairwise(lines), strict=True):
+        if abs((before[0] - after[0]) * at + before[1] - after[1]) > ROUNDED * size:
+            return "jumps"
+    return ""

@@ -1,0 +1,295 @@
+"""The buzz of one-sided contacts: as the describing function predicts it, beside the same played in time.
+
+Takes: a `CompiledSystem` whose peers have one-sided contacts.
+Gives: `Line`, `ContactBuzz`, `Played`, `Buzz`, `buzz`.
+Guarantees: what is predicted always stands beside what was played; where more than one line stands in the
+spectrum, it says so.
+Does not: find every motion: it plays one start, the scene's own.
+
+The loads that the prediction needs are the mean pushes of the motion that was played.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared, prepare
+from apc.analysis.contact_modes import EVERYONE, ContactModes, contact_modes
+from apc.analysis.describing import Predicted, predict
+from apc.analysis.opened import contact_groups
+from apc.analysis.pushes import Push
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.timings import part
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.rigid import LENGTHS
+from apc.frame.exchange import build_exchange
+from apc.frame.parameters import resolve
+from apc.result import Result
+from apc.simulation.trajectory import Trajectory, simulate
+
+Floats = NDArray[np.float64]
+
+# How long is played: so many times as the swing with contacts closed takes to grow or shrink by e, within
+# these seconds; and the part of it, at the end, that is measured.
+GROWTHS, SHORTEST, LONGEST, MEASURED = 40, 8.0, 80.0, 4
+
+# Peers whose contacts are measured; ticks of all peers that are played, some ten seconds' worth.
+MOST_PEERS, MOST_PLAYED = 20, 2 * 10**7
+
+# A swing below this part of the depth is none. If it changes by more than this over what is measured, it has
+# not come to its end.
+QUIET, SETTLED = 1e-4, 0.02
+
+# Lines looked for, each with so many multiples, and the least beside the largest that is a second one: what a
+# steady swing leaves after its own frequency and its multiples is far less. Of two lines sums and differences
+# of so many times each are no third.
+MOST_LINES, MULTIPLES, SECOND, MIXED = 6, 12, 0.1, 3
+
+BY_CHANCE = "predicted with every packet on time, played with lost and late ones"
+
+# Points of a spectrum between two frequencies that can be told apart.
+FINER = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A frequency of the depth that swings most, and its amplitude in m, its multiples left out."""
+
+    frequency_hz: float
+    amplitude_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ContactBuzz:
+    """A contact as it was played, and its depth as predicted under its load.
+
+    `load_n` is its mean push; `depth_m` is from the least to the largest, `in_contact` the share of the time
+    in which it pushes. `predicted_depth_m` is None where nothing is predicted.
+    """
+
+    name: str
+    load_n: float
+    depth_m: float
+    in_contact: float
+    predicted_depth_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Buzz(Result):
+    """A limit cycle of contacts, predicted and played for `played_s` seconds.
+
+    `predicted` is None where `reason` says why. `lines` are those of the spectrum, the largest first, none
+    where the motion comes to rest or still changes; `steady` says whether it goes on as it is; `bounded`,
+    whether it was played to its end. `notes` say what the prediction is worth.
+    """
+
+    shown_by = "simulation:buzz"
+
+    topology: str
+    predicted: Predicted | None
+    reason: str
+    played_s: float
+    bounded: bool
+    steady: bool
+    lines: tuple[Line, ...]
+    contacts: tuple[ContactBuzz, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Measured:
+    """A contact of one peer: the names of the states its depth is of, their factors, and its push."""
+
+    name: str
+    states: tuple[str, ...]
+    factors: Floats
+    offset: float
+    stiffness: float
+
+
+@part("buzz")
+def buzz(
+    system: CompiledSystem, *, prepared: Prepared | None = None, modes: ContactModes | None = None
+) -> Buzz:
+    """Predict the buzz of a scene's one-sided contacts, and play it.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    prepared
+        From `analysis.prepare`, of this system with these timings.
+    modes
+        Its modes of contact, if they are known.
+
+    Raises
+    ------
+    ApcError
+        E864 no contact that pushes from tick to tick and never pulls; and those of `trajectory.simulate`.
+    """
+    prepared = prepared or prepare(system)
+    groups = contact_groups(system, prepared)
+    if isinstance(groups, str):
+        raise _refused(system, groups)
+    if not any(pushes for _, pushes in groups):
+        raise _refused(system, "nothing touches")
+    for _, pushes in groups:
+        for one in pushes:
+            if not one.one_sided:
+                raise _refused(system, f"{one.part} pulls, too, or is limited")
+    measured = _contacts(system, groups)
+    predicted = predict(system, groups)
+    seconds = _seconds(system, prepared, modes)
+    names = [one.name for one in measured] + [state for one in measured for state in one.states]
+    played = simulate(system, duration=seconds, signals=tuple(dict.fromkeys(names)))
+    found = _compare(system.name, predicted, played, measured)
+    if all(link.channel is None for link in system.links):
+        return found
+    return replace(found, notes=(*found.notes, BY_CHANCE))
+
+
+def _seconds(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None) -> Fraction:
+    """Return how long to play: until the swing has come to what it is, if that can be waited for."""
+    modes = modes or contact_modes(system, prepared=prepared)
+    radius = next((mode.spectral_radius for mode in modes.modes if mode.name == EVERYONE), 1.0)
+    frame = float(prepared.schedules[0].frame_s)
+    rate = abs(math.log(radius)) / frame if 0 < radius < math.inf else 0.0
+    wanted = min(max(GROWTHS / rate if rate else math.inf, SHORTEST), LONGEST)
+    timings = {one.name: one.value for one in system.timings}
+    tick = min(float(timings[clock.period]) for clock in system.clocks)
+    most = MOST_PLAYED * tick / system.peers
+    if most < SHORTEST:
+        raise _refused(system, f"{system.peers:,} peers are too many to play for {SHORTEST:g} s")
+    return Fraction(math.floor(min(wanted, most)))
+
+
+def _refused(system: CompiledSystem, why: str) -> ApcError:
+    what = f"no buzz to predict: {why}"
+    return ApcError(Mistake("E864", Place(system.name), what, hint="apc simulate"))
+
+
+def _contacts(
+    system: CompiledSystem, groups: Sequence[tuple[PeerGroup, tuple[Push, ...]]]
+) -> list[_Measured]:
+    """Return the contacts that are measured, those of the first peers of each group."""
+    exchange = build_exchange(system, resolve(system).timings)
+    each = max(1, MOST_PEERS // len(groups))
+    found = []
+    for group, pushes in groups:
+        for peer in list(group.peers[:each]):
+            name = exchange.peer_name(int(peer))
+            for one in pushes:
+                states = group.jacobians.kind.states
+                places = [k for k, state in enumerate(states) if state.unit == LENGTHS[0] and one.slopes[k]]
+                if one.slopes[one.states :].any() or not places:
+                    raise _refused(system, f"{one.part} follows more than positions and velocities")
+                stiffness = float(np.abs(one.slopes[places]).max())
+                found.append(
+                    _Measured(
+                        f"{name}.{one.part}",
+                        tuple(f"{name}.{states[k].name}" for k in places),
+                        one.slopes[places] / stiffness,
+                        one.offset / stiffness,
+                        stiffness,
+                    )
+                )
+    return found
+
+
+def _compare(
+    topology: str, predicted: Predicted | str, played: Trajectory, measured: Sequence[_Measured]
+) -> Buzz:
+    """Lay what is predicted beside what was played."""
+    known = predicted if isinstance(predicted, Predicted) else None
+    first = len(played.time) - len(played.time) // MEASURED
+    bounded = not played.summary.stopped
+    time = played.time[first:]
+    depths = [
+        one.offset + sum(f * played[state][first:] for f, state in zip(one.factors, one.states, strict=True))
+        for one in measured
+    ]
+    pushes = [played[one.name][first:] for one in measured]
+    window = np.hanning(len(time))
+    loads = [float(push @ window / window.sum()) for push in pushes]
+    contacts = tuple(
+        ContactBuzz(
+            name=one.name,
+            load_n=load,
+            depth_m=float(np.ptp(depth)),
+            in_contact=float((push > 0).mean()),
+            predicted_depth_m=known.peak_to_peak * load / one.stiffness if known else None,
+        )
+        for one, load, depth, push in zip(measured, loads, depths, pushes, strict=True)
+    )
+    swing = max(depths, key=lambda one: float(np.ptp(one)))
+    halves = [float(np.ptp(half)) for half in np.array_split(swing, 2)]
+    size = max(load / one.stiffness for load, one in zip(loads, measured, strict=True))
+    quiet = float(np.ptp(swing)) <= QUIET * size
+    steady = bounded and (quiet or abs(halves[1] - halves[0]) <= SETTLED * max(halves))
+    lines = _lines(time, swing) if steady and not quiet else ()
+    reason = "" if known else str(predicted)
+    notes = tuple(_notes(known, bounded=bounded, steady=steady, lines=lines))
+    end = float(played.time[-1])
+    return Buzz(topology, known, reason, end, bounded, steady, lines, contacts, notes)
+
+
+def _notes(known: Predicted | None, *, bounded: bool, steady: bool, lines: Sequence[Line]) -> list[str]:
+    """Say what a prediction is worth beside what was played."""
+    found = []
+    if not bounded:
+        found.append("the motion played leaves every bound: it comes to no cycle")
+    elif not steady:
+        found.append("the motion played still changes at its end: its figures are those of its last part")
+    if len(lines) > 1:
+        several = " and ".join(f"{line.frequency_hz:.4g} Hz" for line in lines)
+        found.append(
+            f"lines stand in the spectrum at {several}, none of which repeats another: one sinusoid says "
+            "nothing of such a motion, and what was played counts"
+        )
+    if known and not known.attracts:
+        found.append("the cycle predicted is one that motions leave: what swings less dies out, more grows")
+    if known and known.attracts and steady and not lines:
+        found.append("the motion played came to rest and does not show the cycle predicted")
+    if not known and lines:
+        found.append("it buzzes all the same, in a way that one sinusoid does not describe")
+    return found
+
+
+def _lines(time: Floats, values: Floats) -> tuple[Line, ...]:
+    """Return the lines of a spectrum, multiples of each and mixtures of two left out."""
+    step = float(time[-1] - time[0]) / (len(time) - 1)
+    at, left = time - time[0], values - values.mean()
+    window, size = np.hanning(len(time)), FINER * len(time)
+    apart = 2 / (step * len(time))  # what a window of this length tells apart
+    found: list[Line] = []
+    for _ in range(MOST_LINES):
+        spectrum = np.abs(np.fft.rfft(left * window, size))
+        place = int(np.argmax(spectrum[1:-1])) + 1
+        near = np.log(spectrum[place - 1 : place + 2])
+        aside = 0.5 * (near[0] - near[2]) / (near[0] - 2 * near[1] + near[2])
+        frequency = float(place + aside) / (size * step)
+        multiples = np.arange(1, min(MULTIPLES, max(1, math.floor(0.5 / (step * frequency)))) + 1)
+        angles = 2 * np.pi * frequency * np.outer(at, multiples)
+        basis = np.hstack([np.cos(angles), np.sin(angles), np.ones((len(at), 1))])
+        factors = np.linalg.lstsq(basis, left, rcond=None)[0]
+        amplitude = float(np.hypot(factors[0], factors[len(multiples)]))
+        if found and amplitude < SECOND * found[0].amplitude_m:
+            break
+        if not _is_mixed(frequency, [line.frequency_hz for line in found], apart):
+            found.append(Line(frequency, amplitude))
+        left = left - basis @ factors
+    return tuple(found)
+
+
+def _is_mixed(frequency: float, known: Sequence[float], apart: float) -> bool:
+    """Say whether a frequency is one that is known, or a sum or difference of a few times two of these."""
+    times = range(-MIXED, MIXED + 1)
+    sums = {i * one + j * other for one in known for other in known for i in times for j in times}
+    return any(abs(frequency - one) < apart for one in sums)
