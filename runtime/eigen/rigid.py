@@ -489,7 +489,7 @@ def _null_space(equations: Sequence[Form], size: int, *, split: int, known: int)
 
     Notes
     -----
-    What two unknowns or one determine is put in its place first: a chain of a thousand masses is nothing else.
+    What two unknowns or one determine is put in its place first: a chain of masses is nothing else.
     """
     rows, bound = _substituted(equations)
     left = [unknown for unknown in range(size) if unknown not in bound]

@@ -109,9 +109,7 @@ def turns(
     return found
 
 
-def _mirrored(
-    start: Complexes, heard: Complexes, states: Integers, values: Complexes
-) -> NDArray[np.bool_]:
+def _mirrored(start: Complexes, heard: Complexes, states: Integers, values: Complexes) -> NDArray[np.bool_]:
     """Say which modes (k,) are the one before seen in a mirror: its conjugate."""
     found = np.zeros(len(values), dtype=np.bool_)
     found[1:] = (values[:-1].imag > 0) & (values[1:] == values[:-1].conj()) & (states[1:] == states[:-1])
