@@ -33,7 +33,7 @@ FIRST = 1 / 4
 # Each bracket that fails is followed by one so much wider, so many times.
 WIDER, TRIES = 16.0, 8
 
-# Bits tried in turn at one end of a bracket; with fewer a state the coefficients of the polynomial seldom tell.
+# Bits tried in turn at one end of a bracket; with fewer a state the polynomial's coefficients seldom tell.
 PRECISIONS = (128, 256, 512, 1024)
 BITS_A_STATE = 6
 
