@@ -221,7 +221,9 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--methods", default="auto", help="auto,dense,determinant,krylov")
-    parser.add_argument("--every", type=int, default=200, help="scenes from one running tally to the next")
+    parser.add_argument(
+        "--every", type=int, default=200, help="scenes from one running tally to the next, 0 for none"
+    )
     given = parser.parse_args()
     judge, tally, told = Judge(given.strict), Tally(), [0]
 
@@ -229,7 +231,7 @@ def main() -> None:
         for wrong in tally.wrong[told[0] :]:
             print(f"WRONG after {done:,}: {wrong}", file=sys.stderr, flush=True)
         told[0] = len(tally.wrong)
-        if done and done % given.every == 0:
+        if done and given.every and done % given.every == 0:
             print(f"{done:,} of {given.points:,}: {tally}", file=sys.stderr, flush=True)
 
     try:
