@@ -22,4 +22,6 @@ def users_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         # Nothing is said of how far work is, however long it takes.
         patch.setattr("apc.cli.progress.QUIET", float("inf"))
+        # Processes that tests start keep what Python compiled, as where apc is installed.
+        patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
         yield

@@ -73,8 +73,7 @@ ALONE = (2, 9, 14)
 
 
 @pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
-@pytest.mark.parametrize("more", ["", *ODD])
-@pytest.mark.parametrize("peers", [3, 7])
+@pytest.mark.parametrize(("peers", "more"), [*((3, more) for more in ("", *ODD)), (7, ""), (7, ODD[-1])])
 def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: str) -> None:
     starts = ", ".join(f"{place} mm" for place in range(peers))
     link = f"{LINK[:-1]}, {more}}}" if more else LINK

@@ -54,8 +54,8 @@ def test_a_delay_that_is_scanned_is_scanned_far_enough_or_said_not_to_be() -> No
     for one in margins(compiled(text)).rows:
         assert one.value is not None or one.scanned >= 1.5 * one.present
         assert one.note == ""
-    # 0.99 ms and 1 ms meet at every hundredth of a millisecond.
-    slow = replaced(text, ("network: 8 ms", "network: 0.99 ms"))
+    # 0.95 ms and 1 ms meet at every twentieth of a millisecond.
+    slow = replaced(text, ("network: 8 ms", "network: 0.95 ms"))
     found = margins(compiled(slow))
     row = next(one for one in found.rows if one.parameter == "lan.delay")
     assert row.value is None

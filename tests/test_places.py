@@ -110,9 +110,12 @@ def radius(folder: Path, place: tuple[str, str], **variables: str) -> float:
     return analyze(scene(folder, *place, **variables)).spectral_radius
 
 
-@pytest.mark.parametrize("place", PLACES)
-def test_an_expression_of_a_clock_means_what_a_variable_means(place: str, tmp_path: Path) -> None:
-    for expression, start in CLOCKED.items():
+@pytest.mark.parametrize(("number", "place"), list(enumerate(PLACES)))
+def test_an_expression_of_a_clock_means_what_a_variable_means(
+    number: int, place: str, tmp_path: Path
+) -> None:
+    """Every other expression in a place, the others in the next one: each stands in six or more."""
+    for expression, start in list(CLOCKED.items())[number % 2 :: 2]:
         variables = {"clocked": expression, "start": start, "continuous": "a.x"}
         written = radius(tmp_path, PLACES[place](expression), **variables)
         named = radius(tmp_path, PLACES[place]("before"), **variables)

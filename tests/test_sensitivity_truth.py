@@ -63,7 +63,7 @@ def shipped(name: str) -> CompiledSystem:
     return compile_topology(SCENES / f"{name}.yaml")
 
 
-@pytest.mark.parametrize("seed", [3, 5, 8])
+@pytest.mark.parametrize("seed", [3, 5])
 def test_every_derivative_and_frequency_is_right_within_its_error(seed: int) -> None:
     assert run(3, seed=seed) == []
 
@@ -129,7 +129,7 @@ def test_a_row_says_what_setting_its_name_does(name: str) -> None:
 
 def test_a_row_says_what_setting_its_name_does_on_random_scenes() -> None:
     generator = random.Random(17)
-    for _ in range(5):
+    for _ in range(3):
         text = scene(generator)
         assert changed_by_a_percent(compiled(text)) == "", text
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,8 +41,14 @@ def source(text: str) -> Source:
     return parse_source(text.encode(), file="scene.yaml")
 
 
+@functools.cache
+def built_in() -> Library:
+    """Return the library that comes with apc, read once."""
+    return Library()
+
+
 def scene(text: str, library: Library | None = None) -> Scene:
-    return build_scene(source(text), library or Library())
+    return build_scene(source(text), library or built_in())
 
 
 def flat(text: str, library: Library | None = None) -> FlatSystem:
@@ -56,7 +63,9 @@ def ordered(text: str, library: Library | None = None) -> SortedSystem:
     return sort(clocked(text, library))
 
 
+@functools.lru_cache(maxsize=32)
 def compiled(text: str, library: Library | None = None) -> CompiledSystem:
+    """Compile a text; the same text gives the same model, with all that it keeps."""
     return build_functions(ordered(text, library), Origin("scene.yaml", ()))
 
 

@@ -35,6 +35,9 @@ from apc.frame.site import LinearSite, entrywise
 
 Balls = NDArray[Any]  # of flint.arb, and the integers 0 and 1 where these are exact
 
+# Products of matrices that take fewer of numbers are not worth matrices of python-flint.
+FEW_PRODUCTS = 4096
+
 # [F G] by duration in quanta, for one site.
 Steps = Mapping[int, Balls]
 
@@ -202,8 +205,23 @@ def _surd_ball(surd: Surd) -> Any:
 
 
 def _multiply(matrix: Balls, rows: Balls) -> Balls:
-    """Return the product with a matrix that is mostly zeros, as rows may be; an exact zero is the integer."""
+    """Return the product with a matrix that is mostly zeros, as rows may be; an exact zero is the integer.
+
+    Enough balls are multiplied by python-flint at once; numbers with slopes, and few, one by one.
+    """
     product = np.zeros((len(matrix), rows.shape[1]), dtype=object)
+    if matrix.size * rows.shape[1] > FEW_PRODUCTS and _all_balls(matrix, rows):
+        left, right = _maybe(matrix), _maybe(rows)
+        between = np.flatnonzero(left.any(axis=0) & right.any(axis=1))
+        lines = np.flatnonzero(left[:, between].any(axis=1))
+        columns = np.flatnonzero(right[between].any(axis=0))
+        whole = _flint(matrix[np.ix_(lines, between)]) * _flint(rows[np.ix_(between, columns)])
+        found = np.empty(len(lines) * len(columns), dtype=object)
+        found[:] = whole.entries()
+        found = found.reshape(len(lines), len(columns))
+        found[~(left[np.ix_(lines, between)] @ right[np.ix_(between, columns)])] = 0
+        product[np.ix_(lines, columns)] = found
+        return product
     columns = rows.T.tolist()
     for line, entries in zip(product, matrix.tolist(), strict=True):
         used = [(row, entry) for row, entry in enumerate(entries) if not isinstance(entry, int) or entry]
@@ -217,12 +235,28 @@ def _multiply(matrix: Balls, rows: Balls) -> Balls:
     return product
 
 
+def _maybe(numbers: Balls) -> NDArray[np.bool_]:
+    """Say which of an array of numbers may be other than zero: all but exact zeros."""
+    known = [isinstance(one, int) and not one for one in numbers.ravel().tolist()]
+    return ~np.array(known, dtype=np.bool_).reshape(numbers.shape)
+
+
+def _all_balls(*blocks: Balls) -> bool:
+    """Say whether all numbers are balls or integers."""
+    return all({*map(type, block.ravel())} <= {flint.arb, int} for block in blocks)
+
+
+def _flint(block: Balls) -> Any:
+    """Return an array (n, m) of balls as a matrix of python-flint."""
+    return flint.arb_mat(*block.shape, block.ravel().tolist())
+
+
 BALLS = Arithmetic(_multiply, np.add, np.subtract, lambda value: value.astype(object))
 
 
 def square(balls: Balls) -> Any:
     """Return an array of balls as a matrix of python-flint."""
-    return flint.arb_mat(len(balls), len(balls), [flint.arb(entry) for entry in balls.ravel()])
+    return _flint(balls)
 
 
 def reduced_balls(matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: NDArray[np.intp]) -> Balls:

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.threads import load_pool
+
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Matrix = NDArray[Any]  # float64 or complex128
@@ -29,6 +31,9 @@ WORST = 1e10
 
 # What is smaller decides nothing; its derivative, one of a defective cluster at zero often, means nothing.
 SMALL = 0.05
+
+# A matrix of more states than this is worth the loading of SciPy.
+LARGE = 100
 
 # How far from the predicted eigenvalue inverse iteration is shifted, so that the matrix it inverts stays
 # regular. Each step leaves a share of about SHIFT/gap of the other vectors.
@@ -72,8 +77,12 @@ class Eigenpairs:
 def eigenpairs(matrix: Matrix) -> Eigenpairs:
     """Return all eigenvalues of matrices (…, n, n), in no order, and their vectors.
 
-    Right and left vectors are looked for apart, so that a defective cluster spoils none but its own.
+    Right and left vectors are looked for apart, so that a defective cluster spoils none but its own; of one
+    large matrix from the same triangular form, which is most of the work.
     """
+    if matrix.ndim == 2 and len(matrix) > LARGE:
+        found, left, right = load_pool("scipy.linalg").eig(matrix, left=True, check_finite=False)
+        return Eigenpairs(found.astype(np.complex128), right.astype(np.complex128), left.conj().T)
     values, right = (one.astype(np.complex128) for one in np.linalg.eig(matrix))
     return Eigenpairs(values, right, left_vectors(matrix, values))
 

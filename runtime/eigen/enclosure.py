@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.eigenpairs import Eigenpairs, left_vectors
+from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
 from apc.eigen.relative import independent_places
 from apc.frame.discretize import UNIT
@@ -38,6 +38,9 @@ SMALL = 1e-2
 # splits, this many; fewer of a matrix of more states, where each takes a second.
 WIDE = 1e-9
 SPLITS_TRIED, FEWER_SPLITS, MANY_STATES = 8, 2, 300
+
+# How much larger what drives a block of several may become where one beside it is scaled, see `_alone`.
+GROWN = 1024.0
 
 # Eigenvalues nearer to one another than this, relatively, are enclosed together: their own vectors are hardly
 # two.
@@ -97,10 +100,9 @@ def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
     """
     scale = balance(np.abs(matrix) + error)
     matrix, error = matrix / scale[:, None] * scale, error / scale[:, None] * scale
-    values, right = (part.astype(np.complex128) for part in np.linalg.eig(matrix))
-    order = np.lexsort((-values.imag, values.real, -np.abs(values)))
-    values, right = values[order], right[:, order]
-    left = left_vectors(matrix, values)
+    found = eigenpairs(matrix)
+    pairs = found.at(np.lexsort((-found.values.imag, found.values.real, -np.abs(found.values))))
+    values, right, left = pairs.values, pairs.right, pairs.left
     sizes = np.abs(values)
 
     # Splits between k and k + 1: conjugates stay together.
@@ -143,15 +145,70 @@ def _enclose(
     if found is None:
         return Enclosure(0.0, np.inf, np.full(n, np.inf))
     form, left_over = found
+    sizes, totals = _totals(left_over, label, large)
     # A block of one is its own centre.
-    centres, radii = np.diagonal(form).astype(np.complex128), _totals(left_over, label, large)
-    for block in _several(label[:large]):
-        centres[block], radii[block] = _blockdiscs(form[np.ix_(block, block)], float(radii[block[0]]))
+    centres, radii = np.diagonal(form).astype(np.complex128), totals.copy()
+    several = _several(label[:large])
+    for block in several:
+        centres[block], radii[block] = _blockdiscs(form[np.ix_(block, block)], float(totals[block[0]]))
     if large < n:
         own = form[large:, large:]
-        centres[large:] = 0.0
-        radii[large:] = pseudospectral_radius(own.real if np.isrealobj(matrix) else own, float(radii[-1]))
-    return discs(values, centres, radii)
+        small = own.real if np.isrealobj(matrix) else own
+        centres[large:], radii[large:] = 0.0, pseudospectral_radius(small, float(totals[-1]))
+    found = discs(values, centres, radii)
+    if not found.high - found.low > WIDE * max(found.low, 1.0) or not _apart(centres, radii)[:large].any():
+        return found
+    ones, grown = np.ones(n, dtype=np.bool_), radii.copy()
+    for block in several:
+        about, radius = _blockdiscs(form[np.ix_(block, block)], GROWN * float(totals[block[0]]))
+        ones[block], grown[block] = False, radius + np.abs(about - centres[block])
+    if large < n:
+        ones[large:], grown[large:] = False, pseudospectral_radius(small, GROWN * float(totals[-1]))
+    return discs(values, centres, _alone(centres, radii, ones, grown, sizes, totals))
+
+
+def _apart(centres: Complexes, radii: Floats) -> NDArray[np.bool_]:
+    """Say of each disc whether no other touches it."""
+    touching = np.abs(centres[:, None] - centres) <= radii[:, None] + radii
+    return np.asarray(touching.sum(axis=0) == 1)
+
+
+def _alone(
+    centres: Complexes,
+    radii: Floats,
+    ones: NDArray[np.bool_],
+    grown: Floats,
+    sizes: Floats,
+    totals: Floats,
+) -> Floats:
+    """Return the radii (n,) of discs, less where a disc of a block of one stands alone.
+
+    Parameters
+    ----------
+    centres, radii
+        The discs, one for each place.
+    ones, grown
+        Which are of blocks of one, and of the others the radius if their totals were `GROWN` times as large.
+    sizes, totals
+        See `_totals`.
+
+    Notes
+    -----
+    With block c scaled by 1/α > 1, the discs are those of G_cb α, and of G_bc / α for the others: c's shrinks
+    to ‖G_cc‖ + α Σ_b ‖G_cb‖, the first of which is all there is to first order, and the others grow. As long
+    as these keep clear of it, it holds one eigenvalue (Wilkinson, The Algebraic Eigenvalue Problem, 1965,
+    chapter 2), that of the disc before, which was clear of the others, too.
+    """
+    gap = np.abs(centres[:, None] - centres) * (1 - 8 * UNIT) - radii - grown[:, None]  # [b, c]
+    np.fill_diagonal(gap, np.inf)
+    room = np.where(ones[:, None], gap, ((GROWN - 1) * totals)[:, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(gap > 0, sizes / room, np.inf)
+    np.fill_diagonal(share, 0.0)
+    share = share.max(axis=0) * (1 + 8 * UNIT)
+    first = np.diagonal(sizes)
+    less = (first + share * (totals - first)) * (1 + 8 * UNIT)
+    return np.where(ones & (share < 1) & (less < radii), less, radii)
 
 
 def _basis(right: Complexes, left: Complexes, label: Places, large: int) -> Matrix | None:
@@ -188,15 +245,21 @@ def _block_diagonal(
         return None
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
     moved = matrix @ basis
-    product = inverse @ moved
-    form = np.where(label[:, None] == label, product, 0.0)
-    if np.isrealobj(matrix):  # the large ones are whole conjugate pairs, so what is left is real
-        form[large:, large:] = form[large:, large:].real
     size, weight = np.abs(basis), np.abs(inverse)
-    doubt = np.abs(moved - basis @ form) + error @ size
-    doubt += charge * (np.abs(matrix) @ size + size @ np.abs(form))
+    # What is outside the blocks is never asked for: nearly all of them are of one.
+    alone = np.einsum("ij,ji->i", inverse, moved)
+    form = np.diag(alone)
+    left, carried = moved - basis * alone, size * np.abs(alone)
+    for block in _blocks(label, large):
+        own = inverse[block] @ moved[:, block]
+        if block[0] == large and np.isrealobj(matrix):
+            own = own.real  # the large ones are whole conjugate pairs, so what is left is real
+        form[np.ix_(block, block)] = own
+        left[:, block] = moved[:, block] - basis[:, block] @ own
+        carried[:, block] = size[:, block] @ np.abs(own)
+    doubt = np.abs(left) + (error + charge * np.abs(matrix)) @ size + charge * carried
     # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
-    wrong = (np.abs(np.eye(n) - inverse @ basis) + charge * (weight @ size)).sum(axis=1)
+    wrong = np.abs(np.eye(n) - inverse @ basis).sum(axis=1) + charge * (weight @ size.sum(axis=1))
     defect = float(wrong.max(initial=0.0))
     if not defect < 0.5:
         return None
@@ -205,18 +268,26 @@ def _block_diagonal(
     return (form, left_over) if np.isfinite(left_over).all() else None
 
 
-def _totals(left_over: Floats, label: Places, large: int) -> Floats:
-    """Return Σ_b ‖G_cb‖ for the block c of every place, each norm that of Frobenius."""
+def _totals(left_over: Floats, label: Places, large: int) -> tuple[Floats, Floats]:
+    """Return ‖G_cb‖, that of Frobenius, for the blocks c and b of all places (n, n), and Σ_b of it (n,)."""
     n = len(left_over)
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
-    member = (label[:, None] == label).astype(np.float64)
     peak = float(left_over.max(initial=0.0))  # relative to it no square is lost
     squares = np.square(left_over / peak) if peak > 0 else left_over
-    sizes = peak * (1 + charge) * (np.sqrt(member @ squares @ member) + 1e-150)
+    for block in _blocks(label, large):
+        squares[block] = squares[block].sum(axis=0)
+        squares[:, block] = squares[:, block].sum(axis=1, keepdims=True)
+    sizes = peak * (1 + charge) * (np.sqrt(squares) + 1e-150)
     if large < n:
         sizes[large:, large:] = norms(left_over[large:, large:])  # often much less: few entries in a row
     first = label == np.arange(n)  # each block once
-    return np.asarray(sizes[:, first].sum(axis=1))
+    return sizes, np.asarray(sizes[:, first].sum(axis=1))
+
+
+def _blocks(label: Places, large: int) -> list[Places]:
+    """Return the places of each block of two or more, the small ones' last."""
+    small = np.arange(large, len(label))
+    return [*_several(label[:large]), *([small] if len(small) else [])]
 
 
 def _blockdiscs(block: Matrix, error: float) -> tuple[Complexes, float]:

@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
 
-# Rows of which columns are chosen one by one, each the best of all; of more, by a QR decomposition, which
+# Rows of which columns are chosen one by one, each the best of all; of more, by an LU decomposition, which
 # pivots on columns alone and costs a cube, not as many passes over all.
 MOST_PIVOTED = 64
 
@@ -65,8 +65,8 @@ def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
     """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
     if len(rows) > MOST_PIVOTED:
         scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        order = load_pool("scipy.linalg").qr(scaled, mode="r", pivoting=True, check_finite=False)[1]
-        return np.sort(order[: len(rows)]).astype(np.intp)
+        order = load_pool("scipy.linalg").lu(scaled.T, p_indices=True, check_finite=False)[0]
+        return np.flatnonzero(order < len(rows))
     left = np.array(rows)
     places: list[int] = []
     for _ in range(len(rows)):

@@ -261,7 +261,8 @@ def _combine(terms: Iterable[tuple[Any, Form]]) -> Form:
     """Return the sum of weight · form."""
     total: Form = {}
     for weight, form in terms:
-        _add(total, weight, form)
+        if weight:
+            _add(total, weight, form)
     return total
 
 
@@ -488,37 +489,94 @@ def _null_space(equations: Sequence[Form], size: int, *, split: int, known: int)
 
     Notes
     -----
-    Reduced with the unknowns in reverse order, each pivot is bound by unknowns before it; a free unknown
-    among the first `split` then stands for one vector, and the later free ones vanish on these.
+    What two unknowns or one determine is put in its place first: a chain of masses is nothing else.
     """
-    rows = [form for form in equations if any(form.values())]
-    if not size or (rows and _surely_none(rows, size, known)):
+    rows, bound = _substituted(equations)
+    left = [unknown for unknown in range(size) if unknown not in bound]
+    place_of = {unknown: place for place, unknown in enumerate(left)}
+    rows = [{place_of[unknown]: weight for unknown, weight in form.items()} for form in rows]
+    if not left or (rows and _surely_none(rows, len(left), known)):
         return []
+    free = _solutions(rows, len(left))
+    vectors = []
+    for solution in free:
+        vector = dict(zip(left, solution, strict=True))
+        # What stands for an unknown was put in its place later, or never.
+        for unknown, (weight, other) in reversed(bound.items()):
+            vector[unknown] = weight * vector[other] if weight else Fraction(0)
+        vectors.append([vector[unknown] for unknown in range(size)])
+    if not vectors:
+        return []
+    # Each vector begins with a 1, at an unknown that is 0 in all others.
+    reduced, rank = flint.fmpq_mat([[_fmpq(entry) for entry in vector] for vector in vectors]).rref()
+    basis = []
+    for line in range(rank):
+        vector = [Fraction(int(entry.p), int(entry.q)) for entry in (reduced[line, c] for c in range(size))]
+        if any(vector[:split]):
+            basis.append(vector)
+    return basis
+
+
+def _substituted(equations: Sequence[Form]) -> tuple[list[Form], dict[int, tuple[Fraction, int]]]:
+    """Return equations of three unknowns or more, and each unknown that others gave in terms of another.
+
+    Of those bound, in the order in which they were: a weight and the unknown that it stands before.
+    """
+    rows = [{unknown: Fraction(weight) for unknown, weight in form.items() if weight} for form in equations]
+    holding: dict[int, set[int]] = {}
+    for line, form in enumerate(rows):
+        for unknown in form:
+            holding.setdefault(unknown, set()).add(line)
+    bound: dict[int, tuple[Fraction, int]] = {}
+    short = [line for line, form in enumerate(rows) if len(form) < 3]
+    while short:
+        form = rows[short.pop()]
+        if not form:
+            continue
+        # Of two the one that stands in fewer equations.
+        (unknown, own), *rest = sorted(form.items(), key=lambda term: len(holding[term[0]]))
+        other, weight = (rest[0][0], -rest[0][1] / own) if rest else (unknown, Fraction(0))
+        bound[unknown] = weight, other
+        for line in holding.pop(unknown):
+            changed = rows[line]
+            share = changed.pop(unknown) * weight
+            if share:
+                total = changed.get(other, 0) + share
+                if total:
+                    changed[other] = total
+                    holding[other].add(line)
+                else:
+                    del changed[other]
+                    holding[other].discard(line)
+            if len(changed) < 3:
+                short.append(line)
+    return [form for form in rows if form], bound
+
+
+def _solutions(rows: Sequence[Form], size: int) -> list[list[Fraction]]:
+    """Return independent solutions of homogeneous equations, as many as there are."""
     matrix = flint.fmpq_mat(max(len(rows), 1), size)
     for line, form in enumerate(rows):
-        for index, weight in form.items():
-            exact = Fraction(weight)
-            matrix[line, size - 1 - index] = flint.fmpq(exact.numerator, exact.denominator)
+        for unknown, weight in form.items():
+            matrix[line, unknown] = _fmpq(weight)
     reduced, rank = matrix.rref()
-    pivots = []
-    column = 0
+    pivots: list[int] = []
     for line in range(rank):
-        while reduced[line, column] == 0:
-            column += 1
-        pivots.append(column)
-    taken = set(pivots)
+        pivots.append(next(c for c in range(pivots[-1] + 1 if pivots else 0, size) if reduced[line, c] != 0))
     basis = []
-    for unknown in range(split):
-        column = size - 1 - unknown
-        if column in taken:
-            continue
+    for unknown in sorted(set(range(size)) - set(pivots)):
         vector = [Fraction(0)] * size
         vector[unknown] = Fraction(1)
         for line, pivot in enumerate(pivots):
-            entry = reduced[line, column]
-            vector[size - 1 - pivot] = Fraction(-int(entry.p), int(entry.q))
+            entry = reduced[line, unknown]
+            vector[pivot] = Fraction(-int(entry.p), int(entry.q))
         basis.append(vector)
     return basis
+
+
+def _fmpq(number: Fraction | float) -> Any:
+    exact = Fraction(number)
+    return flint.fmpq(exact.numerator, exact.denominator)
 
 
 def _surely_none(rows: Sequence[Form], size: int, known: int) -> bool:

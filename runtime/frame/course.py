@@ -40,6 +40,9 @@ A_FEW = 256
 # From point to point a motion that turns by less is followed closely enough.
 CLOSE = 1.0
 
+# Vectors that miss each other's conjugates by no more, relatively, are of one motion and its mirror image.
+SAME = 1e-9
+
 # What an angle may miss the eigenvalue's by, in radians: rounding misses it by far less, and a motion that is
 # not the eigenvalue's, as where a vector of a nearly vanishing one is mostly rounding, by any amount.
 OFF = 0.3
@@ -72,7 +75,9 @@ def turns(
     """
     found = np.full(len(values), np.nan)
     swing = float(np.abs(np.linalg.eigvals(site.a).imag).max(initial=0.0)) / (2 * np.pi)
-    left = np.arange(len(values))
+    mirrored = _mirrored(start, heard, states, values)
+    real = (values.imag == 0) & ~start.imag.any(axis=0) & ~heard.imag.any(axis=0)
+    left = np.flatnonzero(~mirrored)
     durations = [event.duration for event in schedule.events if isinstance(event, Propagate)]
     for doubled in range(1, DOUBLINGS + 1):
         points = {
@@ -87,15 +92,30 @@ def turns(
         chunk = MOST // max(sum(points.values()) * height, most)
         seen = np.zeros(len(values), dtype=np.bool_)
         steps = _finest(site, schedule, points)
-        for first in range(0, len(left), chunk):
-            some = left[first : first + chunk]
-            course = _course(site, schedule, steps, points, start[:, some], heard[:, some], states[some])
+        # A real course is half the work of a complex one.
+        alike = [left[real[left]], left[~real[left]]]
+        for some in (one[first : first + chunk] for one in alike for first in range(0, len(one), chunk)):
+            z, r = start[:, some], heard[:, some]
+            if real[some[0]]:
+                z, r = z.real, r.real
+            course = _course(site, schedule, steps, points, z, r, states[some])
             angle, widest = turned_along(course)
             before, _ = turned_along(course[::2])  # half as finely
             agreed = (np.abs(angle - before) < OFF) | (widest < CLOSE)
             found[some[agreed]] = _of_eigenvalue(angle[agreed], values[some[agreed]])
             seen[some[agreed]] = True
         left = left[~seen[left]]
+    found[mirrored] = -found[np.flatnonzero(mirrored) - 1]
+    return found
+
+
+def _mirrored(start: Complexes, heard: Complexes, states: Integers, values: Complexes) -> NDArray[np.bool_]:
+    """Say which modes (k,) are the one before seen in a mirror: its conjugate."""
+    found = np.zeros(len(values), dtype=np.bool_)
+    found[1:] = (values[:-1].imag > 0) & (values[1:] == values[:-1].conj()) & (states[1:] == states[:-1])
+    for block in (start, heard):
+        apart = np.abs(block[:, 1:] - block[:, :-1].conj()).max(axis=0, initial=0.0)
+        found[1:] &= apart <= SAME * np.abs(block[:, 1:]).max(axis=0, initial=0.0)
     return found
 
 
@@ -227,23 +247,24 @@ def _course(
     schedule: Schedule,
     finest: dict[int, Floats],
     points: dict[int, int],
-    start: Complexes,
-    heard: Complexes,
+    start: Floats | Complexes,
+    heard: Floats | Complexes,
     states: Integers,
-) -> Complexes:
+) -> Floats | Complexes:
     """Return the states followed at so many points of each step, and the end (points, k)."""
+    width = 2 if np.iscomplexobj(start) else 1
     n_x, own = len(site.a), np.unique(states, return_inverse=True)
     fine = {duration: _followed(step, own[0], points[duration]) for duration, step in finest.items()}
     steps = {duration: power[0, :n_x] for duration, (_, power) in fine.items()}
     parts: list[Floats] = []
 
-    def columns(block: Complexes) -> Floats:
+    def columns(block: Floats | Complexes) -> Floats:
         # A complex column is two real ones: a real matrix times these is half the work.
         return np.ascontiguousarray(block).view(np.float64)
 
     def watch(duration: int, moving: NDArray[Any]) -> None:
         rows = fine[duration][0][own[1]]
-        parts.append(rows @ moving.reshape(len(moving), -1, 2).swapaxes(0, 1))
+        parts.append(rows @ moving.reshape(len(moving), -1, width).swapaxes(0, 1))
 
     listened = columns(heard)
     course = follow(site, schedule, steps, columns(start), lambda row: listened[row], watch=watch)
@@ -251,12 +272,12 @@ def _course(
         try:
             next(course)
         except StopIteration as end:
-            last = end.value.reshape(len(end.value), -1, 2)[states, np.arange(len(states))]
+            last = end.value.reshape(len(end.value), -1, width)[states, np.arange(len(states))]
             path = np.concatenate([*parts, last[:, None]], axis=1)
-            return np.ascontiguousarray((path[..., 0] + 1j * path[..., 1]).T)
+            return np.ascontiguousarray((path[..., 0] + 1j * path[..., 1] if width == 2 else path[..., 0]).T)
 
 
-def turned_along(course: Complexes) -> tuple[Floats, Floats]:
+def turned_along(course: Floats | Complexes) -> tuple[Floats, Floats]:
     """Return by how much courses (points, k) turn about 0, in radians, and the widest angle between points.
 
     A change of sign is half a turn forwards, whatever the sign of the zero beside it; a course that stays at

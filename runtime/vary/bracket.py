@@ -33,8 +33,9 @@ FIRST = 1 / 4
 # Each bracket that fails is followed by one so much wider, so many times.
 WIDER, TRIES = 16.0, 8
 
-# Bits tried in turn at one end of a bracket.
+# Bits tried in turn at one end of a bracket; with fewer a state the polynomial's coefficients seldom tell.
 PRECISIONS = (128, 256, 512, 1024)
+BITS_A_STATE = 6
 
 # The closed systems at a value, with the rigid modes of each.
 ExactSystems = Callable[[float], Sequence[tuple[ClosedSystem, RigidModes]]]
@@ -77,7 +78,8 @@ def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Br
     system = systems(root.value)[root.system][0]
     if unprovable(system) or len(system.names) > MOST_PROVED:
         return None
-    most_bits = PRECISIONS[0]
+    likely = BITS_A_STATE * len(system.names)
+    most_bits = next((bits for bits in PRECISIONS if bits >= likely), PRECISIONS[-1])
 
     @functools.cache
     def above(value: float) -> bool | None:

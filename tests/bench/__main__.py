@@ -65,7 +65,12 @@ PARTS = (
     Part("bench", "Speed against error on the paper's scene", ("apc", "bench", AVERAGE), timed=False),
     Part("hard", "Hard cases", ("apc", "bench", "--hard", "tests/hard"), timed=False),
     Part("scale", "More peers", ("apc", "bench", AVERAGE, "--scale", "3,30,300,3000,30000,1e6"), timed=False),
-    Part("random", "Random scenes", _own("random_scenes"), _own("random_scenes", "--points", "200")),
+    Part(
+        "random",
+        "Random scenes",
+        _own("random_scenes", "--every", "0"),
+        _own("random_scenes", "--points", "200", "--every", "0"),
+    ),
     Part("scans", "Random scans", _own("random_scans"), _own("random_scans", "--points", "40")),
     Part("comparison", "Other programs", _own("comparison")),
     Part("work_precision", "Methods of simulation", _own("work_precision")),

@@ -11,6 +11,8 @@ import statistics
 import tempfile
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 from apc.benchmark.timing import median_time, timed
@@ -40,8 +42,8 @@ def print_table(
     write: Callable[[int, Path], str],
     judge: Judge,
     target: float | None = None,
-) -> None:
-    """Measure and print one table; its last line is judged by the target (seconds)."""
+) -> float:
+    """Measure and print one table; its last line is judged by the target (seconds), and its seconds returned."""
     print(
         f"\n{title}\n{count:>9}  "
         + "  ".join(f"{stage:>9}" for stage in STAGES)
@@ -68,6 +70,30 @@ def print_table(
             before = total
     if target is not None:
         print(f"target {target:g} s: {judge.in_time(title, total, target)}")
+    return total
+
+
+def in_rumoca(number: int) -> float | None:
+    """Return the seconds in which Rumoca makes the same chain's sorted equations; None where it is not installed."""
+    if find_spec("rumoca") is None:
+        return None
+    masses = max(1, number // 3)
+    names = range(1, masses + 1)
+    lines = [
+        "model Chain",
+        "  parameter Real k = 10; parameter Real c = 1; parameter Real m = 0.01; parameter Real x0 = 0;",
+    ]
+    lines += [f"  Real x{i}(start = 0); Real v{i}(start = 0); Real f{i};" for i in names]
+    lines.append("equation")
+    for i in names:
+        behind = f" - f{i + 1}" if i < masses else ""
+        lines.append(f"  der(x{i}) = v{i}; f{i} = k*(x{i - 1} - x{i}); m*der(v{i}) = f{i} - c*v{i}{behind};")
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "Chain.mo"
+        path.write_text("\n".join([*lines, "end Chain;", ""]), encoding="utf-8")
+        session = import_module("rumoca").Session
+        seconds, _ = median_time(lambda: session().load(str(path), model="Chain").structure, 3)
+    return seconds
 
 
 def main() -> None:
@@ -89,7 +115,12 @@ def main() -> None:
         print_table("different peers, from a table (linear)", "peers", rows, table, judge, 10)
         print_table("kinds of peers", "kinds", [1, 2, 4, 8, 16, 32][:last], kinds, judge)
         lengths = [10, 30, 100, 300, 1000][:last]
-        print_table("equations in one component", "equations", lengths, equations, judge, 10)
+        ours = print_table("equations in one component", "equations", lengths, equations, judge, 10)
+        theirs = in_rumoca(lengths[-1])
+        if theirs is not None:
+            work = f"{lengths[-1]:,} equations to sorted ones"
+            judge.beside(f"{work} and functions", (ours, "–"), "Rumoca, without functions", (theirs, "–"))
+            print(f"\n{work} in Rumoca: {theirs:.3f} s")
     judge.end()
 
 

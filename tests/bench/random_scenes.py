@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 import random
+import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -137,7 +138,15 @@ def _looked_into(system: CompiledSystem, found: Analysis) -> list[str]:
         return [repr(error)]
 
 
-def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws: int = DRAWS) -> Tally:
+def run(
+    points: int,
+    *,
+    seed: int = 0,
+    methods: Sequence[str] = ("auto",),
+    draws: int = DRAWS,
+    tally: Tally | None = None,
+    tell: Callable[[int, Tally], None] = lambda done, tally: None,
+) -> Tally:
     """Analyse so many random scenes by each method.
 
     Parameters
@@ -150,11 +159,16 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
         See `analysis.analyze`.
     draws
         Of numbers for each structure.
+    tally
+        What is counted on, so that who stops in the middle has what there is.
+    tell
+        Is shown how many scenes are done, and the tally, before each structure.
     """
-    generator, tally = random.Random(seed), Tally()
+    generator, tally = random.Random(seed), Tally() if tally is None else tally
     with single_threaded(), precision(BITS), own_library() as library:
         for number in range(points):
             if number % draws == 0:
+                tell(number, tally)
                 shape = draw_shape(generator)
                 text, plain = shape.text, None
             try:
@@ -199,14 +213,31 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
 
 
 def main() -> None:
-    """Print what came out, and every scene that is wrong."""
+    """Print what came out, and every scene that is wrong; so far, on the way, on the other stream.
+
+    Stopped in the middle, it says what there is.
+    """
     parser = parser_of("random_scenes", __doc__)
     parser.add_argument("--points", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--methods", default="auto", help="auto,dense,determinant,krylov")
+    parser.add_argument(
+        "--every", type=int, default=200, help="scenes from one running tally to the next, 0 for none"
+    )
     given = parser.parse_args()
-    judge = Judge(given.strict)
-    tally = run(given.points, seed=given.seed, methods=given.methods.split(","))
+    judge, tally, told = Judge(given.strict), Tally(), [0]
+
+    def tell(done: int, tally: Tally) -> None:
+        for wrong in tally.wrong[told[0] :]:
+            print(f"WRONG after {done:,}: {wrong}", file=sys.stderr, flush=True)
+        told[0] = len(tally.wrong)
+        if done and given.every and done % given.every == 0:
+            print(f"{done:,} of {given.points:,}: {tally}", file=sys.stderr, flush=True)
+
+    try:
+        run(given.points, seed=given.seed, methods=given.methods.split(","), tally=tally, tell=tell)
+    except KeyboardInterrupt:
+        print(f"stopped before {given.points:,} were done")
     print(tally)
     for one in tally.wrong:
         judge.right(one, holds=False)

@@ -8,11 +8,17 @@ program written by hand for this one scene, in NumPy or C, with time itself, or 
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 import resource
+from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from typing import cast
 
+import casadi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
@@ -158,6 +164,68 @@ def numpy_loop(ticks: int) -> Floats:
     return rows
 
 
+def numba_loop() -> Callable[[int], Floats] | None:
+    """Return the same loop over single numbers, compiled by numba; None where there is no numba."""
+    if find_spec("numba") is None:
+        return None
+    njit = import_module("numba").njit
+    a, b = user_plant()
+    both = expm(np.block([[a, b], [np.zeros((2, 6))]]) * TICK)[:4]
+
+    def loop(ticks: int) -> Floats:
+        x, next_x = np.zeros((USERS, 4)), np.zeros((USERS, 4))
+        x[0, 0] = START
+        force = np.zeros((USERS, 2))
+        sent, heard = np.zeros(USERS), np.zeros(USERS)
+        rows = np.empty((ticks, USERS, 6))
+        for k in range(ticks):
+            if k % TICKS == 0:
+                for i in range(USERS):
+                    heard[i], sent[i] = sent[i], x[i, 2]
+            total = heard.sum()
+            for i in range(USERS):
+                for s in range(4):
+                    rows[k, i, s] = x[i, s]
+                    moved = both[s, 4] * force[i, 0] + both[s, 5] * force[i, 1]
+                    for q in range(4):
+                        moved += both[s, q] * x[i, q]
+                    next_x[i, s] = moved
+                rows[k, i, 4], rows[k, i, 5] = force[i, 0], force[i, 1]
+                force[i, 0] = K_C * (x[i, 0] - x[i, 2])
+                force[i, 1] = K_T * (x[i, 2] - (total - heard[i]) / (USERS - 1))
+            x, next_x = next_x, x
+        return rows
+
+    return cast(Callable[[int], Floats], njit(loop))
+
+
+def mapaccum_loop(ticks: int) -> Floats:
+    """Play it by CasADi's mapaccum: a frame of ticks is one function, whose end is the next one's start."""
+    frames = -(-ticks // TICKS)
+    start = np.zeros(7 * USERS)
+    start[0] = START
+    _, rows = _frames(frames)(start, casadi.DM(0, frames))
+    return np.array(rows).T.reshape(frames * TICKS, USERS, 6)[:ticks]
+
+
+@functools.cache
+def _frames(number: int) -> casadi.Function:
+    """Return so many frames of all users: what they are at the start, nothing → ends of frames, rows of ticks."""
+    a, b = user_plant()
+    both = casadi.DM(expm(np.block([[a, b], [np.zeros((2, 6))]]) * TICK)[:4])
+    z, nothing = casadi.SX.sym("z", 7 * USERS), casadi.SX.sym("nothing", 0)
+    x = casadi.reshape(z[: 4 * USERS], 4, USERS)
+    force = casadi.reshape(z[4 * USERS : 6 * USERS], 2, USERS)
+    heard, sent, rows = z[6 * USERS :].T, x[2, :], []
+    for _ in range(TICKS):
+        rows.append(casadi.vec(casadi.vertcat(x, force)))
+        others = (casadi.sum2(heard) - heard) / (USERS - 1)
+        acting = casadi.vertcat(K_C * (x[0, :] - x[2, :]), K_T * (x[2, :] - others))
+        x, force = both @ casadi.vertcat(x, force), acting
+    end = casadi.vertcat(casadi.vec(x), casadi.vec(force), sent.T)
+    return casadi.Function("frame", [z, nothing], [end, casadi.vertcat(*rows)]).mapaccum(number)
+
+
 def _play(ready: Simulation) -> list[Block]:
     return list(blocks(ready))
 
@@ -179,6 +247,15 @@ def speed(judge: Judge) -> None:
         f"\n10 s of three users, 10,000 ticks, {len(found.signals)} signals (with preparing, not compiled before or found again: {first:.2f} s)"
     )
     print(f"  NumPy loop         {1e3 * loop:8.2f} ms   differs by {error:.1e}, relative   {said}")
+    others = [("NumPy, a loop over ticks", loop)]
+    for name, play_by_hand in (("CasADi, mapaccum", mapaccum_loop), ("numba, loops by hand", numba_loop())):
+        if play_by_hand is not None:
+            play_by_hand(10_001)  # compiled
+            taken, rows = median_time(partial(play_by_hand, 10_001), REPEATS)
+            apart = np.abs(rows - by_hand).max() / np.abs(by_hand).max()
+            judge.within(f"{name} against the NumPy loop", float(apart), LINEAR)
+            others.append((name, taken))
+            print(f"  {name:<22} {1e3 * taken:4.2f} ms   differs by {apart:.1e}, relative")
     for name, jit, most in (("virtual machine", False, MOST_PART_VIRTUAL), ("machine code", True, MOST_PART)):
         ready = prepare(system, Settings(Fraction(10), jit=jit))
         taken, played = median_time(partial(_play, ready), REPEATS)
@@ -186,12 +263,8 @@ def speed(judge: Judge) -> None:
         judge.within(f"{name} against the NumPy loop", error, LINEAR)
         kept_part = judge.in_time(f"{name}, part of the NumPy loop", taken / loop, most)
         kept_s = f"{MOST_MS:g} ms {judge.in_time(f'{name}, ms', 1e3 * taken, MOST_MS)}, " if jit else ""
-        judge.beside(
-            f"10 s of three users, {name}",
-            (taken, f"{error:.1e} apart"),
-            "NumPy, a loop over ticks",
-            (loop, "–"),
-        )
+        for other, theirs in others:
+            judge.beside(f"10 s of three users, {name}", (taken, f"{error:.1e} apart"), other, (theirs, "–"))
         print(
             f"  {name:<16}   {1e3 * taken:8.2f} ms   {taken / loop:6.4f} of the NumPy loop   target {kept_s}{most:g} {kept_part}"
         )
