@@ -203,7 +203,7 @@ class _Played:
 
     @property
     def _read(self) -> NDArray[np.bool_]:
-        """Say of each number whether another follows from it; a packet held that none does lasts for itself."""
+        """Say of each number whether another follows from it: what is held and never read lasts."""
         found = np.zeros(self.size, dtype=bool)
         for kind, *what in self.record:
             for modes in np.ndindex(*(way.states for way in self.ways)) if kind == "map" else ():

@@ -88,7 +88,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator leading many bends marginal
-        delays lags search mean_square critical margins sensitivity
+        delays lags search mean_square critical margins sensitivity over_network
         """,
     ),
     ("apc", "answer"),

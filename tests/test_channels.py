@@ -316,4 +316,6 @@ def test_an_axis_of_losses_is_a_probability_that_follows_from_no_other() -> None
 
 def _with_study(text: str, axis: str) -> str:
     before = text.partition("studies:")[0]
-    return f"{before}studies: {{region: {{x: {{{axis}}}, y: {{coordination.stiffness: [0 N/m, 1500 N/m]}}}}}}\n"
+    return (
+        f"{before}studies: {{region: {{x: {{{axis}}}, y: {{coordination.stiffness: [0 N/m, 1500 N/m]}}}}}}\n"
+    )

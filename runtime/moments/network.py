@@ -54,6 +54,9 @@ ENUMERATED = 4
 ITERATED = 1e-10
 ROUNDED = 4e-15
 
+# Covariances of luck times cubes of the means' states, up to which one growth takes some ten milliseconds.
+QUICK = 200_000
+
 # How many times what two estimates differ by counts as their error; what bounds may be apart at most.
 DOUBTS, LOOSE = 10, 1e-9
 
@@ -92,8 +95,8 @@ class NetworkVerdict(Result):
 class Growth:
     """What second moments grow by in a frame, with bounds; estimates where `exact` is False.
 
-    `why` says why there is none, `note` what it is; `proved` that every rounding is in the bounds. `errors`
-    works out how far copies are from each other.
+    `why` says why there is none, `note` what it is; `proved` that every rounding is in the bounds; `quick`
+    that it took some milliseconds. `errors` works out how far copies are from each other.
     """
 
     radius: float
@@ -103,6 +106,7 @@ class Growth:
     why: str = ""
     note: str = ""
     proved: bool = False
+    quick: bool = False
     errors: Callable[[], Told] | None = None
 
     @property
@@ -159,7 +163,8 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
                 return Growth(np.nan, 0.0, np.inf, False, why)
             inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None, bounded=bounded)
             errors = partial(crowd_error, system, prepared)
-            return Growth(inner.radius, inner.low, inner.high, True, proved=True, errors=errors)
+            quick = entries * max(states, default=0) ** 3 <= QUICK
+            return Growth(inner.radius, inner.low, inner.high, True, proved=True, quick=quick, errors=errors)
         first, why = _due(system, lossy)
         if not why and len(system.links) == 1 and not system.links[0].delays:
             closed = stand_in(system, prepared, first)
@@ -168,7 +173,7 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
             inner = mean_square_radius(*closed, bounded=bounded)
             errors = partial(standing_error, system, prepared, first)
             every = system.peers <= ENUMERATED  # of more, a quadrature's nodes are rounded
-            return Growth(inner.radius, inner.low, inner.high, True, proved=every, errors=errors)
+            return Growth(inner.radius, inner.low, inner.high, True, proved=every, quick=every, errors=errors)
     else:
         first, why = _due(system, lossy)
     if not why and any(law.jitter for _, law in lossy):
