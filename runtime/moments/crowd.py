@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import Clock, CompiledSystem, Kind
 from apc.eigen.closing import Coupling, Loop, without_packets
-from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
 from apc.eigen.peer_group import PeerGroup, used_ways
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.parameters import resolve
-from apc.frame.radius import radius_of, value_of, with_radius
+from apc.frame.radius import with_radius
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
 from apc.moments.gains import Luck, Moments, Part
@@ -155,7 +154,7 @@ def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = 
         )
         for g, one in listened
     ]
-    parts, bounds = [], []
+    parts = []
     for place, loop in enumerate(loops):
         alone = _class_apart(loops, place)
         own = {
@@ -166,12 +165,9 @@ def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = 
         mean, channels = mean_loop(
             loop, told.of(loop), list(remembered.values()), list(own.values()), standing_motions(loop)
         )
-        _, found = enclose_eigenvalues(value_of(mean.matrix), radius_of(mean.matrix))
-        bounds.append((found.low, found.high))
         classes = tuple(range(len(loop.sites))) if alone is None else (alone,)
         parts.append(Part(mean, alone, classes, dict(zip(own, channels, strict=True))))
-    low, high = np.max(bounds, axis=0).tolist()
-    return Moments(tuple(parts), tuple(luck), (low, high))
+    return Moments(tuple(parts), tuple(luck))
 
 
 def standing_motions(loop: Loop) -> Floats:
@@ -242,10 +238,11 @@ def remembered_of(
     links = {link.name: link for link in system.links}
     clocks = {clock.name: clock for clock in system.clocks}
     found = []
+    times = {one.name: instants(told, one) for one in system.clocks}
     for route, listed in sorted(heard.items()):
         link, delay = links[route[0]], told.timings[route[1]]
-        sent = instants(told, clocks[link.clock])
-        ticks = {(row.clock, row.tick): instants(told, clocks[row.clock])[row.tick] for row in listed}
+        sent = times[link.clock]
+        ticks = {(row.clock, row.tick): times[row.clock][row.tick] for row in listed}
         law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
         memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly)
         found.append(remember(route, memory, sorted({row.channel for row in listed})))

@@ -15,7 +15,7 @@ eigenvalue of G is 1, or by ρ(A)² where it is smaller than 1 all the way down.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.enclosure import enclose_eigenvalues
+from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.moments.mean_loops import Channel, MeanLoop, Route
@@ -39,18 +40,21 @@ NOTHING = 1e-24
 # Doublings until a sum counts as endless, 2^60 frames; or where what is doubled has grown to this.
 DOUBLINGS, ENDLESS = 60, 1e100
 
-# Steps towards the radius; secants need some ten. The first is so near above the means' own growth.
-STEPS, NEAR = 60, 1e-9
+TINY = float(np.finfo(np.float64).tiny)
 
-# How far above the means' own growth, or this, G is first looked for to be small, and how much farther each
-# time.
-LEAST, FIRST_GAP, WIDER = 1e-3, 1e-3, 30
+# Steps towards the radius; secants need some five. After so many without a λ at which G is large, it is
+# looked at so near above the means' own growth.
+STEPS, BLIND, NEAR = 60, 4, 1e-9
 
-# How near 1 is near enough; and as far from it, slopes are not rounding.
-CLOSE, ROUGH = 1e-13, 1e-6
+# G is first looked at where it decides the verdict, at 1, if the means decay by more than this; else so far
+# above their own growth, and at most so many times farther each time.
+NEAR_ONE, FIRST_GAP, WIDER = 0.99999, 0.1, 30
+
+# How near the radius is near enough, relatively; and as far from 1, the slopes of G are not rounding.
+CLOSE, ROUGH = 1e-14, 1e-6
 
 # How near it is enclosed at first, relatively, and how much farther at last.
-FIRST_WIDTH, LAST_WIDTH = 1e-11, 1e-3
+FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
 
 
 # Covariances of luck times cubes of the means' states: as much takes some ten seconds.
@@ -106,11 +110,16 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """All loops and all kinds of luck of a scene; `means` are bounds on the means' spectral radius."""
+    """All loops and all kinds of luck of a scene."""
 
     parts: tuple[Part, ...]
     luck: tuple[Luck, ...]
-    means: tuple[float, float]
+
+    @property
+    def means(self) -> tuple[list[Matrix], list[Matrix]]:
+        """The matrices of the loops, those that luck drives first."""
+        own = [part.loop.matrix for part in self.parts if part.channels]
+        return own, [part.loop.matrix for part in self.parts if not part.channels]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,25 +142,80 @@ def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
 
 
 def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
-    """Return Σ_k M^k B M^kᵀ of a matrix M (n, n) and matrices B (b, n, n), None where it does not end.
+    """Return Σ_k M^k B M^kᵀ of a matrix M (n, n) and symmetric B (b, n, n), None where it does not end.
+
+    With radii, that it ends for every M within them is proved.
 
     Notes
     -----
-    Doubled (Smith, 1968): of 2j terms, the second half is M^j times the first. What is left out after the
-    last doubling is M^j Y M^jᵀ, at most ‖M^j‖² / (1 − ‖M^j‖²) of the largest entry of what is there.
+    Let X̂ be what floats say, and E = B + M X̂ Mᵀ − X̂ what they leave, −θ D² ≤ E ≤ θ D² in the order of
+    symmetric matrices for some diagonal D. For a P ≥ 0 with P − M P Mᵀ ≥ (1 − φ) D², φ < 1, the powers of M
+    die out (Lyapunov), and X − X̂ = Σ_k M^k E M^kᵀ lies between −θ/(1 − φ) P and θ/(1 − φ) P. D² is as X̂ on
+    its diagonal, P as floats have Σ_k M^k D² M^kᵀ; θ and φ are the largest sums of rows, over D (Gershgorin).
+    """
+    if numbers is FLOATS:
+        return _doubled(matrix, driven)
+    n = matrix.shape[-1]
+    found = _doubled(value_of(matrix), value_of(driven))
+    if found is None or not n:
+        return None if found is None else driven
+    found = (found + np.swapaxes(found, -1, -2)) / 2
+    weights = _weights(found, value_of(matrix))
+    seed = np.diag(weights**2)
+    still = _doubled(value_of(matrix), seed[None])
+    if still is None:
+        return None
+    still = (still + np.swapaxes(still, -1, -2)) / 2
+    guessed = numbers.exact(np.concatenate([found, still]))
+    added = np.concatenate([driven, numbers.exact(seed[None])])
+    left = numbers.subtract(numbers.add(around(matrix, guessed, numbers), added), guessed)
+    scale = np.outer(weights, weights)
+    size = (np.abs(value_of(left)) + radius_of(left)) / scale
+    *thetas, phi = size.sum(axis=-1).max(axis=-1) * (1 + (n + 8) * UNIT)
+    if not (phi < 1 and _is_positive(still[0] / scale)):
+        return None
+    wide = np.sqrt(np.diagonal(still[0]))
+    reach = np.array(thetas)[:, None, None] / (1 - phi) * np.outer(wide, wide)
+    return with_radius(found, reach * (1 + 16 * UNIT))
+
+
+def _weights(found: Matrix, matrix: Matrix) -> Floats:
+    """Return how large states are where moments (b, n, n) are found; those that rest, beside the others."""
+    weights = np.sqrt(np.abs(np.diagonal(found, axis1=-2, axis2=-1)).sum(axis=0))
+    if not weights.all():
+        alike = balance(np.abs(matrix))
+        least = (weights[weights > 0] / alike[weights > 0]).min(initial=np.inf)
+        weights = np.where(weights > 0, weights, alike * (least if np.isfinite(least) else 1.0))
+    return np.asarray(weights)
+
+
+def _is_positive(matrix: Matrix) -> bool:
+    """Say whether a symmetric matrix, its entries rounded twice, is proved to have no eigenvalue below 0.
+
+    A Cholesky factorization that runs to its end is one of a matrix that is off by (n + 1) u times its trace
+    at most (Higham, Accuracy and Stability of Numerical Algorithms, theorem 10.3).
+    """
+    n, trace = len(matrix), float(np.trace(matrix))
+    try:
+        np.linalg.cholesky(matrix - 4 * (n + 8) * UNIT * trace * np.eye(n))
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(trace))
+
+
+def _doubled(matrix: Matrix, driven: Matrix) -> Matrix | None:
+    """Return Σ_k M^k B M^kᵀ in floats, None where it does not end.
+
+    Doubled (Smith, 1968): of 2j terms, the second half is M^j times the first.
     """
     total, power = driven, matrix
     for _ in range(DOUBLINGS):
-        total = numbers.add(total, around(power, total, numbers))
-        power = numbers.multiply(power, power)
-        sums = np.abs(power).sum(axis=-1)
-        size = float((sums if numbers is FLOATS else sums.sum(axis=0)).max(initial=0.0))
+        total = total + power @ total @ power.T
+        power = power @ power
+        size = float(np.abs(power).sum(axis=-1).max(initial=0.0))
         if not size < ENDLESS:
             return None
         if size**2 < NOTHING:
-            if numbers is not FLOATS:
-                most = (np.abs(value_of(total)) + radius_of(total)).max(axis=(-2, -1), keepdims=True)
-                radius_of(total)[...] += 2 * size**2 * most
             return total
     return None
 
@@ -252,31 +316,33 @@ def number_of(value: float, numbers: Arithmetic) -> Matrix:
     return np.array([value, 4 * UNIT * abs(value)]).reshape(2, 1, 1)
 
 
-def mean_square_radius(means: tuple[float, float], of: Gain | None, *, bounded: bool = True) -> Enclosed:
+def mean_square_radius(
+    driven: Sequence[Matrix], alone: Sequence[Matrix], of: Gain, *, bounded: bool = True
+) -> Enclosed:
     """Enclose what second moments grow by in a frame, for all start states.
 
     Parameters
     ----------
-    means
-        Bounds on the spectral radius of the means.
+    driven, alone
+        The loops of means (2, n, n), each with its radius: those that luck drives, and those that it doesn't.
     of
-        G(λ), None where nothing is left to chance.
+        G(λ).
     bounded
         Whether bounds are asked for; without them, they are the radius itself.
     """
-    low, high = means
-    if not np.isfinite(high):
+    own, others = _growth(driven), _growth(alone)
+    if not np.isfinite(own + others):
         return Enclosed(np.nan, 0.0, np.inf)
-    square = (low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT))
-    if of is None:
-        return Enclosed(low * high, *square)
-    least = max(high**2, np.finfo(np.float64).tiny)
-    found, steep = _radius(of, least)
-    radius = low * high if found is None else found
+    found, steep = _radius(of, max(own, TINY)) if driven else (None, 1.0)
+    radius = max(others, own if found is None else found)
     if not bounded:
         return Enclosed(radius, radius, radius)
+    if not driven:
+        return Enclosed(radius, *_square(alone))
+    # Bounds on G at λ prove that the means it comes from grow by less.
+    square = _square([*driven, *alone] if found is None else alone)
     above, wide = np.inf, None
-    start, width = (least, NEAR) if found is None else (found, FIRST_WIDTH)
+    start, width = (max(square[1], TINY), NEAR) if found is None else (found, FIRST_WIDTH)
     while width <= LAST_WIDTH and above > start * (1 + width):
         bounds = _bounds(of, start * (1 + width))
         if bounds is not None:
@@ -290,7 +356,25 @@ def mean_square_radius(means: tuple[float, float], of: Gain | None, *, bounded: 
         if bounds is not None:
             below = max(below, found * (1 - width) * min(bounds[0], 1.0) * (1 - 2 * UNIT))
         width *= 8
+    if not below:  # so near the growth of the means, G has no bounds
+        below = _square(driven)[0]
     return Enclosed(radius, min(below, radius), max(above, square[1], radius))
+
+
+def _growth(loops: Sequence[Matrix]) -> float:
+    """Return what squares of the means grow by in floats."""
+    return max((_size(np.linalg.eigvals(value_of(one))) ** 2 for one in loops), default=0.0)
+
+
+def _square(loops: Sequence[Matrix]) -> tuple[float, float]:
+    """Return bounds on what squares of the means grow by."""
+    found = [enclose_eigenvalues(value_of(one), radius_of(one))[1] for one in loops]
+    low, high = max((one.low for one in found), default=0.0), max((one.high for one in found), default=0.0)
+    return low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT)
+
+
+def _size(values: NDArray[Any]) -> float:
+    return float(np.abs(values).max(initial=0.0))
 
 
 def _bounds(of: Gain, growth: float) -> tuple[float, float] | None:
@@ -301,6 +385,9 @@ def _bounds(of: Gain, growth: float) -> tuple[float, float] | None:
     matrix = of(growth, RADII)
     if matrix is None or not np.isfinite(matrix).all():
         return None
+    if matrix.shape[-1] == 1:
+        value, off = abs(float(matrix[0, 0, 0])), float(matrix[1, 0, 0])
+        return (value - off) * (1 - UNIT), (value + off) * (1 + UNIT)
     _, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
     return found.low, found.high
 
@@ -311,47 +398,52 @@ def _largest(of: Gain, growth: float) -> float:
         matrix = of(growth, FLOATS)
     if matrix is None or not np.isfinite(matrix).all():
         return np.inf
-    return float(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0))
+    return _size(matrix if len(matrix) == 1 else np.linalg.eigvals(matrix))
 
 
 def _radius(of: Gain, least: float) -> tuple[float | None, float]:
     """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
 
-    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. 1/G is followed, which is nearly
-    straight where G has its pole: by secants between a point on either side, one that stays twice counting
-    half (the Illinois rule).
+    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. 1/G − 1 is followed, which is nearly
+    straight from −1 at the means' own growth, where G has its pole: by secants between a point on either
+    side, one that stays twice counting as much less as the other moved (Anderson and Björck, 1973).
     """
 
     def over(growth: float) -> float:
-        return 1 / max(_largest(of, growth), np.finfo(np.float64).tiny) - 1
+        return 1 / max(_largest(of, growth), TINY) - 1
 
-    low, gap = least * (1 + NEAR), max(least, LEAST) * FIRST_GAP
-    at_low = over(low)
-    if at_low > 0:
-        return None, 1.0
-    high = low + gap
+    low, at_low, known = least, -1.0, False  # of the pole, nothing is known: luck may not reach it
+    high = 1.0 if least < NEAR_ONE else least * (1 + FIRST_GAP)
     at_high = over(high)
     while at_high < 0:
-        low, at_low, gap = high, at_high, WIDER * gap
-        high = low + gap
+        low, at_low, known = high, at_high, True
+        ahead = (high - least) / max(1 + at_high, 1 / WIDER)
+        high = least + max(ahead, (high - least) * (1 + FIRST_GAP))
         at_high = over(high)
-    best, off = (low, -at_low) if -at_low < at_high else (high, at_high)
-    steep, stayed = max(1.0, best * (at_high - at_low) / (high - low)), 0
-    for _ in range(STEPS):
+    best, off, steep, stayed = high, at_high, 1.0, 0
+    for step in range(STEPS):
+        if step >= BLIND and not known and off > ROUGH:
+            low = least * (1 + NEAR)
+            at_low = over(low)
+            if at_low > 0:
+                return None, 1.0
+            known = True
         middle = low - at_low * (high - low) / (at_high - at_low)
-        if off <= max(CLOSE, UNIT * steep) or not low < middle < high:
+        if off <= CLOSE * steep or not low < middle < high:
             break
         found = over(middle)
         if found < 0:
-            slope = (found - at_low) / (middle - low)
-            low, at_low = middle, found
-            at_high, stayed = (at_high / 2, 1) if stayed == 1 else (at_high, 1)
+            slope = (found - at_high) / (middle - high)
+            shrink = 1 - found / at_low
+            at_high *= (shrink if shrink > 0 else 0.5) if stayed == 1 else 1.0
+            low, at_low, known, stayed = middle, found, True, 1
         else:
-            slope = (at_high - found) / (high - middle)
-            high, at_high = middle, found
-            at_low, stayed = (at_low / 2, -1) if stayed == -1 else (at_low, -1)
+            slope = (found - at_low) / (middle - low)
+            shrink = 1 - found / at_high
+            at_low *= (shrink if shrink > 0 else 0.5) if stayed == -1 else 1.0
+            high, at_high, stayed = middle, found, -1
         if off > ROUGH:
             steep = max(1.0, middle * slope)
         if abs(found) < off:
             best, off = middle, abs(found)
-    return best, steep
+    return (best, steep) if known or off <= ROUGH else (None, 1.0)

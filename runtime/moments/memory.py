@@ -17,6 +17,7 @@ Ticks of which all packets sent so far are equally likely to be heard, and toget
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,6 +35,9 @@ SAME_CHANCE = 1e-15
 
 # Roundings of a probability, relative to 1: those of its law's numbers and of erfc or a power.
 CHANCE_ROUNDINGS = 8
+
+# Descriptions that are remembered.
+LATELY = 64
 
 # Of a quotient of times by a jitter, which is a float: the latest packets of a table arrive all at once.
 ROUNDED = 4e-16
@@ -122,7 +126,7 @@ def memory_of(
     *,
     strictly: bool = False,
 ) -> Memory:
-    """Describe what ticks hear of one sender.
+    """Describe what ticks hear of one sender; what was described lately is remembered.
 
     Parameters
     ----------
@@ -135,6 +139,19 @@ def memory_of(
     strictly
         Whether a tick misses what arrives just then.
     """
+    return _memory_of(law, delay, tuple(sent), tuple(ticks.items()), frame, strictly)
+
+
+@functools.lru_cache(maxsize=LATELY)
+def _memory_of(
+    law: ChannelLaw,
+    delay: Fraction,
+    sent: tuple[Fraction, ...],
+    told: tuple[tuple[tuple[str, int], Fraction], ...],
+    frame: Fraction,
+    strictly: bool,
+) -> Memory:
+    ticks = dict(told)
     ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
     unit = math.lcm(*(one.denominator for one in (frame, *sent, *ticks.values())))
     length, starts = int(frame * unit), [int(one * unit) for one in reversed(sent)]

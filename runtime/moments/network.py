@@ -161,7 +161,7 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
             states = [channel.matrix.shape[-1] for part in of.parts for channel in part.channels.values()]
             if why := too_much(entries, max(states, default=0)):
                 return Growth(np.nan, 0.0, np.inf, False, why)
-            inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None, bounded=bounded)
+            inner = mean_square_radius(*of.means, partial(gain, of), bounded=bounded)
             errors = partial(crowd_error, system, prepared)
             quick = entries * max(states, default=0) ** 3 <= QUICK
             return Growth(inner.radius, inner.low, inner.high, True, proved=True, quick=quick, errors=errors)
@@ -170,7 +170,8 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
             closed = stand_in(system, prepared, first)
             if isinstance(closed, str):
                 return Growth(np.nan, 0.0, np.inf, False, closed)
-            inner = mean_square_radius(*closed, bounded=bounded)
+            means, luck = closed
+            inner = mean_square_radius(means, [], luck, bounded=bounded)
             errors = partial(standing_error, system, prepared, first)
             every = system.peers <= ENUMERATED  # of more, a quadrature's nodes are rounded
             return Growth(inner.radius, inner.low, inner.high, True, proved=every, quick=every, errors=errors)
