@@ -174,15 +174,16 @@ def proved_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:
     Raises
     ------
     ApcError
-        As `box_proof.prove_box`; E898 links are unreliable, over which no box is proved.
+        As `box_proof.prove_box`, or `moments.box.prove_box` where links are, or may become, unreliable.
     """
     from apc.analysis.box_proof import prove_box
-    from apc.network.nominal import left_out
+    from apc.network.nominal import channel_numbers, left_out
 
-    if left_out(system):
-        what = "no box is proved in mean square, and links of this scene lose or delay packets by chance"
-        name = box[0].free.label
-        raise ApcError(Mistake("E898", Place("box"), what, hint=f"apc critical {name} --in mean-square"))
+    numbers = channel_numbers(system)
+    if left_out(system) or any(one.free.name in numbers for one in box):
+        from apc.moments.box import prove_box as prove_over_network
+
+        return prove_over_network(system, box)
     return prove_box(system, box)
 
 

@@ -81,7 +81,7 @@ HOUSE = (
         "apc.moments",
         """
         memory mean_loops gains crowd held peak worst almost_sure stand_in patterns bursts traces
-        hands errors network
+        hands errors network box
         """,
     ),
     (

@@ -30,7 +30,7 @@ from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.moments.bursts import tagged_moments
 from apc.moments.crowd import crowd, hearing, peer_classes
-from apc.moments.gains import Moments, around, gain, number_of, scaled, stein, units_of
+from apc.moments.gains import Moments, around, gain, number_of, stein, units_of
 from apc.moments.hands import Copy, Peer, forced
 from apc.moments.patterns import every_pattern, frames, of_all, resting_moments
 from apc.moments.stand_in import Classes, entries_of, luck_after, luck_of_luck, spread_of, standing_in

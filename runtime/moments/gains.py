@@ -1,8 +1,8 @@
 """The spectral radius of second moments, from how luck drives itself.
 
 Takes: the mean loops of a scene and what the luck of its channels does to them.
-Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `stein`, `around`,
-`scaled`, `of_kind`, `number_of`, `units_of`, `too_much`.
+Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `below_1`; `stein`,
+`around`, `of_kind`, `number_of`, `units_of`, `too_much`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd`).
 
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
-from apc.moments.mean_loops import Channel, MeanLoop, Route
+from apc.moments.mean_loops import Channel, MeanLoop, Route, scaled
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -131,16 +132,6 @@ class Enclosed:
     high: float
 
 
-def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
-    """Return matrices entry by entry times others, or times numbers."""
-    if numbers is FLOATS:
-        return np.asarray(matrix * by)
-    value, factor, off = value_of(matrix), value_of(by), radius_of(by)
-    product = value * factor
-    radius = radius_of(matrix) * (np.abs(factor) + off) + np.abs(value) * off + UNIT * np.abs(product)
-    return with_radius(product, radius * (1 + 8 * UNIT))
-
-
 def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     """Return Σ_k M^k B M^kᵀ of a matrix M (n, n) and symmetric B (b, n, n), None where it does not end.
 
@@ -216,7 +207,7 @@ def _doubled(matrix: Matrix, driven: Matrix) -> Matrix | None:
         if not size < ENDLESS:
             return None
         if size**2 < NOTHING:
-            return total
+            return np.asarray(total)
     return None
 
 
@@ -359,6 +350,15 @@ def mean_square_radius(
     if not below:  # so near the growth of the means, G has no bounds
         below = _square(driven)[0]
     return Enclosed(radius, min(below, radius), max(above, square[1], radius))
+
+
+def below_1(of: Moments) -> bool:
+    """Say whether it is proved that second moments die out, for all matrices within their radii."""
+    driven, alone = of.means
+    if not _square(alone)[1] < 1:
+        return False
+    bounds = _bounds(partial(gain, of), 1.0) if driven else None
+    return not driven or (bounds is not None and bounds[1] < 1)
 
 
 def _growth(loops: Sequence[Matrix]) -> float:

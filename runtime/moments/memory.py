@@ -26,6 +26,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.frame.discretize import UNIT
 from apc.network.channel import LATEST, PARETO_SHAPE, ChannelLaw
 
 Floats = NDArray[np.float64]
@@ -48,12 +49,14 @@ class Memory:
     """The values that ticks hear: of this frame, and of those to come, `old` and `chances` by value.
 
     Value e of those there are once all packets of a frame are sent was `old[e]` before it, one of `count`
-    kept from the frames before; slot k's packet takes its place with probability `chances[e, k]`. `heard`
-    says which value a tick (clock, index) hears; `kept` which values are kept for the next frame, in order.
+    kept from the frames before; slot k's packet takes its place with probability `chances[e, k]`, known to
+    within `doubts[e, k]` and its rounding. `heard` says which value a tick (clock, index) hears; `kept` which
+    values are kept for the next frame, in order.
     """
 
     old: NDArray[np.intp]  # (n_e,)
     chances: Floats  # (n_e, slots)
+    doubts: Floats  # (n_e, slots)
     heard: Mapping[tuple[str, int], int]
     kept: NDArray[np.intp]  # (count,)
 
@@ -72,10 +75,18 @@ class Memory:
         own = self.chances[:, slot]
         return np.flatnonzero((own > 0) & (own < 1))
 
-    def spread(self, slot: int) -> Floats:
-        """Return the covariance (n, n) of whether a slot's packet takes the place of its uncertain values."""
-        own = self.chances[self.uncertain(slot), slot]
-        return np.asarray(np.minimum.outer(own, own) - np.outer(own, own))
+    def spread(self, slot: int) -> tuple[Floats, Floats]:
+        """Return the covariance (n, n) of whether a slot's packet takes the place of its uncertain values.
+
+        And how far it may be off: a chance π has the variance π (1 − π), of slope 1 − 2 π.
+        """
+        place = self.uncertain(slot)
+        own, doubt = self.chances[place, slot], self.doubts[place, slot]
+        found = np.minimum.outer(own, own) - np.outer(own, own)
+        both = np.outer(own, doubt) + np.outer(doubt, own) + np.outer(doubt, doubt)
+        off = np.maximum.outer(doubt, doubt) + both
+        np.fill_diagonal(off, np.abs(1 - 2 * own) * doubt + doubt**2)
+        return found, off * (1 + 8 * UNIT) + 2 * CHANCE_ROUNDINGS * UNIT * found
 
 
 def is_memoryless(law: ChannelLaw) -> bool:
@@ -125,6 +136,7 @@ def memory_of(
     frame: Fraction,
     *,
     strictly: bool = False,
+    doubt: float = 0.0,
 ) -> Memory:
     """Describe what ticks hear of one sender; what was described lately is remembered.
 
@@ -138,8 +150,10 @@ def memory_of(
         The length of a frame, in seconds.
     strictly
         Whether a tick misses what arrives just then.
+    doubt
+        How far the share of packets that get lost may be off.
     """
-    return _memory_of(law, delay, tuple(sent), tuple(ticks.items()), frame, strictly)
+    return _memory_of(law, delay, tuple(sent), tuple(ticks.items()), frame, strictly, doubt)
 
 
 @functools.lru_cache(maxsize=LATELY)
@@ -150,6 +164,7 @@ def _memory_of(
     told: tuple[tuple[tuple[str, int], Fraction], ...],
     frame: Fraction,
     strictly: bool,
+    doubt: float,
 ) -> Memory:
     ticks = dict(told)
     ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
@@ -184,9 +199,11 @@ def _memory_of(
     listed = list(keys)
     known = {listed[place][: len(listed[place]) - slots]: number for number, place in enumerate(kept)}
     old = [known[key[slots:]] for key in listed]
+    chances = np.array([key[:slots][::-1] for key in listed])
     return Memory(
         old=np.array(old, np.intp),
-        chances=np.array([key[:slots][::-1] for key in listed]),
+        chances=chances,
+        doubts=chances * (doubt / (1 - law.mean_loss)) * (1 + 8 * UNIT) if doubt else np.zeros(chances.shape),
         heard={tick: of_time[int(time * unit)] for tick, time in ticks.items()},
         kept=np.array(kept, np.intp),
     )

@@ -36,8 +36,8 @@ from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, Arithmetic, with_radius
 from apc.frame.schedule import Selected, Way
 from apc.moments.crowd import Hearing, hearing, own_value, peer_classes, remembered_of, standing_motions
-from apc.moments.gains import Gain, around, number_of, of_kind, scaled, stein, too_much
-from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
+from apc.moments.gains import Gain, around, number_of, of_kind, stein, too_much
+from apc.moments.mean_loops import Remembered, Site, scaled, standing_state, with_memory
 from apc.network.channel import channel_law
 
 Floats = NDArray[np.float64]
