@@ -32,6 +32,7 @@ from apc.moments.bursts import tagged_moments
 from apc.moments.crowd import crowd, hearing, peer_classes
 from apc.moments.gains import Moments, around, gain, number_of, stein, units_of
 from apc.moments.hands import Copy, Peer, forced
+from apc.moments.mean_loops import scaled
 from apc.moments.patterns import every_pattern, frames, of_all, resting_moments
 from apc.moments.stand_in import Classes, entries_of, luck_after, luck_of_luck, spread_of, standing_in
 
