@@ -1,7 +1,7 @@
 """The spectral radius of second moments, from how luck drives itself.
 
 Takes: the mean loops of a scene and what the luck of its channels does to them.
-Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `below_1`; `stein`,
+Gives: `Luck`, `Part`, `Moments`; `gain_of`, `mean_square_radius`, `Enclosed`, `Gain`; `below_1`; `stein`,
 `around`, `of_kind`, `number_of`, `units_of`, `too_much`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd`).
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -217,71 +216,113 @@ def around(left: Matrix, inner: Matrix, numbers: Arithmetic, right: Matrix | Non
     return numbers.multiply(numbers.multiply(left, inner), np.swapaxes(other, -1, -2))
 
 
-def gain(of: Moments, growth: float, numbers: Arithmetic = FLOATS) -> Matrix | None:
+def gain_of(of: Moments) -> Gain:
     """Return G(λ) over the entries of all covariances of luck, None where the means grow faster.
+
+    What does not depend on λ is worked out once.
 
     Parameters
     ----------
     of
         The loops and their luck.
-    growth
-        λ, what second moments grow by in a frame.
-    numbers
-        Floats, or floats with their radii.
     """
     firsts = np.cumsum([0] + [sum(map(len, one.entries)) for one in of.luck]).tolist()
-    found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
-    shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
-    for part in of.parts:
-        for d, channel in part.channels.items():
-            kind = of.luck[d]
-            covariances = of_kind(RADII.exact(units_of(kind)), numbers)
-            driven = scaled(around(of_kind(channel.driven, numbers), covariances, numbers), shrink, numbers)
-            moments = stein(scaled(of_kind(channel.matrix, numbers), root, numbers), driven, numbers)
+    known: dict[bool, list[_Driven]] = {}
+
+    def at(growth: float, numbers: Arithmetic) -> Matrix | None:
+        exact = numbers is FLOATS
+        if exact not in known:
+            known[exact] = [_driven(of, part, d, firsts, numbers) for part in of.parts for d in part.channels]
+        found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
+        shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
+        for one in known[exact]:
+            matrix, driven = scaled(one.matrix, root, numbers), scaled(one.driven, shrink, numbers)
+            moments = stein(matrix, driven, numbers)
             if moments is None:
                 return None
-            answer = _Answer(channel.matrix.shape[-1], moments, covariances, numbers)
-            # One channel drives the mean of all receivers by 1/n, and them apart by 1 − 1/n or −1/n.
-            alone = 1 / kind.receivers
-            share = kind.heard * (alone if part.apart is None else 1 - alone)
-            for (site, route, slot), rows in channel.misses.items():
-                miss = of_kind(rows, numbers)
-                same = scaled(answer.of(miss, miss), number_of(share, numbers), numbers)
-                for c, other in enumerate(of.luck):
-                    if (other.route, other.sender) != (route, part.classes[site]):
-                        continue
-                    moved = same
-                    if c == d:
-                        own = of_kind(channel.own[slot], numbers)
-                        both = answer.of(miss, own)
-                        both = numbers.add(both, np.swapaxes(both, -1, -2))
-                        factor = number_of(alone if part.apart is None else -alone, numbers)
-                        moved = numbers.add(moved, scaled(both, factor, numbers))
-                        if part.apart is None:
-                            moved = numbers.add(moved, answer.of(own, own))
-                    moved = scaled(moved, of_kind(other.spreads[slot], numbers), numbers)
-                    listed = np.array(other.entries[slot], np.intp).reshape(-1, 2).T
-                    block = np.moveaxis(moved[..., listed[0], listed[1]], 0, -1)
-                    first = firsts[c] + sum(map(len, other.entries[:slot]))
-                    place = np.s_[..., first : first + listed.shape[1], firsts[d] : firsts[d + 1]]
+            for answer in one.answers:
+                same = answer.miss.of(moments, numbers)
+                for place, entries, spread, own in answer.heard:
+                    moved = same if own is None else numbers.add(same, own.of(moments, numbers))
+                    moved = scaled(moved, spread, numbers)
+                    block = np.moveaxis(moved[..., entries[0], entries[1]], 0, -1)
                     found[place] = numbers.add(found[place], block)
-    return found
+        return found
+
+    return at
 
 
 @dataclass(frozen=True, slots=True)
-class _Answer:
-    """How states of a part and of a channel answer to each unit of its luck's covariance."""
+class _Form:
+    """The moments E[l rᵀ] + E[r lᵀ] of forms of states times `by`, each unit of luck by itself, and `own`."""
 
-    states: int
-    moments: Matrix
-    covariances: Matrix
-    numbers: Arithmetic
+    left: Matrix
+    right: Matrix
+    by: Matrix
+    own: Matrix
 
-    def of(self, left: Matrix, right: Matrix) -> Matrix:
-        """Return the moments E[l rᵀ] of linear forms of states and luck."""
-        n, numbers = self.states, self.numbers
-        late = around(left[..., :n], self.moments, numbers, right[..., :n])
-        return numbers.add(late, around(left[..., n:], self.covariances, numbers, right[..., n:]))
+    def of(self, moments: Matrix, numbers: Arithmetic) -> Matrix:
+        """Return them for the moments of states (b, n, n)."""
+        found = around(self.left, moments, numbers, self.right)
+        found = numbers.add(found, np.swapaxes(found, -1, -2))
+        return numbers.add(scaled(found, self.by, numbers), self.own)
+
+
+@dataclass(frozen=True, slots=True)
+class _Answers:
+    """How far packets are from what is heard, `miss`, and what luck that is to channels.
+
+    `heard`: where each stands in G, its entries, whether it is lucky, and what the channel itself adds.
+    """
+
+    miss: _Form
+    heard: tuple[tuple[Any, NDArray[np.intp], Matrix, _Form | None], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Driven:
+    """A part driven by the luck of a channel: states by `matrix` and, for each unit, `driven` (b, n, n)."""
+
+    matrix: Matrix
+    driven: Matrix
+    answers: tuple[_Answers, ...]
+
+
+def _driven(of: Moments, part: Part, d: int, firsts: Sequence[int], numbers: Arithmetic) -> _Driven:
+    """Return how a part answers to the luck of channels of kind d."""
+    kind, channel = of.luck[d], part.channels[d]
+    n = channel.matrix.shape[-1]
+    covariances = of_kind(RADII.exact(units_of(kind)), numbers)
+
+    def form(left: Matrix, right: Matrix, by: float) -> _Form:
+        left, right, factor = of_kind(left, numbers), of_kind(right, numbers), number_of(by / 2, numbers)
+        own = around(left[..., n:], covariances, numbers, right[..., n:])
+        own = scaled(numbers.add(own, np.swapaxes(own, -1, -2)), factor, numbers)
+        return _Form(left[..., :n], right[..., :n], factor, own)
+
+    # One channel drives the mean of all receivers by 1/n, and them apart by 1 − 1/n or −1/n.
+    alone = 1 / kind.receivers
+    share = kind.heard * (alone if part.apart is None else 1 - alone)
+    answers = []
+    for (site, route, slot), miss in channel.misses.items():
+        heard = []
+        for c, other in enumerate(of.luck):
+            if (other.route, other.sender) != (route, part.classes[site]):
+                continue
+            own = None
+            if c == d and part.apart is None:
+                # o oᵀ + (m oᵀ + o mᵀ)/n, of which the form has both halves
+                mixed = RADII.add(scaled(miss, number_of(2 * alone, RADII), RADII), channel.own[slot])
+                own = form(mixed, channel.own[slot], 1.0)
+            elif c == d:
+                own = form(miss, channel.own[slot], -2 * alone)
+            entries = np.array(other.entries[slot], np.intp).reshape(-1, 2).T
+            first = firsts[c] + sum(map(len, other.entries[:slot]))
+            place = np.s_[..., first : first + entries.shape[1], firsts[d] : firsts[d + 1]]
+            heard.append((place, entries, of_kind(other.spreads[slot], numbers), own))
+        answers.append(_Answers(form(miss, miss, share), tuple(heard)))
+    driven = around(of_kind(channel.driven, numbers), covariances, numbers)
+    return _Driven(of_kind(channel.matrix, numbers), driven, tuple(answers))
 
 
 def units_of(kind: Luck) -> Floats:
@@ -357,7 +398,7 @@ def below_1(of: Moments) -> bool:
     driven, alone = of.means
     if not _square(alone)[1] < 1:
         return False
-    bounds = _bounds(partial(gain, of), 1.0) if driven else None
+    bounds = _bounds(gain_of(of), 1.0) if driven else None
     return not driven or (bounds is not None and bounds[1] < 1)
 
 

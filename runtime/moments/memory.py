@@ -153,12 +153,14 @@ def memory_of(
     doubt
         How far the share of packets that get lost may be off.
     """
-    return _memory_of(law, delay, tuple(sent), tuple(ticks.items()), frame, strictly, doubt)
+    assert law.trace is None, "recorded delays leave nothing to chance"
+    numbers = law.p, law.r, law.one_minus_h, law.one_minus_k, law.delay, law.jitter, law.distribution
+    return _memory_of(numbers, delay, tuple(sent), tuple(ticks.items()), frame, strictly, doubt)
 
 
 @functools.lru_cache(maxsize=LATELY)
 def _memory_of(
-    law: ChannelLaw,
+    numbers: tuple[float, float, float, float, float, float, str],
     delay: Fraction,
     sent: tuple[Fraction, ...],
     told: tuple[tuple[tuple[str, int], Fraction], ...],
@@ -166,7 +168,7 @@ def _memory_of(
     strictly: bool,
     doubt: float,
 ) -> Memory:
-    ticks = dict(told)
+    law, ticks = ChannelLaw(*numbers, None), dict(told)
     ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
     unit = math.lcm(*(one.denominator for one in (frame, *sent, *ticks.values())))
     length, starts = int(frame * unit), [int(one * unit) for one in reversed(sent)]

@@ -25,7 +25,7 @@ from apc.moments.almost_sure import AlmostSure, almost_sure, unplayed
 from apc.moments.bursts import tagged_radius
 from apc.moments.crowd import crowd
 from apc.moments.errors import Told, crowd_error, pattern_error, standing_error, tagged_error
-from apc.moments.gains import gain, mean_square_radius, too_much
+from apc.moments.gains import gain_of, mean_square_radius, too_much
 from apc.moments.memory import is_memoryless
 from apc.moments.patterns import MOST_CHANNELS, pattern_radius, patterns
 from apc.moments.stand_in import stand_in
@@ -161,7 +161,7 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
             states = [channel.matrix.shape[-1] for part in of.parts for channel in part.channels.values()]
             if why := too_much(entries, max(states, default=0)):
                 return Growth(np.nan, 0.0, np.inf, False, why)
-            inner = mean_square_radius(*of.means, partial(gain, of), bounded=bounded)
+            inner = mean_square_radius(*of.means, gain_of(of), bounded=bounded)
             errors = partial(crowd_error, system, prepared)
             quick = entries * max(states, default=0) ** 3 <= QUICK
             return Growth(inner.radius, inner.low, inner.high, True, proved=True, quick=quick, errors=errors)
