@@ -1,7 +1,7 @@
 """The whole answer of `apc analyze`: the verdict, and what stands beside it.
 
 Takes: a `CompiledSystem`.
-Gives: `Answer`, `answer`, `judge`; `sensitivities_of`.
+Gives: `Answer`, `NetworkAnswer`, `answer`, `judge`; `sensitivities_of`, `proved_box`.
 Guarantees: what stands beside the verdict never changes it; what could not be had is said in a note.
 Does not: compute any of it itself.
 """
@@ -42,12 +42,24 @@ MOST_TICKS, MOST_PRODUCTS = 500, 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
+class NetworkAnswer(Result):
+    """A verdict over the network as it is, with the sensitivities and margins of its growth."""
+
+    shown_by = "analysis:network_answer"
+
+    verdict: NetworkVerdict
+    sensitivities: Sensitivities
+    margins: Margins
+
+
+@dataclass(frozen=True, slots=True)
 class Answer(Result):
     """An analysis with what moves its spectral radius most, its margins, and its modes of contact.
 
     `conventions` holds the analyses under every order of coincident events, or under those that could be had
     in passing; `detailed` says that they were asked for. `box` is the proof over a box of parameters, where
-    one was asked for. `network` is the verdict over the network as it is, None where all packets are on time.
+    one was asked for. `network` is the verdict over the network as it is, with what moves the growth of mean
+    squares and how far that lets each number grow; None where all packets are on time.
     `switching` says whether contacts may open and close at will, None where nothing switches; `buzz` is None
     where it was not asked for.
     """
@@ -55,7 +67,7 @@ class Answer(Result):
     shown_by = "analysis:answer"
 
     analysis: Analysis
-    network: NetworkVerdict | None
+    network: NetworkAnswer | None
     sensitivities: Sensitivities
     margins: Margins
     contact_modes: ContactModes | None
@@ -129,27 +141,35 @@ def answer(
     compared = conventions(system, prepared=prepared, default=found, quick=not every_convention)
     if compared.not_repeated and not every_convention:
         notes = (*notes, compared.not_repeated)
+    nominal = _margins(system, prepared, found)
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
-        network=_over_network(system, prepared, certify=certify),
+        network=_over_network(system, prepared, nominal, certify=certify),
         sensitivities=sensitivities_of(system, prepared, found),
-        margins=_margins(system, prepared, found),
+        margins=nominal,
         contact_modes=modes,
         switching=_switching(system, prepared, modes) if modes else None,
         buzz=_buzz(system, prepared, modes) if with_buzz else None,
         conventions=compared,
         detailed=every_convention,
-        box=_prove_box(system, box) if box else None,
+        box=proved_box(system, box) if box else None,
     )
 
 
-def _over_network(system: CompiledSystem, prepared: Prepared, *, certify: bool) -> NetworkVerdict | None:
-    """Return the verdict over the network as it is; imported here, as most scenes have an ideal one."""
+def _over_network(
+    system: CompiledSystem, prepared: Prepared, nominal: Margins, *, certify: bool
+) -> NetworkAnswer | None:
+    """Return the answer over the network as it is; imported here, as most scenes have an ideal one."""
     if all(link.channel is None for link in system.links):
         return None
     from apc.moments.network import judge_network
+    from apc.vary.over_network import network_margins, network_sensitivities
 
-    return judge_network(system, prepared, certify=certify)
+    verdict = judge_network(system, prepared, certify=certify)
+    if verdict is None:
+        return None
+    moved = network_sensitivities(system, prepared)
+    return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal))
 
 
 def _switching(system: CompiledSystem, prepared: Prepared, modes: ContactModes) -> Switching:
@@ -166,10 +186,29 @@ def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None
     return buzz(system, prepared=prepared, modes=modes)
 
 
-def _prove_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:
-    """Return the proof over a box; imported here, as few analyses ask for one."""
-    from apc.analysis.box_proof import prove_box
+def proved_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:
+    """Return the proof over a box; imported here, as few analyses ask for one.
 
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    box
+        Ranges of parameters.
+
+    Raises
+    ------
+    ApcError
+        As `box_proof.prove_box`, or `moments.box.prove_box` where links are, or may become, unreliable.
+    """
+    from apc.analysis.box_proof import prove_box
+    from apc.network.nominal import channel_numbers, left_out
+
+    numbers = channel_numbers(system)
+    if left_out(system) or any(one.free.name in numbers for one in box):
+        from apc.moments.box import prove_box as prove_over_network
+
+        return prove_over_network(system, box)
     return prove_box(system, box)
 
 

@@ -385,12 +385,11 @@ def prove_box(
     box
         Ranges by parameter, such as {"contact.stiffness": "±1%"} or "900 N/m:1100 N/m".
     """
-    from apc.analysis import box_proof
     from apc.analysis.box import parse_range
+    from apc.answer import proved_box
 
     system = _model(model, set)
-    ranges = [parse_range(system, f"{name}={value}") for name, value in box.items()]
-    return box_proof.prove_box(system, ranges)
+    return proved_box(system, [parse_range(system, f"{name}={value}") for name, value in box.items()])
 
 
 def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> PaperRoute:

@@ -12,6 +12,7 @@ import random
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -31,6 +32,9 @@ ESTIMATED = 1e-4
 
 # Numbers of all second moments that a quick run follows.
 FEW = 20_000
+
+# Draws after which a long run says how far it is.
+EVERY = 10
 
 MILLISECOND = Fraction(1, 1000)
 
@@ -228,8 +232,10 @@ def _size(system: CompiledSystem, laws: dict[str, Law]) -> int:
     return math.prod(way.states for way in laid.ways) * laid.size**2
 
 
-def run(count: int, *, seed: int = 0, quick: bool = False) -> Tally:
-    """Judge so many scenes."""
+def run(
+    count: int, *, seed: int = 0, quick: bool = False, told: Callable[[int, Tally], None] | None = None
+) -> Tally:
+    """Judge so many scenes; `told` is told after each draw how many there were and what came out so far."""
     tally = Tally()
     with own_library() as library:
         number = 0
@@ -237,12 +243,30 @@ def run(count: int, *, seed: int = 0, quick: bool = False) -> Tally:
             one = draw(random.Random(1_000_003 * seed + number), quick=quick)
             check(one, library, tally, FEW if quick else MOST)
             number += 1
+            if told is not None:
+                told(number, tally)
     return tally
+
+
+def _progress(start: float) -> Callable[[int, Tally], None]:
+    """Return what prints each wrong verdict as it comes, and every `EVERY` draws the tally so far."""
+    shown = 0
+
+    def told(number: int, tally: Tally) -> None:
+        nonlocal shown
+        for text in tally.wrong[shown:]:
+            print(f"wrong, draw {number - 1}: {text}", flush=True)
+        shown = len(tally.wrong)
+        if number % EVERY == 0:
+            first = f"{tally}".partition(", not judged:")[0]
+            print(f"{number} draws, {time.perf_counter() - start:.0f} s: {first}", flush=True)
+
+    return told
 
 
 if __name__ == "__main__":
     count, seed = (*(int(one) for one in sys.argv[1:]), *(500, 0)[len(sys.argv) - 1 :])
     start = time.perf_counter()
-    found = run(count, seed=seed)
-    print(found, f"{time.perf_counter() - start:.0f} s", *found.wrong, sep="\n")
+    found = run(count, seed=seed, told=_progress(start))
+    print(found, f"{time.perf_counter() - start:.0f} s", sep="\n")
     sys.exit(bool(found.wrong))

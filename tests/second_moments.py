@@ -189,12 +189,26 @@ class _Played:
         self.size = first
 
     def without_standing(self) -> Floats:
-        """Return the projection that takes off what stands still in every draw."""
+        """Return the projection that takes off what stands still in every draw, and what nobody reads."""
         generator = np.random.default_rng(0)
         rows = [self._drawn(generator) - np.eye(self.size) for _ in range(12)]
         _, values, vectors = np.linalg.svd(np.concatenate(rows))
-        still = vectors[values < STANDING * values[0]]
-        return np.eye(self.size) - still.T @ still
+        unread = np.eye(self.size)[[place for place in self._registers if not self._read[place]]]
+        gone, _ = np.linalg.qr(np.concatenate([unread, vectors[values < STANDING * values[0]]]).T)
+        return np.eye(self.size) - gone @ gone.T
+
+    @property
+    def _registers(self) -> list[int]:
+        return [place for way in self.ways for place in range(way.register.start, way.register.stop)]
+
+    @property
+    def _read(self) -> NDArray[np.bool_]:
+        """Say of each number whether another follows from it: what is held and never read lasts."""
+        found = np.zeros(self.size, dtype=bool)
+        for kind, *what in self.record:
+            for modes in np.ndindex(*(way.states for way in self.ways)) if kind == "map" else ():
+                found |= (what[0](modes) - np.eye(self.size)).any(axis=0)
+        return found
 
     def _drawn(self, generator: np.random.Generator) -> Floats:
         """Return the matrix of a frame, drawn at random."""

@@ -49,9 +49,9 @@ HOUSE = (
         """
         exact names parameters overrides
         discretize radius exchange
-        site jacobians start linearize
+        site jacobians start devices linearize
         schedule liveness hyperperiod scheduling
-        lift batch_lift course residues
+        lift ports batch_lift course residues
         """,
     ),
     ("apc.network", "philox channel nominal timetable"),
@@ -81,14 +81,15 @@ HOUSE = (
         "apc.moments",
         """
         memory mean_loops gains crowd held worst almost_sure stand_in patterns bursts traces
-        hands errors network
+        hands errors network box
         """,
     ),
+    ("apc.hands", "port passivity response norms feel"),
     (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator leading many bends marginal
-        delays lags search mean_square critical margins sensitivity
+        delays lags search mean_square critical margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),
@@ -110,14 +111,14 @@ HOUSE = (
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",
-        "forms pictures network analysis vary region_picture region simulation still recording bench",
+        "forms pictures network hands analysis vary region_picture region simulation still recording bench",
     ),
     # what a person calls
     (
         "apc",
         "inputs api",
     ),
-    ("apc.cli", "options progress region simulate sweep critical bench analyze commands"),
+    ("apc.cli", "options progress region simulate sweep critical feel bench analyze commands"),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())

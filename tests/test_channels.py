@@ -287,3 +287,35 @@ def test_it_is_listed_and_drawn_in_words() -> None:
     assert channel(text.partition("8 ms, ")[2].partition("}\n")[0]).told == lines
     listed = describe(scene(text))
     assert all(f"  {line}\n" in f"{listed}\n" for line in lines)
+
+
+# ---- what can be studied ----
+
+
+@pytest.mark.parametrize(
+    ("said", "name", "span", "ends"),
+    [
+        ("loss: 10 %", "lan.loss", "0 %, 60 %", (Fraction(0), Fraction(3, 5))),
+        ("loss: {p: 1 %, r: 10 %}", "lan.loss.r", "2 %, 0.9", (Fraction(1, 50), Fraction(9, 10))),
+        ("jitter: 2 ms", "lan.jitter", "0 ms, 4 ms", (Fraction(0), Fraction(1, 250))),
+    ],
+)
+def test_what_a_link_loses_by_can_be_an_axis_of_a_study(
+    said: str, name: str, span: str, ends: tuple[Fraction, Fraction]
+) -> None:
+    [x, _] = scene(_with_study(says(said), f"{name}: [{span}]")).region
+    assert (x.parameter, x.low, x.high) == (name, *ends)
+
+
+def test_an_axis_of_losses_is_a_probability_that_follows_from_no_other() -> None:
+    [beyond] = told(scene, _with_study(says("loss: 10 %"), "lan.loss: [0 %, 120 %]"))
+    assert beyond.endswith("E207 lan.loss wants 100 % or less, got 120 %.")
+    [follows] = told(scene, _with_study(says("loss: 10 %"), "lan.loss.r: [1 %, 90 %]"))
+    assert follows.endswith("the nearest is lan.loss. Write: lan.loss")
+
+
+def _with_study(text: str, axis: str) -> str:
+    before = text.partition("studies:")[0]
+    return (
+        f"{before}studies: {{region: {{x: {{{axis}}}, y: {{coordination.stiffness: [0 N/m, 1500 N/m]}}}}}}\n"
+    )

@@ -158,7 +158,7 @@ E894 runtime/simulation: nothing is left to chance
 E895 runtime/simulation: a process that played runs ended
 E896 runtime/network: a number of unreliable links can't be varied
 E897 runtime/moments: no pattern of losses that shakes the scene can be played
-E898 runtime/vary: a scene can't be judged in mean square, or what is asked can't be varied there
+E898 runtime/moments runtime/vary: a scene can't be judged in mean square, or not what is varied
 E901 runtime/regions: an axis of a region is missing or written wrong
 E902 runtime/regions: a parameter is set or varied twice in a region
 E903 runtime/regions: a parameter can't be an axis of a region

@@ -55,7 +55,6 @@ def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
             "lan.jitter",
             "--in mean-square",
         ),
-        (["analyze", "s.yaml", "--box", "lan.loss=1 %:5 %"], "lan.loss", 'apc simulate --set lan.loss="5 %"'),
     ],
 )
 def test_a_nominal_question_about_lost_or_late_packets_is_refused_by_name(

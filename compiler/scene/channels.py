@@ -1,6 +1,7 @@
 """How unreliable a link is, as its entry says it: lost packets, jitter, a recorded trace.
 
-Takes: the YAML nodes of a link's `loss` and `trace`, its `jitter` and words. Gives: `SceneChannel`.
+Takes: the YAML nodes of a link's `loss` and `trace`, its `jitter` and words. Gives: `SceneChannel`,
+`read_channel`, `PROBABILITY`.
 Guarantees: probabilities lie from 0 to 1; nothing is said that has no effect.
 Does not: draw a packet (see the runtime), or know how late a reliable packet is.
 
@@ -19,11 +20,13 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.errors import Mistakes
+from apc.compiler.components.component import Number as Parameter
+from apc.compiler.errors import Mistakes, Place
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Binary, Name, Number
 from apc.compiler.language.recordings import read_trace
 from apc.compiler.language.tables import NamedFiles
+from apc.compiler.language.units import Unit
 from apc.compiler.language.values import Value
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar
@@ -32,6 +35,20 @@ from apc.compiler.source.reading import brief, check_keys, read_text
 PROBABILITIES = ("p", "r", "1-h", "1-k")  # netem's names, in netem's order
 LOSS_EXAMPLE = "loss: {p: 1 %, r: 25 %}"
 _EXAMPLES = {"loss": "loss: 2 %", "jitter": "jitter: 2 ms", "trace": "trace: delays.csv"}
+# What a number of a link's losses is, where one is read.
+PROBABILITY = Parameter(
+    name="probability",
+    unit=Unit("%", Fraction(1, 100), DIMENSIONLESS),
+    default=None,
+    minimum=Fraction(0),
+    open_minimum=False,
+    maximum=Fraction(1),
+    divided=False,
+    words=(),
+    about="",
+    place=Place("probability"),
+)
+
 # What each word is about: it says nothing on a link that has none of them.
 _ABOUT = {"distribution": ("jitter",), "reorder": ("jitter", "trace"), "on_loss": ("loss", "trace")}
 

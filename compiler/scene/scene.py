@@ -23,6 +23,7 @@ from apc.compiler.errors import Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import Value
+from apc.compiler.scene.channels import PROBABILITY
 from apc.compiler.scene.groups import Columns, GroupBody, read_counts, read_settings, with_followers
 from apc.compiler.scene.instances import Part, PartReader, settable_names
 from apc.compiler.scene.links import SceneLink, read_link
@@ -167,7 +168,9 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
         for part in parts
         if part.section == "links" and "." not in part.name
     ]
+    read_links = tuple(link for link in links if link is not None)
     settable = settable_names(parts)
+    varied = settable | _of_losses(read_links)
     return Scene(
         title,
         about,
@@ -175,12 +178,23 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
         tuple(numbers.values.items()),
         _read_groups(bodies, settable, parts, clocks, sections, numbers),
         tuple(part for part in parts if part.section != "links"),
-        tuple(link for link in links if link is not None),
+        read_links,
         read_experiment(root.get("experiment"), numbers.read_time, mistakes),
-        read_region(root.get("studies"), settable, sections.is_reported, numbers.read_for, mistakes),
+        read_region(root.get("studies"), varied, sections.is_reported, numbers.read_for, mistakes),
         tuple(sorted(files.digests.items())),
         root.place,
     )
+
+
+def _of_losses(links: Collection[SceneLink]) -> dict[str, list[tuple[str, Settable]]]:
+    """Return the probabilities of links' losses that can vary: those that follow from no other."""
+    return {
+        name: [(name, PROBABILITY)]
+        for link in links
+        if link.channel is not None
+        for name, value in link.channel.loss
+        if value.expression is None
+    }
 
 
 def _required(root: Mapping, key: str, example: str, mistakes: Mistakes) -> Node | None:

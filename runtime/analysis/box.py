@@ -1,7 +1,7 @@
 """Which parameters a box leaves open, and how far: `contact.stiffness=±1%`.
 
 Takes: a `CompiledSystem` and ranges as text.
-Gives: `parse_range`; `Box`, `open_box`.
+Gives: `parse_range`; `Box`, `open_box`; `OpenSites`, `open_sites`.
 Guarantees: a site's matrices are exact quotients of polynomials in the open parameters, and what depends on
 these by an expression follows.
 Does not: prove anything (see `box_proof`).
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups, prepare
+from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -29,6 +29,7 @@ from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios
 from apc.frame.exact import evaluate_exact
+from apc.frame.exchange import Exchange
 from apc.frame.linearize import site_of_entries
 from apc.frame.names import Free, Range, find
 from apc.frame.overrides import Override, apply
@@ -71,8 +72,8 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
     Raises
     ------
     ApcError
-        E830 not of that form, E831 a parameter that a box can't leave open, E833 limits that can't be; E896
-        a number of an unreliable link; those of `names.find` and `units.quantity`.
+        E830 not of that form, E831 a parameter that a box can't leave open, E833 limits that can't be; those
+        of `names.find` and `units.quantity`.
     """
     # Imported here: the language of quantities, which an analysis without a box never needs.
     from apc.compiler.language.units import quantity
@@ -81,7 +82,6 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
     if not (equals and name and value):
         raise _malformed(text, place)
     free = find(system, name, place)
-    refuse_channel_number(system, free, place)
     parameter = _parameter(system, free, place)
     if value.startswith(("±", "+-")):
         share = _percentage(value.removeprefix("±").removeprefix("+-"), text, place)
@@ -158,12 +158,56 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
     Raises
     ------
     ApcError
+        E896 a number of an unreliable link; those of `open_sites`.
+    """
+    for one in ranges:
+        refuse_channel_number(system, one.free, _PLACE)
+    prepared = prepare(system)
+    found = open_sites(system, ranges, prepared, lambda changed: lifted_groups(changed, prepared=prepared))
+    systems = split(found.groups, found.exchange).systems
+    by_site = {id(group.site): found.sites[group.name] for group in found.groups}
+    sites = tuple(tuple(by_site[id(group.site)] for group in one.sites) for one in systems)
+    return Box(tuple(ranges), systems, sites)
+
+
+@dataclass(frozen=True, slots=True)
+class OpenSites:
+    """A scene's peers where they are alike only if they are alike all over a box.
+
+    `at` is the scene there, `sites` the matrices of each group by its name, over `Fraction` and `Ratio`.
+    """
+
+    at: CompiledSystem
+    groups: tuple[PeerGroup, ...]
+    exchange: Exchange
+    sites: Mapping[str, LinearSite]
+
+
+def open_sites(
+    system: CompiledSystem,
+    ranges: Sequence[Range],
+    prepared: Prepared,
+    lifted: Callable[[CompiledSystem], tuple[tuple[PeerGroup, ...], Exchange]],
+) -> OpenSites:
+    """Leave parameters of a scene's peers open.
+
+    Parameters
+    ----------
+    system, ranges
+        The compiled scene and what is left open.
+    prepared
+        From `analysis.prepare`.
+    lifted
+        Gives the peers of a scene in groups, lifted.
+
+    Raises
+    ------
+    ApcError
         E831 a parameter left open twice, E832 a scene that is no rational function of the parameters.
     """
     for place, one in enumerate(ranges):
         if any(other.free.meets(one.free) for other in ranges[:place]):
             raise ApcError(Mistake("E831", _PLACE, f"{one.free.label} is left open twice"))
-    prepared = prepare(system)
     if not all(site.parameters_suffice for site in prepared.jacobians):
         what = f"{system.name} is not linear: where it is linearized may move with the parameters"
         raise ApcError(Mistake("E832", Place(system.name), what))
@@ -171,19 +215,18 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
     opened = [_opened(system, group, ranges, field) for group in system.groups]
     for share in GENERIC:
         point = [Override(one.free, one.low + share * (one.high - one.low)) for one in ranges]
-        groups, exchange = lifted_groups(apply(system, point), prepared=prepared)
+        at = apply(system, point)
+        groups, exchange = lifted(at)
         members = [_members(group, exchange.starts) for group in groups]
         if all(len({_reach(opened[place]) for place in own}) == 1 for own in members):
             break
     else:
         raise AssertionError("peers of different groups are alike at three places of the box")
-    systems = split(groups, exchange).systems
-    known: dict[str, LinearSite] = {}
-    for group, own in zip(groups, members, strict=True):
-        known[group.name] = _open_site(group, opened[own[0]], system)
-    by_site = {id(group.site): known[group.name] for group in groups}
-    sites = tuple(tuple(by_site[id(group.site)] for group in one.sites) for one in systems)
-    return Box(tuple(ranges), systems, sites)
+    sites = {
+        group.name: _open_site(group, opened[own[0]], system)
+        for group, own in zip(groups, members, strict=True)
+    }
+    return OpenSites(at, groups, exchange, sites)
 
 
 def _members(group: PeerGroup, starts: NDArray[np.int64]) -> list[int]:

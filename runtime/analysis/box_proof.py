@@ -1,7 +1,8 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
 Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `prove_box`.
+Gives: `BoxProof`, `prove_box`; `Cell`, `halved`, `Halved`, `middle`, `site_at`, `range_ball`; `BITS`,
+`UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
 
@@ -15,9 +16,10 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import flint
@@ -134,13 +136,13 @@ def _prove_box(name: str, box: Box) -> BoxProof:
             notes.append(f"{system.name} {what}: nothing can be proved for a whole box")
             continue
         questions.append(_question(system, sites, free))
-    corners = [_middle(whole), *itertools.product(*whole)]
+    corners = [middle(whole), *itertools.product(*whole)]
     for question, point in itertools.product(questions, corners):
         if _is_unstable(question, point):
             return _answer(name, box, UNSTABLE, False, 1, 1.0, point)
     cells, left, where = 0, 1.0 if notes else 0.0, tuple[Fraction, ...]()
     for question in questions:
-        found = _search(question, whole)
+        found = halved(whole, partial(_reach_out, question), partial(_is_unstable, question))
         cells += found.cells
         if found.unstable:
             return _answer(name, box, UNSTABLE, False, cells, 1.0, found.point)
@@ -152,7 +154,7 @@ def _prove_box(name: str, box: Box) -> BoxProof:
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class Halved:
     """What a search in the box found: where it is unstable, or is left open."""
 
     cells: int
@@ -179,28 +181,43 @@ def _question(system: ClosedSystem, sites: tuple[LinearSite, ...], free: RigidMo
     return _Question(system, sites, free.exact, independent_places(free.basis.T))
 
 
-def _search(question: _Question, whole: Cell) -> _Found:
-    """Prove cell after cell, the largest first."""
+def halved(
+    whole: Cell,
+    reach_out: Callable[[Cell], Floats | None],
+    is_unstable: Callable[[tuple[Fraction, ...]], bool],
+) -> Halved:
+    """Prove cell after cell, the largest first.
+
+    Parameters
+    ----------
+    whole
+        The box.
+    reach_out
+        Returns None when a cell is proved, or else how much each parameter matters in it.
+    is_unstable
+        Whether it is proved unstable at a point.
+    """
     waiting = deque([whole])
     looked = 0
     while waiting and looked < MOST_CELLS:
         cell = waiting.popleft()
         looked += 1
-        reach = _reach_out(question, cell)
+        reach = reach_out(cell)
         if reach is None:
             continue
-        middle = _middle(cell)
-        if _is_unstable(question, middle):
-            return _Found(looked, 1.0, True, middle)
+        inner = middle(cell)
+        if is_unstable(inner):
+            return Halved(looked, 1.0, True, inner)
         widest = int(np.argmax(reach))
         low, high = cell[widest]
-        for half in ((low, middle[widest]), (middle[widest], high)):
+        for half in ((low, inner[widest]), (inner[widest], high)):
             waiting.append((*cell[:widest], half, *cell[widest + 1 :]))
     share = float(sum((_volume(cell) for cell in waiting), Fraction(0)) / _volume(whole))
-    return _Found(looked, share, False, _middle(waiting[0]) if waiting else ())
+    return Halved(looked, share, False, middle(waiting[0]) if waiting else ())
 
 
-def _middle(cell: Cell) -> tuple[Fraction, ...]:
+def middle(cell: Cell) -> tuple[Fraction, ...]:
+    """Return the middle of a cell."""
     return tuple((low + high) / 2 for low, high in cell)
 
 
@@ -219,7 +236,7 @@ def _is_unstable(question: _Question, point: Sequence[Fraction]) -> bool:
 
 def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
     """Return the matrix in relative coordinates at a point of balls, or its slope by a parameter there."""
-    sites = [_site_at(site, point, by) for site in question.sites]
+    sites = [site_at(site, point, by) for site in question.sites]
     steps = [
         frame_steps(site, group.schedule, step_duals)
         for site, group in zip(sites, question.system.sites, strict=True)
@@ -230,7 +247,7 @@ def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
     return reduced_balls(matrix, question.vectors, question.held)
 
 
-def _site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSite:
+def site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSite:
     """Return a site's matrices at a point; `by` a parameter, each entry that depends on it with its slope."""
 
     def at(entry: Any) -> Any:
@@ -246,9 +263,8 @@ def _site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSi
 
 def _reach_out(question: _Question, cell: Cell) -> Floats | None:
     """Return None when a cell is proved, or else how much each parameter moves the matrix in it."""
-    middle = _middle(cell)
-    balls = [_ball(low, high) for low, high in cell]
-    centre = square(_matrix(question, [rational_ball(value) for value in middle], None))
+    balls = [range_ball(low, high) for low, high in cell]
+    centre = square(_matrix(question, [rational_ball(value) for value in middle(cell)], None))
     slopes = [square(_matrix(question, balls, by)) for by in range(len(cell))]
     reaches = [rational_ball((high - low) / 2) for low, high in cell]
     n = centre.nrows()
@@ -273,7 +289,8 @@ def _reach_out(question: _Question, cell: Cell) -> Floats | None:
     return np.array([float(_frobenius(one).mid()) for one in turned])
 
 
-def _ball(low: Fraction, high: Fraction) -> Any:
+def range_ball(low: Fraction, high: Fraction) -> Any:
+    """Return a ball that holds a range."""
     return flint.arb(rational_ball(low)).union(flint.arb(rational_ball(high)))
 
 

@@ -42,8 +42,8 @@ SECONDS_A_PEER = 1e-4
     "box",
     multiple=True,
     metavar="PATH=±P%",
-    help="Prove stability for every value within, e.g. --box contact.stiffness=±1%, or "
-    '--box "contact.stiffness=900 N/m:1100 N/m". May be repeated.',
+    help="Prove stability for every value within, over the network as it is, e.g. "
+    '--box contact.stiffness=±1%, or --box "contact.stiffness=900 N/m:1100 N/m". May be repeated.',
 )
 @click.option(
     "--conventions",

@@ -21,24 +21,24 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import Clock, CompiledSystem, Kind
 from apc.eigen.closing import Coupling, Loop, without_packets
-from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
 from apc.eigen.peer_group import PeerGroup, used_ways
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.parameters import resolve
-from apc.frame.radius import radius_of, value_of, with_radius
+from apc.frame.radius import with_radius
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
 from apc.moments.gains import Luck, Moments, Part
 from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember
-from apc.moments.memory import CHANCE_ROUNDINGS, memory_of
+from apc.moments.memory import memory_of
 from apc.network.channel import ChannelLaw, channel_law
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 Flags = NDArray[np.bool_]
+
+NO_DOUBTS: Mapping[str, float] = {}
 
 # A link on which every packet takes the nominal delay.
 PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
@@ -127,7 +127,13 @@ def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
     )
 
 
-def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = None) -> Moments:
+def crowd(
+    system: CompiledSystem,
+    prepared: Prepared,
+    *,
+    told: Hearing | None = None,
+    doubts: Mapping[str, float] = NO_DOUBTS,
+) -> Moments:
     """Make the mean loops of a scene and the luck that drives them.
 
     Parameters
@@ -138,11 +144,13 @@ def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = 
         From `analysis.prepare`, of this system with any numbers.
     told
         Its peers, where they are not those of `hearing`.
+    doubts
+        How far the share of packets that a link loses may be off, by the link's name.
     """
     told = told or hearing(system, prepared)
     loops, weights = peer_classes(told)
     common = loops[0]
-    remembered = {one.route: one for one in remembered_of(system, told, common)}
+    remembered = {one.route: one for one in remembered_of(system, told, common, doubts=doubts)}
     listened = _listened(common, weights, list(remembered.values()))
     luck = [
         Luck(
@@ -155,7 +163,7 @@ def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = 
         )
         for g, one in listened
     ]
-    parts, bounds = [], []
+    parts = []
     for place, loop in enumerate(loops):
         alone = _class_apart(loops, place)
         own = {
@@ -166,12 +174,9 @@ def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = 
         mean, channels = mean_loop(
             loop, told.of(loop), list(remembered.values()), list(own.values()), standing_motions(loop)
         )
-        _, found = enclose_eigenvalues(value_of(mean.matrix), radius_of(mean.matrix))
-        bounds.append((found.low, found.high))
         classes = tuple(range(len(loop.sites))) if alone is None else (alone,)
         parts.append(Part(mean, alone, classes, dict(zip(own, channels, strict=True))))
-    low, high = np.max(bounds, axis=0).tolist()
-    return Moments(tuple(parts), tuple(luck), (low, high))
+    return Moments(tuple(parts), tuple(luck))
 
 
 def standing_motions(loop: Loop) -> Floats:
@@ -189,8 +194,8 @@ def _class_apart(loops: Sequence[Loop], place: int) -> int | None:
 def _spreads(one: Remembered) -> tuple[Matrix, ...]:
     """Return the covariances of each slot's luck: all numbers of a packet have the same."""
     numbers = np.ones((len(one.channels), len(one.channels)))
-    spreads = [np.kron(numbers, one.memory.spread(slot)) for slot in range(one.memory.slots)]
-    return tuple(with_radius(spread, 2 * CHANCE_ROUNDINGS * UNIT * spread) for spread in spreads)
+    spreads = [one.memory.spread(slot) for slot in range(one.memory.slots)]
+    return tuple(with_radius(np.kron(numbers, spread), np.kron(numbers, off)) for spread, off in spreads)
 
 
 def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
@@ -220,7 +225,12 @@ def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
 
 
 def remembered_of(
-    system: CompiledSystem, told: Hearing, common: Loop, *, perfect: bool = False
+    system: CompiledSystem,
+    told: Hearing,
+    common: Loop,
+    *,
+    perfect: bool = False,
+    doubts: Mapping[str, float] = NO_DOUBTS,
 ) -> list[Remembered]:
     """Return what is remembered on each route that anybody listens to.
 
@@ -232,22 +242,26 @@ def remembered_of(
         The loop of all classes.
     perfect
         Whether every packet counts as on time.
+    doubts
+        As for `crowd`.
     """
     heard: dict[Route, list[Selected]] = {}
     for site, rows in zip(common.sites, told.of(common), strict=True):
-        felt: Flags = np.any(site.lifted.q, axis=0) | np.any(site.lifted.d, axis=0)
+        size = site.lifted.mapped(lambda block, off: np.abs(block) + off, site.lifted.error)
+        felt: Flags = np.any(size.q, axis=0) | np.any(size.d, axis=0)
         for place, row in enumerate(rows):
             if felt[place] and not row.gap:
                 heard.setdefault((row.way.link, row.way.delay), []).append(row)
     links = {link.name: link for link in system.links}
-    clocks = {clock.name: clock for clock in system.clocks}
     found = []
+    times = {one.name: instants(told, one) for one in system.clocks}
     for route, listed in sorted(heard.items()):
         link, delay = links[route[0]], told.timings[route[1]]
-        sent = instants(told, clocks[link.clock])
-        ticks = {(row.clock, row.tick): instants(told, clocks[row.clock])[row.tick] for row in listed}
+        sent = times[link.clock]
+        ticks = {(row.clock, row.tick): times[row.clock][row.tick] for row in listed}
         law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
-        memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly)
+        off = doubts.get(route[0], 0.0)
+        memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly, doubt=off)
         found.append(remember(route, memory, sorted({row.channel for row in listed})))
     return found
 

@@ -30,8 +30,9 @@ from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.moments.bursts import tagged_moments
 from apc.moments.crowd import crowd, hearing, peer_classes
-from apc.moments.gains import Moments, around, gain, number_of, scaled, stein, units_of
+from apc.moments.gains import Moments, around, gain_of, number_of, stein, units_of
 from apc.moments.hands import Copy, Peer, forced
+from apc.moments.mean_loops import scaled
 from apc.moments.patterns import every_pattern, frames, of_all, resting_moments
 from apc.moments.stand_in import Classes, entries_of, luck_after, luck_of_luck, spread_of, standing_in
 
@@ -280,7 +281,7 @@ def _rounded(number: Fraction) -> tuple[float, float]:
 
 def _with_luck(of: Moments, spreads: Sequence[_Spread]) -> list[_Spread] | None:
     """Return moments with what the luck of channels adds, None where rounding leaves them open."""
-    matrix = gain(of, 1.0, RADII)
+    matrix = gain_of(of)(1.0, RADII)
     if matrix is None:
         return None
     first = _first_luck(of, spreads)

@@ -1,8 +1,8 @@
 """The spectral radius of second moments, from how luck drives itself.
 
 Takes: the mean loops of a scene and what the luck of its channels does to them.
-Gives: `Luck`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `Gain`; `stein`, `around`,
-`scaled`, `of_kind`, `number_of`, `units_of`, `too_much`.
+Gives: `Luck`, `Part`, `Moments`; `gain_of`, `mean_square_radius`, `Enclosed`, `Gain`; `below_1`; `stein`,
+`around`, `of_kind`, `number_of`, `units_of`, `too_much`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd`).
 
@@ -15,7 +15,7 @@ eigenvalue of G is 1, or by ρ(A)² where it is smaller than 1 all the way down.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.enclosure import enclose_eigenvalues
+from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
-from apc.moments.mean_loops import Channel, MeanLoop, Route
+from apc.moments.mean_loops import Channel, MeanLoop, Route, scaled
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -39,18 +40,21 @@ NOTHING = 1e-24
 # Doublings until a sum counts as endless, 2^60 frames; or where what is doubled has grown to this.
 DOUBLINGS, ENDLESS = 60, 1e100
 
-# Steps towards the radius; secants need some ten. The first is so near above the means' own growth.
-STEPS, NEAR = 60, 1e-9
+TINY = float(np.finfo(np.float64).tiny)
 
-# How far above the means' own growth, or this, G is first looked for to be small, and how much farther each
-# time.
-LEAST, FIRST_GAP, WIDER = 1e-3, 1e-3, 30
+# Steps towards the radius; secants need some five. After so many without a λ at which G is large, it is
+# looked at so near above the means' own growth.
+STEPS, BLIND, NEAR = 60, 4, 1e-9
 
-# How near 1 is near enough; and as far from it, slopes are not rounding.
-CLOSE, ROUGH = 1e-13, 1e-6
+# G is first looked at where it decides the verdict, at 1, if the means decay by more than this; else so far
+# above their own growth, and at most so many times farther each time.
+NEAR_ONE, FIRST_GAP, WIDER = 0.99999, 0.1, 30
+
+# How near the radius is near enough, relatively; and as far from 1, the slopes of G are not rounding.
+CLOSE, ROUGH = 1e-14, 1e-6
 
 # How near it is enclosed at first, relatively, and how much farther at last.
-FIRST_WIDTH, LAST_WIDTH = 1e-11, 1e-3
+FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
 
 
 # Covariances of luck times cubes of the means' states: as much takes some ten seconds.
@@ -106,11 +110,16 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """All loops and all kinds of luck of a scene; `means` are bounds on the means' spectral radius."""
+    """All loops and all kinds of luck of a scene."""
 
     parts: tuple[Part, ...]
     luck: tuple[Luck, ...]
-    means: tuple[float, float]
+
+    @property
+    def means(self) -> tuple[list[Matrix], list[Matrix]]:
+        """The matrices of the loops, those that luck drives first."""
+        own = [part.loop.matrix for part in self.parts if part.channels]
+        return own, [part.loop.matrix for part in self.parts if not part.channels]
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,37 +131,82 @@ class Enclosed:
     high: float
 
 
-def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
-    """Return matrices entry by entry times others, or times numbers."""
-    if numbers is FLOATS:
-        return np.asarray(matrix * by)
-    value, factor, off = value_of(matrix), value_of(by), radius_of(by)
-    product = value * factor
-    radius = radius_of(matrix) * (np.abs(factor) + off) + np.abs(value) * off + UNIT * np.abs(product)
-    return with_radius(product, radius * (1 + 8 * UNIT))
-
-
 def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
-    """Return Σ_k M^k B M^kᵀ of a matrix M (n, n) and matrices B (b, n, n), None where it does not end.
+    """Return Σ_k M^k B M^kᵀ of a matrix M (n, n) and symmetric B (b, n, n), None where it does not end.
+
+    With radii, that it ends for every M within them is proved.
 
     Notes
     -----
-    Doubled (Smith, 1968): of 2j terms, the second half is M^j times the first. What is left out after the
-    last doubling is M^j Y M^jᵀ, at most ‖M^j‖² / (1 − ‖M^j‖²) of the largest entry of what is there.
+    Let X̂ be what floats say, and E = B + M X̂ Mᵀ − X̂ what they leave, −θ D² ≤ E ≤ θ D² in the order of
+    symmetric matrices for some diagonal D. For a P ≥ 0 with P − M P Mᵀ ≥ (1 − φ) D², φ < 1, the powers of M
+    die out (Lyapunov), and X − X̂ = Σ_k M^k E M^kᵀ lies between −θ/(1 − φ) P and θ/(1 − φ) P. D² is as X̂ on
+    its diagonal, P as floats have Σ_k M^k D² M^kᵀ; θ and φ are the largest sums of rows, over D (Gershgorin).
+    """
+    if numbers is FLOATS:
+        return _doubled(matrix, driven)
+    n = matrix.shape[-1]
+    found = _doubled(value_of(matrix), value_of(driven))
+    if found is None or not n:
+        return None if found is None else driven
+    found = (found + np.swapaxes(found, -1, -2)) / 2
+    weights = _weights(found, value_of(matrix))
+    seed = np.diag(weights**2)
+    still = _doubled(value_of(matrix), seed[None])
+    if still is None:
+        return None
+    still = (still + np.swapaxes(still, -1, -2)) / 2
+    guessed = numbers.exact(np.concatenate([found, still]))
+    added = np.concatenate([driven, numbers.exact(seed[None])])
+    left = numbers.subtract(numbers.add(around(matrix, guessed, numbers), added), guessed)
+    scale = np.outer(weights, weights)
+    size = (np.abs(value_of(left)) + radius_of(left)) / scale
+    *thetas, phi = size.sum(axis=-1).max(axis=-1) * (1 + (n + 8) * UNIT)
+    if not (phi < 1 and _is_positive(still[0] / scale)):
+        return None
+    wide = np.sqrt(np.diagonal(still[0]))
+    reach = np.array(thetas)[:, None, None] / (1 - phi) * np.outer(wide, wide)
+    return with_radius(found, reach * (1 + 16 * UNIT))
+
+
+def _weights(found: Matrix, matrix: Matrix) -> Floats:
+    """Return how large states are where moments (b, n, n) are found; those that rest, beside the others."""
+    weights = np.sqrt(np.abs(np.diagonal(found, axis1=-2, axis2=-1)).sum(axis=0))
+    if not weights.all():
+        alike = balance(np.abs(matrix))
+        least = (weights[weights > 0] / alike[weights > 0]).min(initial=np.inf)
+        weights = np.where(weights > 0, weights, alike * (least if np.isfinite(least) else 1.0))
+    return np.asarray(weights)
+
+
+def _is_positive(matrix: Matrix) -> bool:
+    """Say whether a symmetric matrix, its entries rounded twice, is proved to have no eigenvalue below 0.
+
+    A Cholesky factorization that runs to its end is one of a matrix that is off by (n + 1) u times its trace
+    at most (Higham, Accuracy and Stability of Numerical Algorithms, theorem 10.3).
+    """
+    n, trace = len(matrix), float(np.trace(matrix))
+    try:
+        np.linalg.cholesky(matrix - 4 * (n + 8) * UNIT * trace * np.eye(n))
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(trace))
+
+
+def _doubled(matrix: Matrix, driven: Matrix) -> Matrix | None:
+    """Return Σ_k M^k B M^kᵀ in floats, None where it does not end.
+
+    Doubled (Smith, 1968): of 2j terms, the second half is M^j times the first.
     """
     total, power = driven, matrix
     for _ in range(DOUBLINGS):
-        total = numbers.add(total, around(power, total, numbers))
-        power = numbers.multiply(power, power)
-        sums = np.abs(power).sum(axis=-1)
-        size = float((sums if numbers is FLOATS else sums.sum(axis=0)).max(initial=0.0))
+        total = total + power @ total @ power.T
+        power = power @ power
+        size = float(np.abs(power).sum(axis=-1).max(initial=0.0))
         if not size < ENDLESS:
             return None
         if size**2 < NOTHING:
-            if numbers is not FLOATS:
-                most = (np.abs(value_of(total)) + radius_of(total)).max(axis=(-2, -1), keepdims=True)
-                radius_of(total)[...] += 2 * size**2 * most
-            return total
+            return np.asarray(total)
     return None
 
 
@@ -162,71 +216,113 @@ def around(left: Matrix, inner: Matrix, numbers: Arithmetic, right: Matrix | Non
     return numbers.multiply(numbers.multiply(left, inner), np.swapaxes(other, -1, -2))
 
 
-def gain(of: Moments, growth: float, numbers: Arithmetic = FLOATS) -> Matrix | None:
+def gain_of(of: Moments) -> Gain:
     """Return G(λ) over the entries of all covariances of luck, None where the means grow faster.
+
+    What does not depend on λ is worked out once.
 
     Parameters
     ----------
     of
         The loops and their luck.
-    growth
-        λ, what second moments grow by in a frame.
-    numbers
-        Floats, or floats with their radii.
     """
     firsts = np.cumsum([0] + [sum(map(len, one.entries)) for one in of.luck]).tolist()
-    found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
-    shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
-    for part in of.parts:
-        for d, channel in part.channels.items():
-            kind = of.luck[d]
-            covariances = of_kind(RADII.exact(units_of(kind)), numbers)
-            driven = scaled(around(of_kind(channel.driven, numbers), covariances, numbers), shrink, numbers)
-            moments = stein(scaled(of_kind(channel.matrix, numbers), root, numbers), driven, numbers)
+    known: dict[bool, list[_Driven]] = {}
+
+    def at(growth: float, numbers: Arithmetic) -> Matrix | None:
+        exact = numbers is FLOATS
+        if exact not in known:
+            known[exact] = [_driven(of, part, d, firsts, numbers) for part in of.parts for d in part.channels]
+        found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
+        shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
+        for one in known[exact]:
+            matrix, driven = scaled(one.matrix, root, numbers), scaled(one.driven, shrink, numbers)
+            moments = stein(matrix, driven, numbers)
             if moments is None:
                 return None
-            answer = _Answer(channel.matrix.shape[-1], moments, covariances, numbers)
-            # One channel drives the mean of all receivers by 1/n, and them apart by 1 − 1/n or −1/n.
-            alone = 1 / kind.receivers
-            share = kind.heard * (alone if part.apart is None else 1 - alone)
-            for (site, route, slot), rows in channel.misses.items():
-                miss = of_kind(rows, numbers)
-                same = scaled(answer.of(miss, miss), number_of(share, numbers), numbers)
-                for c, other in enumerate(of.luck):
-                    if (other.route, other.sender) != (route, part.classes[site]):
-                        continue
-                    moved = same
-                    if c == d:
-                        own = of_kind(channel.own[slot], numbers)
-                        both = answer.of(miss, own)
-                        both = numbers.add(both, np.swapaxes(both, -1, -2))
-                        factor = number_of(alone if part.apart is None else -alone, numbers)
-                        moved = numbers.add(moved, scaled(both, factor, numbers))
-                        if part.apart is None:
-                            moved = numbers.add(moved, answer.of(own, own))
-                    moved = scaled(moved, of_kind(other.spreads[slot], numbers), numbers)
-                    listed = np.array(other.entries[slot], np.intp).reshape(-1, 2).T
-                    block = np.moveaxis(moved[..., listed[0], listed[1]], 0, -1)
-                    first = firsts[c] + sum(map(len, other.entries[:slot]))
-                    place = np.s_[..., first : first + listed.shape[1], firsts[d] : firsts[d + 1]]
+            for answer in one.answers:
+                same = answer.miss.of(moments, numbers)
+                for place, entries, spread, own in answer.heard:
+                    moved = same if own is None else numbers.add(same, own.of(moments, numbers))
+                    moved = scaled(moved, spread, numbers)
+                    block = np.moveaxis(moved[..., entries[0], entries[1]], 0, -1)
                     found[place] = numbers.add(found[place], block)
-    return found
+        return found
+
+    return at
 
 
 @dataclass(frozen=True, slots=True)
-class _Answer:
-    """How states of a part and of a channel answer to each unit of its luck's covariance."""
+class _Form:
+    """The moments E[l rᵀ] + E[r lᵀ] of forms of states times `by`, each unit of luck by itself, and `own`."""
 
-    states: int
-    moments: Matrix
-    covariances: Matrix
-    numbers: Arithmetic
+    left: Matrix
+    right: Matrix
+    by: Matrix
+    own: Matrix
 
-    def of(self, left: Matrix, right: Matrix) -> Matrix:
-        """Return the moments E[l rᵀ] of linear forms of states and luck."""
-        n, numbers = self.states, self.numbers
-        late = around(left[..., :n], self.moments, numbers, right[..., :n])
-        return numbers.add(late, around(left[..., n:], self.covariances, numbers, right[..., n:]))
+    def of(self, moments: Matrix, numbers: Arithmetic) -> Matrix:
+        """Return them for the moments of states (b, n, n)."""
+        found = around(self.left, moments, numbers, self.right)
+        found = numbers.add(found, np.swapaxes(found, -1, -2))
+        return numbers.add(scaled(found, self.by, numbers), self.own)
+
+
+@dataclass(frozen=True, slots=True)
+class _Answers:
+    """How far packets are from what is heard, `miss`, and what luck that is to channels.
+
+    `heard`: where each stands in G, its entries, whether it is lucky, and what the channel itself adds.
+    """
+
+    miss: _Form
+    heard: tuple[tuple[Any, NDArray[np.intp], Matrix, _Form | None], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Driven:
+    """A part driven by the luck of a channel: states by `matrix` and, for each unit, `driven` (b, n, n)."""
+
+    matrix: Matrix
+    driven: Matrix
+    answers: tuple[_Answers, ...]
+
+
+def _driven(of: Moments, part: Part, d: int, firsts: Sequence[int], numbers: Arithmetic) -> _Driven:
+    """Return how a part answers to the luck of channels of kind d."""
+    kind, channel = of.luck[d], part.channels[d]
+    n = channel.matrix.shape[-1]
+    covariances = of_kind(RADII.exact(units_of(kind)), numbers)
+
+    def form(left: Matrix, right: Matrix, by: float) -> _Form:
+        left, right, factor = of_kind(left, numbers), of_kind(right, numbers), number_of(by / 2, numbers)
+        own = around(left[..., n:], covariances, numbers, right[..., n:])
+        own = scaled(numbers.add(own, np.swapaxes(own, -1, -2)), factor, numbers)
+        return _Form(left[..., :n], right[..., :n], factor, own)
+
+    # One channel drives the mean of all receivers by 1/n, and them apart by 1 − 1/n or −1/n.
+    alone = 1 / kind.receivers
+    share = kind.heard * (alone if part.apart is None else 1 - alone)
+    answers = []
+    for (site, route, slot), miss in channel.misses.items():
+        heard = []
+        for c, other in enumerate(of.luck):
+            if (other.route, other.sender) != (route, part.classes[site]):
+                continue
+            own = None
+            if c == d and part.apart is None:
+                # o oᵀ + (m oᵀ + o mᵀ)/n, of which the form has both halves
+                mixed = RADII.add(scaled(miss, number_of(2 * alone, RADII), RADII), channel.own[slot])
+                own = form(mixed, channel.own[slot], 1.0)
+            elif c == d:
+                own = form(miss, channel.own[slot], -2 * alone)
+            entries = np.array(other.entries[slot], np.intp).reshape(-1, 2).T
+            first = firsts[c] + sum(map(len, other.entries[:slot]))
+            place = np.s_[..., first : first + entries.shape[1], firsts[d] : firsts[d + 1]]
+            heard.append((place, entries, of_kind(other.spreads[slot], numbers), own))
+        answers.append(_Answers(form(miss, miss, share), tuple(heard)))
+    driven = around(of_kind(channel.driven, numbers), covariances, numbers)
+    return _Driven(of_kind(channel.matrix, numbers), driven, tuple(answers))
 
 
 def units_of(kind: Luck) -> Floats:
@@ -252,31 +348,33 @@ def number_of(value: float, numbers: Arithmetic) -> Matrix:
     return np.array([value, 4 * UNIT * abs(value)]).reshape(2, 1, 1)
 
 
-def mean_square_radius(means: tuple[float, float], of: Gain | None, *, bounded: bool = True) -> Enclosed:
+def mean_square_radius(
+    driven: Sequence[Matrix], alone: Sequence[Matrix], of: Gain, *, bounded: bool = True
+) -> Enclosed:
     """Enclose what second moments grow by in a frame, for all start states.
 
     Parameters
     ----------
-    means
-        Bounds on the spectral radius of the means.
+    driven, alone
+        The loops of means (2, n, n), each with its radius: those that luck drives, and those that it doesn't.
     of
-        G(λ), None where nothing is left to chance.
+        G(λ).
     bounded
         Whether bounds are asked for; without them, they are the radius itself.
     """
-    low, high = means
-    if not np.isfinite(high):
+    own, others = _growth(driven), _growth(alone)
+    if not np.isfinite(own + others):
         return Enclosed(np.nan, 0.0, np.inf)
-    square = (low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT))
-    if of is None:
-        return Enclosed(low * high, *square)
-    least = max(high**2, np.finfo(np.float64).tiny)
-    found, steep = _radius(of, least)
-    radius = low * high if found is None else found
+    found, steep = _radius(of, max(own, TINY)) if driven else (None, 1.0)
+    radius = max(others, own if found is None else found)
     if not bounded:
         return Enclosed(radius, radius, radius)
+    if not driven:
+        return Enclosed(radius, *_square(alone))
+    # Bounds on G at λ prove that the means it comes from grow by less.
+    square = _square([*driven, *alone] if found is None else alone)
     above, wide = np.inf, None
-    start, width = (least, NEAR) if found is None else (found, FIRST_WIDTH)
+    start, width = (max(square[1], TINY), NEAR) if found is None else (found, FIRST_WIDTH)
     while width <= LAST_WIDTH and above > start * (1 + width):
         bounds = _bounds(of, start * (1 + width))
         if bounds is not None:
@@ -290,7 +388,34 @@ def mean_square_radius(means: tuple[float, float], of: Gain | None, *, bounded: 
         if bounds is not None:
             below = max(below, found * (1 - width) * min(bounds[0], 1.0) * (1 - 2 * UNIT))
         width *= 8
+    if not below:  # so near the growth of the means, G has no bounds
+        below = _square(driven)[0]
     return Enclosed(radius, min(below, radius), max(above, square[1], radius))
+
+
+def below_1(of: Moments) -> bool:
+    """Say whether it is proved that second moments die out, for all matrices within their radii."""
+    driven, alone = of.means
+    if not _square(alone)[1] < 1:
+        return False
+    bounds = _bounds(gain_of(of), 1.0) if driven else None
+    return not driven or (bounds is not None and bounds[1] < 1)
+
+
+def _growth(loops: Sequence[Matrix]) -> float:
+    """Return what squares of the means grow by in floats."""
+    return max((_size(np.linalg.eigvals(value_of(one))) ** 2 for one in loops), default=0.0)
+
+
+def _square(loops: Sequence[Matrix]) -> tuple[float, float]:
+    """Return bounds on what squares of the means grow by."""
+    found = [enclose_eigenvalues(value_of(one), radius_of(one))[1] for one in loops]
+    low, high = max((one.low for one in found), default=0.0), max((one.high for one in found), default=0.0)
+    return low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT)
+
+
+def _size(values: NDArray[Any]) -> float:
+    return float(np.abs(values).max(initial=0.0))
 
 
 def _bounds(of: Gain, growth: float) -> tuple[float, float] | None:
@@ -301,6 +426,9 @@ def _bounds(of: Gain, growth: float) -> tuple[float, float] | None:
     matrix = of(growth, RADII)
     if matrix is None or not np.isfinite(matrix).all():
         return None
+    if matrix.shape[-1] == 1:
+        value, off = abs(float(matrix[0, 0, 0])), float(matrix[1, 0, 0])
+        return (value - off) * (1 - UNIT), (value + off) * (1 + UNIT)
     _, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
     return found.low, found.high
 
@@ -311,47 +439,52 @@ def _largest(of: Gain, growth: float) -> float:
         matrix = of(growth, FLOATS)
     if matrix is None or not np.isfinite(matrix).all():
         return np.inf
-    return float(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0))
+    return _size(matrix if len(matrix) == 1 else np.linalg.eigvals(matrix))
 
 
 def _radius(of: Gain, least: float) -> tuple[float | None, float]:
     """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
 
-    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. 1/G is followed, which is nearly
-    straight where G has its pole: by secants between a point on either side, one that stays twice counting
-    half (the Illinois rule).
+    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. 1/G − 1 is followed, which is nearly
+    straight from −1 at the means' own growth, where G has its pole: by secants between a point on either
+    side, one that stays twice counting as much less as the other moved (Anderson and Björck, 1973).
     """
 
     def over(growth: float) -> float:
-        return 1 / max(_largest(of, growth), np.finfo(np.float64).tiny) - 1
+        return 1 / max(_largest(of, growth), TINY) - 1
 
-    low, gap = least * (1 + NEAR), max(least, LEAST) * FIRST_GAP
-    at_low = over(low)
-    if at_low > 0:
-        return None, 1.0
-    high = low + gap
+    low, at_low, known = least, -1.0, False  # of the pole, nothing is known: luck may not reach it
+    high = 1.0 if least < NEAR_ONE else least * (1 + FIRST_GAP)
     at_high = over(high)
     while at_high < 0:
-        low, at_low, gap = high, at_high, WIDER * gap
-        high = low + gap
+        low, at_low, known = high, at_high, True
+        ahead = (high - least) / max(1 + at_high, 1 / WIDER)
+        high = least + max(ahead, (high - least) * (1 + FIRST_GAP))
         at_high = over(high)
-    best, off = (low, -at_low) if -at_low < at_high else (high, at_high)
-    steep, stayed = max(1.0, best * (at_high - at_low) / (high - low)), 0
-    for _ in range(STEPS):
+    best, off, steep, stayed = high, at_high, 1.0, 0
+    for step in range(STEPS):
+        if step >= BLIND and not known and off > ROUGH:
+            low = least * (1 + NEAR)
+            at_low = over(low)
+            if at_low > 0:
+                return None, 1.0
+            known = True
         middle = low - at_low * (high - low) / (at_high - at_low)
-        if off <= max(CLOSE, UNIT * steep) or not low < middle < high:
+        if off <= CLOSE * steep or not low < middle < high:
             break
         found = over(middle)
         if found < 0:
-            slope = (found - at_low) / (middle - low)
-            low, at_low = middle, found
-            at_high, stayed = (at_high / 2, 1) if stayed == 1 else (at_high, 1)
+            slope = (found - at_high) / (middle - high)
+            shrink = 1 - found / at_low
+            at_high *= (shrink if shrink > 0 else 0.5) if stayed == 1 else 1.0
+            low, at_low, known, stayed = middle, found, True, 1
         else:
-            slope = (at_high - found) / (high - middle)
-            high, at_high = middle, found
-            at_low, stayed = (at_low / 2, -1) if stayed == -1 else (at_low, -1)
+            slope = (found - at_low) / (middle - low)
+            shrink = 1 - found / at_high
+            at_low *= (shrink if shrink > 0 else 0.5) if stayed == -1 else 1.0
+            high, at_high, stayed = middle, found, -1
         if off > ROUGH:
             steep = max(1.0, middle * slope)
         if abs(found) < off:
             best, off = middle, abs(found)
-    return best, steep
+    return (best, steep) if known or off <= ROUGH else (None, 1.0)

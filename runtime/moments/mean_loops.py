@@ -2,7 +2,7 @@
 
 Takes: the loops of a scene whose ticks each hear by themselves, and what channels remember.
 Gives: `Remembered`, `remember`; `Site`, `with_memory`, `standing_state`; `Listened`, `Channel`, `MeanLoop`,
-`mean_loop`.
+`mean_loop`; `scaled`.
 Guarantees: each matrix comes with the radius of its rounding, those of the sites' frames included; rigid
 motions are taken out, which no luck moves.
 Does not: compute second moments (see `gains`).
@@ -31,7 +31,7 @@ from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
-from apc.frame.radius import RADII, radius_of, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import Selected, Sent, Way
 from apc.moments.memory import CHANCE_ROUNDINGS, Memory
 
@@ -112,34 +112,41 @@ class Followed:
     luck_before: tuple[Matrix, ...]
 
 
+def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
+    """Return matrices entry by entry times others, or times numbers."""
+    if numbers is FLOATS:
+        return np.asarray(matrix * by)
+    value, factor, off = value_of(matrix), value_of(by), radius_of(by)
+    product = value * factor
+    radius = radius_of(matrix) * (np.abs(factor) + off) + np.abs(value) * off + UNIT * np.abs(product)
+    return with_radius(product, radius * (1 + 8 * UNIT))
+
+
 def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembered:
     """Follow what is remembered on a route through a frame."""
     n_e, slots = memory.chances.shape
-    known = np.zeros((n_e, memory.count + slots))
-    known[np.arange(n_e), memory.old] = 1.0
     sizes = [len(memory.uncertain(slot)) for slot in range(slots)]
-    luck = np.zeros((n_e, sum(sizes)))
+    known, luck = np.zeros((2, n_e, memory.count + slots)), np.zeros((2, n_e, sum(sizes)))
+    known[0, np.arange(n_e), memory.old] = 1.0
     before, luck_before = [], []
-    roundings, first = CHANCE_ROUNDINGS, 0
+    first = 0
     for slot in range(slots):
-        uncertain, chance = memory.uncertain(slot), memory.chances[:, slot, None]
-        before.append(_rounded(known[uncertain], roundings))
-        luck_before.append(_rounded(luck[uncertain], roundings))
-        known, luck = (1 - chance) * known, (1 - chance) * luck
-        known[:, memory.count + slot] += chance[:, 0]
-        luck[uncertain, first + np.arange(len(uncertain))] = 1.0
+        uncertain, certain = memory.uncertain(slot), memory.chances[:, slot] == 1
+        before.append(known[:, uncertain])
+        luck_before.append(luck[:, uncertain])
+        known[:, certain], luck[:, certain] = 0.0, 0.0
+        known[0, certain, memory.count + slot] = 1.0
+        own = memory.chances[uncertain, slot, None]
+        off = CHANCE_ROUNDINGS * UNIT + memory.doubts[uncertain, slot, None]
+        missed = with_radius(1 - own, off + UNIT)
+        known[:, uncertain] = scaled(known[:, uncertain], missed, RADII)
+        luck[:, uncertain] = scaled(luck[:, uncertain], missed, RADII)
+        known[:, uncertain, memory.count + slot] = with_radius(own, off)[..., 0]
+        luck[0, uncertain, first + np.arange(len(uncertain))] = 1.0
         first += len(uncertain)
-        roundings += CHANCE_ROUNDINGS + 2
     return Remembered(
-        *(route, memory, tuple(channels)),
-        Followed(_rounded(known, roundings), _rounded(luck, roundings), tuple(before), tuple(luck_before)),
+        *(route, memory, tuple(channels)), Followed(known, luck, tuple(before), tuple(luck_before))
     )
-
-
-def _rounded(values: Floats, roundings: int) -> Matrix:
-    """Return numbers made of probabilities by so many roundings, with their radii."""
-    certain = (values == 0) | (values == 1)
-    return with_radius(values, np.where(certain, 0.0, roundings * UNIT * np.maximum(np.abs(values), 1.0)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ Ticks of which all packets sent so far are equally likely to be heard, and toget
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.frame.discretize import UNIT
 from apc.network.channel import LATEST, PARETO_SHAPE, ChannelLaw
 
 Floats = NDArray[np.float64]
@@ -35,6 +37,9 @@ SAME_CHANCE = 1e-15
 # Roundings of a probability, relative to 1: those of its law's numbers and of erfc or a power.
 CHANCE_ROUNDINGS = 8
 
+# Descriptions that are remembered.
+LATELY = 64
+
 # Of a quotient of times by a jitter, which is a float: the latest packets of a table arrive all at once.
 ROUNDED = 4e-16
 
@@ -44,12 +49,14 @@ class Memory:
     """The values that ticks hear: of this frame, and of those to come, `old` and `chances` by value.
 
     Value e of those there are once all packets of a frame are sent was `old[e]` before it, one of `count`
-    kept from the frames before; slot k's packet takes its place with probability `chances[e, k]`. `heard`
-    says which value a tick (clock, index) hears; `kept` which values are kept for the next frame, in order.
+    kept from the frames before; slot k's packet takes its place with probability `chances[e, k]`, known to
+    within `doubts[e, k]` and its rounding. `heard` says which value a tick (clock, index) hears; `kept` which
+    values are kept for the next frame, in order.
     """
 
     old: NDArray[np.intp]  # (n_e,)
     chances: Floats  # (n_e, slots)
+    doubts: Floats  # (n_e, slots)
     heard: Mapping[tuple[str, int], int]
     kept: NDArray[np.intp]  # (count,)
 
@@ -68,10 +75,18 @@ class Memory:
         own = self.chances[:, slot]
         return np.flatnonzero((own > 0) & (own < 1))
 
-    def spread(self, slot: int) -> Floats:
-        """Return the covariance (n, n) of whether a slot's packet takes the place of its uncertain values."""
-        own = self.chances[self.uncertain(slot), slot]
-        return np.asarray(np.minimum.outer(own, own) - np.outer(own, own))
+    def spread(self, slot: int) -> tuple[Floats, Floats]:
+        """Return the covariance (n, n) of whether a slot's packet takes the place of its uncertain values.
+
+        And how far it may be off: a chance π has the variance π (1 − π), of slope 1 − 2 π.
+        """
+        place = self.uncertain(slot)
+        own, doubt = self.chances[place, slot], self.doubts[place, slot]
+        found = np.minimum.outer(own, own) - np.outer(own, own)
+        both = np.outer(own, doubt) + np.outer(doubt, own) + np.outer(doubt, doubt)
+        off = np.maximum.outer(doubt, doubt) + both
+        np.fill_diagonal(off, np.abs(1 - 2 * own) * doubt + doubt**2)
+        return found, off * (1 + 8 * UNIT) + 2 * CHANCE_ROUNDINGS * UNIT * found
 
 
 def is_memoryless(law: ChannelLaw) -> bool:
@@ -121,8 +136,9 @@ def memory_of(
     frame: Fraction,
     *,
     strictly: bool = False,
+    doubt: float = 0.0,
 ) -> Memory:
-    """Describe what ticks hear of one sender.
+    """Describe what ticks hear of one sender; what was described lately is remembered.
 
     Parameters
     ----------
@@ -134,7 +150,25 @@ def memory_of(
         The length of a frame, in seconds.
     strictly
         Whether a tick misses what arrives just then.
+    doubt
+        How far the share of packets that get lost may be off.
     """
+    assert law.trace is None, "recorded delays leave nothing to chance"
+    numbers = law.p, law.r, law.one_minus_h, law.one_minus_k, law.delay, law.jitter, law.distribution
+    return _memory_of(numbers, delay, tuple(sent), tuple(ticks.items()), frame, strictly, doubt)
+
+
+@functools.lru_cache(maxsize=LATELY)
+def _memory_of(
+    numbers: tuple[float, float, float, float, float, float, str],
+    delay: Fraction,
+    sent: tuple[Fraction, ...],
+    told: tuple[tuple[tuple[str, int], Fraction], ...],
+    frame: Fraction,
+    strictly: bool,
+    doubt: float,
+) -> Memory:
+    law, ticks = ChannelLaw(*numbers, None), dict(told)
     ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
     unit = math.lcm(*(one.denominator for one in (frame, *sent, *ticks.values())))
     length, starts = int(frame * unit), [int(one * unit) for one in reversed(sent)]
@@ -167,9 +201,11 @@ def memory_of(
     listed = list(keys)
     known = {listed[place][: len(listed[place]) - slots]: number for number, place in enumerate(kept)}
     old = [known[key[slots:]] for key in listed]
+    chances = np.array([key[:slots][::-1] for key in listed])
     return Memory(
         old=np.array(old, np.intp),
-        chances=np.array([key[:slots][::-1] for key in listed]),
+        chances=chances,
+        doubts=chances * (doubt / (1 - law.mean_loss)) * (1 + 8 * UNIT) if doubt else np.zeros(chances.shape),
         heard={tick: of_time[int(time * unit)] for tick, time in ticks.items()},
         kept=np.array(kept, np.intp),
     )

@@ -25,7 +25,7 @@ from apc.moments.almost_sure import AlmostSure, almost_sure, unplayed
 from apc.moments.bursts import tagged_radius
 from apc.moments.crowd import crowd
 from apc.moments.errors import Told, crowd_error, pattern_error, standing_error, tagged_error
-from apc.moments.gains import gain, mean_square_radius, too_much
+from apc.moments.gains import gain_of, mean_square_radius, too_much
 from apc.moments.memory import is_memoryless
 from apc.moments.patterns import MOST_CHANNELS, pattern_radius, patterns
 from apc.moments.stand_in import stand_in
@@ -53,6 +53,9 @@ ENUMERATED = 4
 # What an iteration leaves of an eigenvalue, relatively: 1e-13 asked for, and references met to 1e-11.
 ITERATED = 1e-10
 ROUNDED = 4e-15
+
+# Covariances of luck times cubes of the means' states, up to which one growth takes some ten milliseconds.
+QUICK = 200_000
 
 # How many times what two estimates differ by counts as their error; what bounds may be apart at most.
 DOUBTS, LOOSE = 10, 1e-9
@@ -92,8 +95,8 @@ class NetworkVerdict(Result):
 class Growth:
     """What second moments grow by in a frame, with bounds; estimates where `exact` is False.
 
-    `why` says why there is none, `note` what it is; `proved` that every rounding is in the bounds. `errors`
-    works out how far copies are from each other.
+    `why` says why there is none, `note` what it is; `proved` that every rounding is in the bounds; `quick`
+    that it took some milliseconds. `errors` works out how far copies are from each other.
     """
 
     radius: float
@@ -103,6 +106,7 @@ class Growth:
     why: str = ""
     note: str = ""
     proved: bool = False
+    quick: bool = False
     errors: Callable[[], Told] | None = None
 
     @property
@@ -157,18 +161,20 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
             states = [channel.matrix.shape[-1] for part in of.parts for channel in part.channels.values()]
             if why := too_much(entries, max(states, default=0)):
                 return Growth(np.nan, 0.0, np.inf, False, why)
-            inner = mean_square_radius(of.means, partial(gain, of) if of.luck else None, bounded=bounded)
+            inner = mean_square_radius(*of.means, gain_of(of), bounded=bounded)
             errors = partial(crowd_error, system, prepared)
-            return Growth(inner.radius, inner.low, inner.high, True, proved=True, errors=errors)
+            quick = entries * max(states, default=0) ** 3 <= QUICK
+            return Growth(inner.radius, inner.low, inner.high, True, proved=True, quick=quick, errors=errors)
         first, why = _due(system, lossy)
         if not why and len(system.links) == 1 and not system.links[0].delays:
             closed = stand_in(system, prepared, first)
             if isinstance(closed, str):
                 return Growth(np.nan, 0.0, np.inf, False, closed)
-            inner = mean_square_radius(*closed, bounded=bounded)
+            means, luck = closed
+            inner = mean_square_radius(means, [], luck, bounded=bounded)
             errors = partial(standing_error, system, prepared, first)
             every = system.peers <= ENUMERATED  # of more, a quadrature's nodes are rounded
-            return Growth(inner.radius, inner.low, inner.high, True, proved=every, errors=errors)
+            return Growth(inner.radius, inner.low, inner.high, True, proved=every, quick=every, errors=errors)
     else:
         first, why = _due(system, lossy)
     if not why and any(law.jitter for _, law in lossy):

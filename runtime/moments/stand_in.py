@@ -31,14 +31,13 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Loop
-from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.frame.radius import RADII, Arithmetic, with_radius
 from apc.frame.schedule import Selected, Way
 from apc.moments.crowd import Hearing, hearing, own_value, peer_classes, remembered_of, standing_motions
-from apc.moments.gains import Gain, around, number_of, of_kind, scaled, stein, too_much
-from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
+from apc.moments.gains import Gain, around, number_of, of_kind, stein, too_much
+from apc.moments.mean_loops import Remembered, Site, scaled, standing_state, with_memory
 from apc.network.channel import channel_law
 
 Floats = NDArray[np.float64]
@@ -71,15 +70,13 @@ class _Receiver:
 class Classes:
     """Classes of equal peers: how many, where each one's states start, and how a peer of each moves.
 
-    `parts` are the means' loops in relative coordinates (class or None for all, matrix, coordinates), `means`
-    bounds on their spectral radius.
+    `parts` are the means' loops in relative coordinates (class or None for all, matrix, coordinates).
     """
 
     counts: tuple[int, ...]
     offsets: tuple[int, ...]
     receivers: tuple[_Receiver, ...]
     parts: tuple[tuple[int | None, Matrix, Relative], ...]
-    means: tuple[float, float]
 
     def of(self, place: int) -> slice:
         """Return the states of a class."""
@@ -115,10 +112,8 @@ def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
     return nodes, vectors[0] ** 2
 
 
-def stand_in(
-    system: CompiledSystem, prepared: Prepared, first: Fraction
-) -> tuple[tuple[float, float], Gain] | str:
-    """Return bounds on the means' spectral radius and G(λ) of what luck adds, see `gains`; or why not.
+def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tuple[list[Matrix], Gain] | str:
+    """Return the means' loops and G(λ) of what luck adds, see `gains`; or why not.
 
     Parameters
     ----------
@@ -129,7 +124,7 @@ def stand_in(
     if isinstance(found, str):
         return found
     why = too_much(sum(map(len, entries_of(found))), found.offsets[-1])
-    return why or (found.means, partial(luck_of_luck, found))
+    return why or ([matrix for _, matrix, _ in found.parts], partial(luck_of_luck, found))
 
 
 def standing_in(
@@ -296,9 +291,7 @@ def _closed(
         still = standing_state(apart, standing_motions(loop), loop, [0, offsets[h + 1] - offsets[h]])
         own = relative_coordinates(still)
         parts.append((h, _reduced(apart, own), own))
-    bounds = [enclose_eigenvalues(value_of(matrix), radius_of(matrix))[1] for _, matrix, _ in parts]
-    means = max(one.low for one in bounds), max(one.high for one in bounds)
-    return Classes(counts, offsets, receivers, tuple(parts), means)
+    return Classes(counts, offsets, receivers, tuple(parts))
 
 
 def _each(blocks: Matrix, by: Floats) -> Matrix:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from apc.analysis.needs import Needs, SiteNeeds
     from apc.analysis.paper import NamedMatrix, PaperRoute
     from apc.analysis.switching import Switching
-    from apc.answer import Answer
+    from apc.answer import Answer, NetworkAnswer
     from apc.compiler.compiled import CompiledSystem
     from apc.eigen.spectrum import Mode
     from apc.frame.names import Range
@@ -176,6 +176,20 @@ def answer_text(found: Answer) -> str:
     if found.box is not None:
         parts.append(str(found.box))
     return "\n\n".join(parts)
+
+
+def network_answer_text(found: NetworkAnswer) -> str:
+    """Return the verdict over the network as it is, and what moves it."""
+    return "\n\n".join(map(str, (found.verdict, found.sensitivities, found.margins)))
+
+
+def network_answer_document(found: NetworkAnswer) -> dict[str, Any]:
+    """Return the verdict over the network as it is, and what moves it, as plain data."""
+    return found.verdict.to_dict() | {
+        "sensitivities": found.sensitivities.to_dict(),
+        "margins": document(found.margins.rows),
+        "margins_note": found.margins.note,
+    }
 
 
 def answer_document(found: Answer) -> dict[str, Any]:

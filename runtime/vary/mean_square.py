@@ -1,8 +1,8 @@
 """The values of one parameter at which a scene becomes stable or unstable in mean square.
 
 Takes: a `CompiledSystem` with unreliable links and the name of a parameter, or of what links lose.
-Gives: `MEAN_SQUARE`, `NOMINAL`, `criterion_of`; `search_mean_square`; `growth_at`;
-`MeanSquareEvaluator`.
+Gives: `MEAN_SQUARE`, `NOMINAL`, `criterion_of`; `search_mean_square`; `first_lost`, `FirstLost`; `growth_at`,
+`allowed`; `MeanSquareEvaluator`.
 Guarantees: on either side of a crossing, by its error, bounds on the growth of second moments decide.
 Does not: find two crossings between neighbouring samples; follow a delay, whose pieces are the nominal
 search's (see `delays`).
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -41,6 +41,9 @@ SHARES = 33
 
 # How near a crossing is found at first, relatively, and how far its bounds may be at last.
 NEAR, FAR = 1e-14, 1e-4
+
+# After so many values at which nothing changes, second moments don't depend on a parameter.
+STILL = 4
 
 # The first width at which bounds are asked for; steps towards a crossing.
 FIRST, STEPS = 1e-12, 60
@@ -168,7 +171,7 @@ class MeanSquareEvaluator:
         """Say which values (k, m) are within what each parameter may be."""
         found = np.ones(len(values), dtype=bool)
         for own, one in zip(values.T, self.free, strict=True):
-            least, most = _bounds(self.system, one)
+            least, most = allowed(self.system, one)
             found &= (own >= least) & (own <= most)
         return found
 
@@ -178,7 +181,7 @@ class MeanSquareEvaluator:
         return (np.array([(one.high - one.low) / max(one.radius, LEAST) for one in found])[:, None, None],)
 
 
-def _bounds(system: CompiledSystem, free: Free) -> tuple[float, float]:
+def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
     """Return between which values a parameter may be."""
     if any(timing.name == free.name for timing in system.timings):
         return 0.0, math.inf
@@ -225,25 +228,17 @@ def search_mean_square(
     """
     refuse_time(system, free, place)
     samples = _samples(system, free, low, high, present)
-    known: dict[float, Growth] = {}
-
-    def bounds_at(value: float, *, bounded: bool = True) -> Growth:
-        return growth_at(system, prepared, [Override(free, Fraction(value))], place, bounded=bounded)
-
-    def at(value: float) -> Growth:
-        if value not in known:
-            known[value] = bounds_at(value, bounded=False)
-        return known[value]
-
+    looking = _Looking(system, free, prepared, place, {})
+    known = looking.known
     for number, value in enumerate(samples):
         if told is not None:
             told(f"{number} of {len(samples)} values")
-        at(value)
+        looking.at(value)
     verdicts = [known[value].radius < 1 for value in samples]
     edges, stable = [], [verdicts[0]]
     for place_of, (one, other) in enumerate(itertools.pairwise(samples)):
         if verdicts[place_of] != verdicts[place_of + 1]:
-            edges.append(_crossing(at, bounds_at, one, other, stable_below=verdicts[place_of]))
+            edges.append(looking.crossing(one, other))
             stable.append(verdicts[place_of + 1])
     radii = {known[value].radius for value in samples}
     return Search(
@@ -255,6 +250,105 @@ def search_mean_square(
         looked=len(known),
         enters=len(radii) > 1,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Looking:
+    """A scene looked at for values of one parameter; `known` are those without bounds."""
+
+    system: CompiledSystem
+    free: Free
+    prepared: Prepared
+    place: Place
+    known: dict[float, Growth]
+
+    def at(self, value: float) -> Growth:
+        """Return what second moments grow by, without bounds."""
+        if value not in self.known:
+            self.known[value] = self._growth(value, bounded=False)
+        return self.known[value]
+
+    def _growth(self, value: float, *, bounded: bool) -> Growth:
+        overrides = [Override(self.free, Fraction(value))]
+        return growth_at(self.system, self.prepared, overrides, self.place, bounded=bounded)
+
+    def crossing(self, low: float, high: float) -> Crossing:
+        """Return the crossing between two values of other verdicts, and how far bounds leave it open.
+
+        By secants that keep a point on either side, one that stays twice counting half (the Illinois rule).
+        """
+        at_low, at_high = math.log(self.at(low).radius), math.log(self.at(high).radius)
+        value, stayed, stable_below = low, 0, at_low < 0
+        for _ in range(STEPS):
+            middle = low - at_low * (high - low) / (at_high - at_low)
+            if not low < middle < high:
+                break
+            value, found = middle, math.log(self.at(middle).radius)
+            if abs(found) < NEAR or high - low <= NEAR * abs(high):
+                break
+            if (found < 0) == (at_low < 0):
+                low, at_low = middle, found
+                at_high, stayed = (at_high / 2, 1) if stayed == 1 else (at_high, 1)
+            else:
+                high, at_high = middle, found
+                at_low, stayed = (at_low / 2, -1) if stayed == -1 else (at_low, -1)
+        width = FIRST * max(abs(value), 1e-300)
+        while width <= FAR * max(abs(value), 1e-300):
+            sides = [self._growth(one, bounded=True) for one in (value - width, value + width)]
+            below, above = (one.stable for one in sides)
+            if None not in (below, above) and below != above:
+                proof = BOUNDED if all(one.proved for one in sides) else ITERATED
+                proof = proof if all(one.exact for one in sides) else TAGGED
+                return Crossing(value, width, "below" if below else "above", math.nan, "crossing", proof)
+            width *= 4
+        side = "below" if stable_below else "above"
+        return Crossing(value, width, side, math.nan, "crossing", ESTIMATED)
+
+
+@dataclass(frozen=True, slots=True)
+class FirstLost:
+    """How far a parameter grows from a stable value until second moments do; `crossing` None: not up to
+    `reached`.
+
+    `enters` says whether second moments depend on it, `looked` at how many values, `why` why not farther.
+    """
+
+    crossing: Crossing | None
+    reached: float
+    enters: bool
+    looked: int
+    why: str
+
+
+def first_lost(
+    system: CompiledSystem, free: Free, samples: Sequence[float], prepared: Prepared, place: Place
+) -> FirstLost:
+    """Look at values of a parameter, from a stable one on, until second moments grow.
+
+    Parameters
+    ----------
+    system, free
+        The compiled scene and what varies.
+    samples
+        Where to look, the first a stable value.
+    prepared, place
+        As for `search_mean_square`.
+    """
+    looking, why, reached = _Looking(system, free, prepared, place, {}), "", samples[0]
+    for one, other in itertools.pairwise(samples):
+        try:
+            grows = looking.at(one).radius < 1 <= looking.at(other).radius
+        except ApcError as error:
+            why = error.mistakes[0].what
+            break
+        reached = other
+        if grows:
+            found = looking.crossing(one, other)
+            return FirstLost(found, reached, True, len(looking.known), "")
+        if len(looking.known) == STILL and len({found.radius for found in looking.known.values()}) == 1:
+            break
+    enters = len({found.radius for found in looking.known.values()}) > 1
+    return FirstLost(None, reached, enters, len(looking.known), why)
 
 
 def _samples(
@@ -274,46 +368,6 @@ def _samples(
         count = max(math.ceil(SAMPLES * math.log10(top / bottom)), SAMPLES)
         return [float(one) for one in np.geomspace(bottom, top, count + 1)]
     return [float(one) for one in np.linspace(bottom, top, 6 * SAMPLES + 1)]
-
-
-def _crossing(
-    at: Callable[[float], Growth],
-    bounds_at: Callable[[float], Growth],
-    low: float,
-    high: float,
-    *,
-    stable_below: bool,
-) -> Crossing:
-    """Return the crossing between two values of other verdicts, and how far bounds leave it open.
-
-    By secants that keep a point on either side, one that stays twice counting half (the Illinois rule).
-    """
-    at_low, at_high = math.log(at(low).radius), math.log(at(high).radius)
-    value, stayed = low, 0
-    for _ in range(STEPS):
-        middle = low - at_low * (high - low) / (at_high - at_low)
-        if not low < middle < high:
-            break
-        value, found = middle, math.log(at(middle).radius)
-        if abs(found) < NEAR or high - low <= NEAR * abs(high):
-            break
-        if (found < 0) == (at_low < 0):
-            low, at_low = middle, found
-            at_high, stayed = (at_high / 2, 1) if stayed == 1 else (at_high, 1)
-        else:
-            high, at_high = middle, found
-            at_low, stayed = (at_low / 2, -1) if stayed == -1 else (at_low, -1)
-    width = FIRST * max(abs(value), 1e-300)
-    while width <= FAR * max(abs(value), 1e-300):
-        sides = bounds_at(value - width), bounds_at(value + width)
-        below, above = (one.stable for one in sides)
-        if None not in (below, above) and below != above:
-            proof = BOUNDED if all(one.proved for one in sides) else ITERATED
-            proof = proof if all(one.exact for one in sides) else TAGGED
-            return Crossing(value, width, "below" if below else "above", math.nan, "crossing", proof)
-        width *= 4
-    side = "below" if stable_below else "above"
-    return Crossing(value, width, side, math.nan, "crossing", ESTIMATED)
 
 
 BOUNDED = "second moments bounded on either side"

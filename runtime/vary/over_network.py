@@ -1,0 +1,200 @@
+"""Margins and sensitivities of what second moments grow by, over the network as it is.
+
+Takes: a `CompiledSystem` with unreliable links, and its margins over the nominal network.
+Gives: `network_margins`, `network_sensitivities`.
+Guarantees: on either side of a margin, by its error, bounds on the growth of second moments decide, or the
+note says of which they don't; a derivative's error holds where slopes on both sides differ.
+Does not: vary a delay or a period; look where one growth takes long (see `Growth.quick`); prove that nothing
+changes between two values it looked at.
+
+A derivative at v is the difference quotient D(h) of values at v − h and v + h, extrapolated from two steps
+(Richardson): D = (4 D(h/2) − D(h))/3. Its error is estimated as |D(h/2) − D(h)|, three times the first term
+left out, and half of what the slopes on both sides differ by, extrapolated as well: J = 2 J(h/2) − J(h), next
+to nothing but at a kink; to these comes what the bound on the growth at v allows values to be off by.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+
+from apc.analysis.analysis import Prepared
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Place
+from apc.compiler.timings import part
+from apc.compiler.words import counted
+from apc.finite_equations import finite_equations
+from apc.frame.names import Free, named_times, unit_of, value_now
+from apc.frame.overrides import Override
+from apc.moments.network import Growth, growth
+from apc.network.nominal import channel_numbers
+from apc.threads import single_threaded
+from apc.vary.evaluator import free_parameters
+from apc.vary.margins import GROWTH, Margin, Margins, coupler_parameters
+from apc.vary.mean_square import BOUNDED, FirstLost, allowed, first_lost, growth_at
+from apc.vary.search import SAMPLES
+from apc.vary.sensitivity import Sensitivities, Sensitivity, varied
+
+PLACE = Place("over the network")
+
+# The longer of two steps of a difference, relatively: what is left out, its fourth power, is then as small as
+# what values right to some 1e-11 leave open.
+STEP = 2.0**-7
+
+# Values of a probability or jitter to look at, from the present one to the largest.
+SHARES = 16
+
+# What grows is called so.
+MOMENTS = "second moments"
+
+
+def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins) -> Margins:
+    """Find how much each stiffness, damping, probability and jitter may grow, stable in mean square.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    nominal
+        The margins over the nominal network: how far to look from a value of 0.
+    """
+    with part("margins"), single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        here = _looked_at(system, prepared)
+        if isinstance(here, str):
+            return Margins((), f"not looked for: {here}")
+        if not here.stable:
+            return Margins((), "none: the scene is not stable in mean square as it is")
+        scales = {one.parameter: one.value or one.scanned / GROWTH for one in nominal.rows}
+        rows: list[Margin] = []
+        notes, open_sides, looked = [], [], 0
+        for one in (*coupler_parameters(system), *_of_channels(system)):
+            found = first_lost(system, one, _samples(system, one, scales), prepared, PLACE)
+            looked += found.looked
+            if not found.enters:
+                continue
+            rows.append(_margin(system, one, found))
+            if found.why:
+                notes.append(f"{one.label}: {found.why}")
+            if found.crossing is not None and found.crossing.proof != BOUNDED:
+                open_sides.append(f"{one.label} ({found.crossing.proof})")
+    if open_sides:
+        notes.append(f"not bounded on either side: {', '.join(open_sides)}")
+    notes.append(
+        f"{counted(looked, 'value')} were looked at: a narrow change of the verdict could hide between two"
+    )
+    notes.append("delays and periods were not varied: what happens when would change with them")
+    return Margins(tuple(rows), "; ".join(notes))
+
+
+def _looked_at(system: CompiledSystem, prepared: Prepared) -> Growth | str:
+    """Return what second moments grow by, or why nothing is looked at for many values."""
+    found = growth(system, prepared)
+    if found.why:
+        return f"over the network, the scene is not judged: {found.why}"
+    if not found.quick:
+        return (
+            "over this network, to judge one value takes long (apc critical looks at those of one parameter)"
+        )
+    return found
+
+
+def _of_channels(system: CompiledSystem) -> list[Free]:
+    """Return what links lose and delay packets by, where it follows from nothing else."""
+    numbers = channel_numbers(system)
+    times = [Free(one.name) for one in named_times(system) if one.formula is None]
+    return [one for one in (*free_parameters(system), *times) if one.name in numbers]
+
+
+def _samples(system: CompiledSystem, free: Free, scales: dict[str, float]) -> list[float]:
+    """Return the values to look at, the present one first."""
+    present, most = value_now(system, free), allowed(system, free)[1]
+    if free.name in channel_numbers(system):
+        delays = [
+            value_now(system, Free(link.delay))
+            for link in system.links
+            if link.channel is not None and link.channel.jitter == free.name
+        ]
+        return [float(one) for one in np.linspace(present, min([most, *delays]), SHARES + 1)]
+    scale = abs(present) or scales.get(free.label, 0.0)
+    if not scale:
+        return [present]
+    first, last = (scale if present else scale / GROWTH), scale * GROWTH
+    ahead = np.geomspace(first, last, round(SAMPLES * np.log10(last / first)) + 1)
+    return [present, *(float(one) for one in ahead if present < one <= most)]
+
+
+def _margin(system: CompiledSystem, free: Free, found: FirstLost) -> Margin:
+    """Return a margin that was found, or how far it was looked for."""
+    present, crossing = value_now(system, free), found.crossing
+    return Margin(
+        parameter=free.label,
+        unit=unit_of(system, free.name),
+        present=present,
+        value=None if crossing is None else crossing.value,
+        error=None if crossing is None else crossing.error,
+        factor=crossing.value / present if crossing is not None and present else None,
+        frequency_hz=None,
+        kind="" if crossing is None else crossing.kind,
+        scanned=found.reached,
+    )
+
+
+def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensitivities:
+    """Differentiate what second moments grow by with respect to every parameter, and what links lose by.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    """
+    with part("sensitivities"), single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        here = _looked_at(system, prepared)
+        if isinstance(here, str):
+            return Sensitivities(0.0, (), (), f"what moves it most: not looked for: {here}")
+        rows, without = [], []
+        for one in (*varied(system), *_of_channels(system)):
+            present = value_now(system, one)
+            try:
+                told = _derivative(system, one, present, prepared, here)
+            except ApcError:  # not even so near can it be judged
+                told = None
+            if told is None:
+                without.append(one.label)
+                continue
+            slope, error = told
+            unit = unit_of(system, one.name)
+            rows.append(Sensitivity(one.label, unit, present, slope, slope * present, error, 0))
+    rows.sort(key=lambda row: (-abs(row.relative), row.parameter))
+    note = "by differences of two steps: errors are estimates, not bounds"
+    if without:
+        note += f"; not differentiated: {', '.join(without)}"
+    return Sensitivities(here.radius, ((complex(here.radius), MOMENTS),), tuple(rows), note)
+
+
+def _derivative(
+    system: CompiledSystem, free: Free, present: float, prepared: Prepared, here: Growth
+) -> tuple[float, float] | None:
+    """Return the derivative of what second moments grow by and its error, None where no step fits.
+
+    See the head of this module.
+    """
+    low, high = allowed(system, free)
+    step = STEP * abs(present)
+    if not step or not (low <= present - step and present + step <= high):
+        return None
+
+    def at(value: float) -> float:
+        overrides = [Override(free, Fraction(value))]
+        return growth_at(system, prepared, overrides, PLACE, bounded=False).radius
+
+    steps = [(present + width) - present for width in (step, step / 2)]
+    ends = [(at(present - width), at(present + width)) for width in steps]
+    slopes = [(above - below) / (2 * width) for width, (below, above) in zip(steps, ends, strict=True)]
+    bends = [
+        (above - 2 * here.radius + below) / width for width, (below, above) in zip(steps, ends, strict=True)
+    ]
+    coarse, fine = slopes
+    doubt = max(here.high - here.radius, here.radius - here.low)
+    error = abs(fine - coarse) + abs(2 * bends[1] - bends[0]) / 2 + 4 * doubt / step
+    return (4 * fine - coarse) / 3, error

@@ -1,0 +1,157 @@
+"""Claims about `apc.vary.over_network`: margins and sensitivities of the growth of mean squares.
+
+Independent: where references are critical (matrix-free second moments, brute force over all patterns of
+loss), and `second_moments`, an event-by-event program that shares nothing with `apc.moments`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+import apc
+from apc.analysis.analysis import prepare
+from apc.compiler.compiled import CompiledSystem
+from apc.vary.margins import Margins, margins
+from apc.vary.over_network import network_margins, network_sensitivities
+from apc.vary.sensitivity import Sensitivity
+from tests.second_moments import Law, second_moment_radius
+from tests.test_mean_square import burst, scene
+
+
+def grown(system: CompiledSystem) -> Margins:
+    return network_margins(system, prepare(system), Margins((), ""))
+
+
+def moved(system: CompiledSystem) -> dict[str, Sensitivity]:
+    return {row.parameter: row for row in network_sensitivities(system, prepare(system)).rows}
+
+
+@pytest.mark.parametrize(
+    ("more", "reference"), [("10 %", 1143.224858916119), ("20 %, on_loss: zero", 1354.3615910782753)]
+)
+def test_a_margin_ends_where_a_reference_is_critical(more: str, reference: float) -> None:
+    found = {row.parameter: row for row in grown(scene(more=f", loss: {more}")).rows}
+    row = found["coordination.stiffness"]
+    assert row.value is not None
+    assert row.error is not None
+    assert abs(row.value - reference) <= row.error + 1e-8
+    assert row.error < 1e-5
+    assert row.factor == row.value / 500
+
+
+def test_over_another_network_a_margin_is_another() -> None:
+    system = scene(more=", loss: 40 %")
+    nominal = {row.parameter: row for row in margins(system).rows}["coordination.stiffness"]
+    found = {row.parameter: row for row in grown(system).rows}["coordination.stiffness"]
+    assert nominal.value is not None
+    assert found.value is not None
+    assert math.isclose(nominal.value, 1096.41, abs_tol=0.01)
+    assert math.isclose(found.value, 1384, abs_tol=1)
+
+
+def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
+    found = moved(scene(peers=2, stiffness=900.0))
+
+    def radius(stiffness: float = 900.0, loss: float = 0.1) -> float:
+        system = scene(peers=2, stiffness=stiffness, more=f", loss: {100 * loss!r} %")
+        return second_moment_radius(system, {"lan": Law(loss, 1 - loss)})
+
+    for name, step, up, down in (
+        ("coordination.stiffness", 1.0, radius(901.0), radius(899.0)),
+        ("lan.loss", 1e-4, radius(loss=0.1001), radius(loss=0.0999)),
+    ):
+        row, expected = found[name], (up - down) / (2 * step)
+        # The program's own differences are right to some 1e-6 of them: 1e-10 of a radius over such a step.
+        assert abs(row.derivative - expected) <= row.error + 3e-6 * abs(expected)
+        assert row.error < 1e-3 * abs(row.derivative)
+
+
+def test_at_a_kink_the_error_holds_the_slopes_of_both_sides() -> None:
+    """A jitter of 2 ms about 8 ms: of a little more, one more tick can miss a packet."""
+    row = moved(scene(more=", jitter: 2 ms"))["lan.jitter"]
+    slopes = []
+    for side in (1.98, 2.02):
+        found = moved(scene(more=f", jitter: {side} ms"))["lan.jitter"]
+        slopes.append(found.derivative)
+    assert abs(slopes[0] - slopes[1]) > 0.1
+    assert all(abs(row.derivative - slope) <= 1.05 * row.error for slope in slopes)
+
+
+@pytest.mark.parametrize("more", [burst(0.1, 10), ", loss: 100 %"])
+def test_where_one_value_takes_long_or_is_not_judged_it_says_so(more: str) -> None:
+    system = scene(more=more)
+    told = grown(system)
+    assert not told.rows
+    assert told.note.startswith("not looked for: over th")
+    assert network_sensitivities(system, prepare(system)).note.startswith(
+        "what moves it most: not looked for"
+    )
+
+
+def test_what_is_not_stable_in_mean_square_has_no_margins() -> None:
+    told = grown(scene(stiffness=1200.0))
+    assert not told.rows
+    assert told.note == "none: the scene is not stable in mean square as it is"
+
+
+# Largest stiffness of three users by the share lost (brute force over all patterns, to 0.5 N/m): none
+# 1096.4, 5 % 1118, 10 % 1143.2, 40 % 1384.
+@pytest.mark.parametrize(
+    ("stiffness", "box", "stable"),
+    [
+        (500.0, {"coordination.stiffness": "1090 N/m:1100 N/m"}, True),
+        (500.0, {"coordination.stiffness": "1143.0 N/m:1143.24 N/m"}, False),
+        (1098.0, {"lan.loss": "12 %:14 %"}, True),
+        (1098.0, {"lan.loss": "0 %:5 %"}, False),
+        (800.0, {"contact.stiffness": "±2%", "lan.loss": "0 %:1 %"}, True),
+        (800.0, {"device.mass": "±0.5%", "cube.damping": "±1%"}, True),
+    ],
+)
+def test_a_box_in_mean_square_is_decided_as_references_say(
+    stiffness: float, box: dict[str, str], *, stable: bool
+) -> None:
+    found = apc.prove_box(scene(stiffness=stiffness, more=", loss: 10 %"), box)
+    assert found.stable is stable
+    assert found.verdict == ("stable in mean square" if stable else "unstable in mean square")
+
+
+def test_what_is_left_open_of_a_box_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apc.analysis.box_proof.MOST_CELLS", 20)
+    found = apc.prove_box(scene(), {"coordination.stiffness": "1000 N/m:1143.2 N/m"})
+    assert (found.stable, found.cells) == (None, 20)
+    assert 0 < found.open_share <= 1
+    assert 1000 < found.point[0] < 1143.2
+
+
+def test_of_an_ideal_link_a_box_is_nominal_until_it_may_lose_packets() -> None:
+    system = scene(more=", loss: 0 %")
+    assert apc.prove_box(system, {"contact.stiffness": "±1%"}).verdict == "stable up to a common translation"
+    assert apc.prove_box(system, {"lan.loss": "0 %:2 %"}).verdict == "stable in mean square"
+
+
+@pytest.mark.parametrize(
+    ("more", "box", "why"),
+    [
+        (
+            ", loss: 10 %, on_loss: zero",
+            {"contact.stiffness": "±1%"},
+            "losses of lan with on_loss: zero",
+        ),
+        (burst(0.1, 10), {"contact.stiffness": "±1%"}, "over bursts of lan"),
+        (burst(0.1, 10), {"lan.loss.r": "±1%"}, "over bursts of lan"),
+        (", loss: 100 %", {"contact.stiffness": "±1%"}, "no box is proved: lan loses everything"),
+    ],
+)
+def test_a_box_that_is_not_served_is_refused_by_name(more: str, box: dict[str, str], why: str) -> None:
+    with pytest.raises(apc.ApcError, match="E898 no box is proved") as error:
+        apc.prove_box(scene(more=more), box)
+    assert why in str(error.value)
+    assert error.value.mistakes[0].hint == f"apc critical {next(iter(box))} --in mean-square"
+
+
+def test_a_jitter_is_no_range_of_a_box() -> None:
+    with pytest.raises(apc.ApcError, match=r"E831 lan\.jitter is a time"):
+        apc.prove_box(scene(more=", jitter: 2 ms"), {"lan.jitter": "±1%"})
+    assert apc.prove_box(scene(more=", jitter: 2 ms"), {"contact.stiffness": "±0.01%"}).stable
