@@ -7,14 +7,18 @@ Does not: compute.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import click
 
 from apc.analysis.methods import AUTO, METHODS
 from apc.cli.options import Command, file_argument, hands_option, json_option, print_result, set_option
 from apc.cli.progress import at_work
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
+
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
 
 # Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
 SECONDS_A_PEER = 1e-4

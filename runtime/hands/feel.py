@@ -286,6 +286,15 @@ def read_frequencies(
 ) -> Floats:
     """Return the frequencies that options name, in Hz: those listed, or points between two at equal ratios.
 
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    listed
+        Frequencies with units and commas between, or None.
+    low, high, points
+        From where to where, `HIGHEST` or half the fastest clock if not given, and how many.
+
     Raises
     ------
     ApcError
@@ -342,8 +351,6 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
         device = find_device(
             group.jacobians, group.parameters, unit_of, group.listening, part=max(names, default="")
         )
-        if isinstance(device, str) and not names:  # it is neither pushed nor asked for
-            device = None
         if names and not isinstance(device, Device):
             what = device or f"{group.name} has no device"
             hint = "--at with the part that is held, as user[1].device"
@@ -353,7 +360,7 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
             what = f"a frame of {group.name} has too many events and states: {kicks:,} together"
             hint = f"{MOST_KICKS:,} at most"
             raise ApcError(Mistake("E933", Place(system.origin.topology), what, hint=hint))
-        own, site = open_site(group, device)
+        own, site = open_site(group, device if isinstance(device, Device) else None)
         opened.append(own)
         sites[id(own.schedule)] = site
     plain, wide = _arranged(system, groups, exchange), _arranged(system, opened, exchange)
