@@ -77,6 +77,9 @@ from .api import (
 from .api import (
     switching as switching,
 )
+from .api import (
+    with_hands as with_hands,
+)
 from .benchmark.bench import Bench as Bench
 from .compiler.compiled import CompiledSystem as CompiledSystem
 from .compiler.errors import ApcError as ApcError

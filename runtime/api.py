@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from apc.vary.sensitivity import Sensitivities
 
 Format = Literal["text", "json", "dot", "svg"]
-Criterion = Literal["mean-square", "nominal"]
+Criterion = Literal["mean-square", "nominal", "passive"]
 
 
 def compile(path: str | Path) -> CompiledSystem:
@@ -76,6 +76,27 @@ def load(path: str | Path) -> CompiledSystem:
     from apc.inputs import load_fresh
 
     return load_fresh(Path(path))
+
+
+def with_hands(model: CompiledSystem | str | Path, hands: str) -> CompiledSystem:
+    """Return the model with hands at all devices.
+
+    Parameters
+    ----------
+    model
+        As for `analyze`.
+    hands
+        "clamped": they are held fast; "held": a hand of `hand.mass`, `hand.damping` and `hand.stiffness`
+        each, 0 until set; or a hand of the library, such as "StylusArmForward".
+
+    Raises
+    ------
+    ApcError
+        No such hands, a peer without a device, or with a hand already.
+    """
+    from apc.frame import devices
+
+    return devices.with_hands(_model(model, None), hands)
 
 
 def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> CompiledSystem:
@@ -188,7 +209,8 @@ def critical(
         Quantities between which to look, such as "5000 N/m".
     criterion
         "mean-square": stable means that second moments die out over the network as it is, the default where
-        a link loses or delays packets; "nominal": that motions die out if every packet is on time.
+        a link loses or delays packets; "nominal": that motions die out if every packet is on time; "passive":
+        that they do so with every passive hand at every device.
 
     Raises
     ------

@@ -12,7 +12,16 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import Command, file_argument, in_option, json_option, print_result, set_option
+from apc.cli.options import (
+    Command,
+    criterion_with,
+    file_argument,
+    hands_option,
+    in_option,
+    json_option,
+    print_result,
+    set_option,
+)
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
@@ -28,6 +37,7 @@ SCENES = (".yaml", ".yml", ".apc")
 @click.option("--upper", metavar='"VALUE UNIT"', help="Look no further up than this.")
 @click.option("--lower", metavar='"VALUE UNIT"', help="Look no further down than this.")
 @in_option
+@hands_option
 @json_option
 def critical_command(
     path: str,
@@ -36,6 +46,7 @@ def critical_command(
     upper: str | None,
     lower: str | None,
     criterion: str | None,
+    hands: str,
     as_json: bool,
 ) -> None:
     """Find the largest stable value of a parameter, with its error.
@@ -51,9 +62,10 @@ def critical_command(
     from apc.vary.critical import critical
 
     _check_order(path, file)
-    system = open_scene(file, settings)
+    asked = criterion_with(hands, criterion)
+    system = open_scene(file, settings, hands=hands)
     with status_line() as told:
-        found = critical(system, path, lower=lower, upper=upper, criterion=criterion, told=told)
+        found = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
     print_result(found, as_json=as_json)
 
 

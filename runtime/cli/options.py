@@ -2,7 +2,7 @@
 
 Takes: a result.
 Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `in_option`, `hands_option`,
-`json_option`, `WholeNumber`; `print_result`, `tell`, `beside`.
+`json_option`, `criterion_with`, `WholeNumber`; `print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import click
 
 from apc.compiler.digits import plain_int
-from apc.compiler.errors import visible
+from apc.compiler.errors import ApcError, Mistake, Place, visible
 from apc.compiler.files import is_stdout
 from apc.compiler.timings import part, record
 from apc.present.forms import json_text
@@ -56,6 +56,16 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 def file_option(name: str, told: str, *, required: bool = False) -> Callable[[Function], Function]:
     """Return an option that names a file to write; `told` is its help."""
     return click.option(name, type=click.Path(path_type=Path), metavar="FILE", help=told, required=required)
+
+
+def criterion_with(hands: str, criterion: str | None) -> str | None:
+    """Return the criterion that --in and --hands together ask for. Raises ApcError E930 where they can't."""
+    if hands != "passive":
+        return criterion
+    if criterion == "mean-square":
+        what = "--in mean-square and --hands passive don't go together: hands draw from the nominal network"
+        raise ApcError(Mistake("E930", Place("--hands"), what, hint="--in nominal --hands passive"))
+    return "passive"
 
 
 class Command(click.Command):

@@ -16,8 +16,10 @@ from apc.cli.options import (
     Command,
     WholeNumber,
     beside,
+    criterion_with,
     file_argument,
     file_option,
+    hands_option,
     in_option,
     json_option,
     print_result,
@@ -65,6 +67,7 @@ from apc.threads import start_single_threaded
     help="Cells along each side of the rectangle to begin with.",
 )
 @in_option
+@hands_option
 @file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
 @json_option
 def region_command(
@@ -79,6 +82,7 @@ def region_command(
     settings: tuple[str, ...],
     cells: int,
     criterion: str | None,
+    hands: str,
     out: Path | None,
     as_json: bool,
 ) -> None:
@@ -104,7 +108,8 @@ def region_command(
         what = "--vary and --panel both say what the panels are: one of them is enough"
         raise ApcError(Mistake("E907", Place("region"), what))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
-    systems = [open_scene(one, settings, {"--out": out}) for one in (file, *compare)]
+    asked = criterion_with(hands, criterion)
+    systems = [open_scene(one, settings, {"--out": out}, hands=hands) for one in (file, *compare)]
     with status_line() as told:
         found = compare_regions(
             systems,
@@ -114,7 +119,7 @@ def region_command(
             overlays=overlays,
             normalize=normalize,
             cells=cells,
-            criterion=criterion,
+            criterion=asked,
             told=told,
         )
     if out is not None:

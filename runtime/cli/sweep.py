@@ -18,8 +18,10 @@ from apc.cli.options import (
     Command,
     WholeNumber,
     beside,
+    criterion_with,
     file_argument,
     file_option,
+    hands_option,
     in_option,
     json_option,
     print_result,
@@ -51,6 +53,7 @@ from apc.option_value import option_value
     help="What to compute at each point; see below.",
 )
 @in_option
+@hands_option
 @set_option
 @click.option("--jobs", type=WholeNumber(min=1), help="Processes to compute with; all cores by default.")
 @click.option(
@@ -71,6 +74,7 @@ def sweep_command(
     out: Path,
     of: str,
     criterion: str | None,
+    hands: str,
     settings: tuple[str, ...],
     jobs: int | None,
     cluster: str | None,
@@ -100,13 +104,14 @@ def sweep_command(
     check_table_path(out, "--out")
     waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))
     values = _values(over)
-    system = open_scene(file, settings, {"--out": out})
+    asked = criterion_with(hands, criterion)
+    system = open_scene(file, settings, {"--out": out}, hands=hands)
     with _progress(out) as progress:
         result = sweep(
             system,
             values,
             of=of,
-            criterion=criterion,
+            criterion=asked,
             out=out,
             jobs=jobs,
             cluster=cluster,

@@ -1,7 +1,7 @@
 """Is a scene stable with every passive hand at every device?
 
 Takes: a `CompiledSystem`.
-Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `spare_damping`.
+Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`.
 Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
 anything that gives back no more energy than it was given, each by itself or joined to each other.
 Does not: say with which hand it shakes: which motion of the devices takes energy out.
@@ -22,6 +22,7 @@ from apc.frame.devices import clamped, refuse_hands
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, solve, value_of
 from apc.hands.port import PortLoop, port_loops
+from apc.moments.network import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
@@ -33,6 +34,9 @@ UNDECIDED, NEVER = "undecided", "unstable with some passive hands, however much 
 # How far below the least that is found, relatively, what is proved may lie, the first that can be proved; and
 # what part of that a proof may leave over for rounding.
 WIDTHS, SPARED = (1e-9, 1e-7, 1e-5), (0.03, 1e-3)
+
+# Less damping than this counts as so much, in N·s/m.
+HOPELESS = 1e12
 
 # Two frequencies fit a motion alike, relatively.
 ALIKE = 1e-6
@@ -144,24 +148,28 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
     )
 
 
-def spare_damping(system: CompiledSystem, prepared: Prepared) -> tuple[float, float, float]:
-    """Return how much damping could be spared at each device (N·s/m), and bounds below and above it.
+def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> Growth:
+    """Return a number below 1 where a scene is stable with every passive hand, and above it elsewhere.
 
-    −∞ where no damping suffices.
+    With s the damping that could be spared at each device, in N·s/m, it is e^{−2 asinh s}.
 
     Parameters
     ----------
     system, prepared
         As for `passive_hands`.
+    bounded
+        Whether bounds are asked for.
     """
     refuse_hands(system, OPTION)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
-        if isinstance(loops, str):
-            return -np.inf, -np.inf, -np.inf
-        found = [_bounds(loop) for loop in loops]
-    least, low, high = (min(one[place] for one in found) for place in range(3))
-    return least, low, high
+        found = [(-np.inf, -np.inf, -np.inf)]
+        if not isinstance(loops, str):
+            found = [_bounds(loop)[:3] if bounded else (_least(loop)[0],) * 3 for loop in loops]
+    spared = (max(min(one[place] for one in found), -HOPELESS) for place in range(3))
+    radius, high, low = (float(np.exp(-2 * np.arcsinh(one))) for one in spared)
+    # Unstable with devices clamped, where nothing is bounded: that is told of by floats alone.
+    return Growth(radius, low if np.isfinite(low) else 0.0, high, exact=True, proved=True)
 
 
 def _judge(loop: PortLoop) -> PassiveMode:
@@ -187,7 +195,7 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     −∞ where the scene is unstable with its devices clamped, of which this is no proof.
     """
     matrices = loop.a, loop.b, loop.c, loop.d
-    least, angle = least_real(*map(value_of, (*matrices, loop.weight)))
+    least, angle = _least(loop)
     if not np.isfinite(least):
         return least, -np.inf, np.inf, angle
     scale = max(abs(least), float(np.abs(value_of(loop.weight)).max()))
@@ -202,6 +210,11 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
         if least > 0 and proves_positive(*matrices, loop.weight):
             low = 0.0
     return least, _asymmetry(loop, low), _draws(loop, angle), angle
+
+
+def _least(loop: PortLoop) -> tuple[float, float]:
+    """Return the least eigenvalue of He H + diag(b/τ) over all angles, and its angle, in floats."""
+    return least_real(*map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight)))
 
 
 def _asymmetry(loop: PortLoop, low: float) -> float:

@@ -33,6 +33,8 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of
+from apc.eigen.relative import relative_coordinates
+from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import Device, find_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
@@ -43,6 +45,7 @@ from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
 from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
+Places = NDArray[np.intp]
 Matrix = NDArray[Any]
 
 # Graphs whose modes are orthogonal: what hands give all peers together is the sum of what they give each.
@@ -234,80 +237,111 @@ def _loops(
     return (dense_loop(groups, exchange),), False
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Wires:
+    """The intervals of a loop's devices: `into` and `out` (m,) are where in the closed state, `rest` all else.
+
+    `of` (m, k) says of which site each is, `sums` (m, m) which came before it in a frame, `peers` (m,) how
+    many peers it stands for, `seconds` and `starts` (m,) how long it is and when it begins.
+    """
+
+    into: Places
+    out: Places
+    rest: Places
+    of: Floats
+    sums: Floats
+    peers: Floats
+    seconds: Floats
+    starts: Floats
+
+
+def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched], counts: Sequence[int]) -> _Wires:
+    """Return where the intervals are of sites whose states begin at offsets."""
+    lengths = [len(one.seconds) for one in sites]
+    whose = np.repeat(np.arange(len(sites)), lengths)
+    starts = np.concatenate([np.cumsum([0.0, *map(float, one.seconds[:-1])]) for one in sites])
+    added = [start + place for start, one in zip(offsets, sites, strict=True) for place in one.ports.added]
+    pairs = list(zip(offsets, sites, strict=True))
+    return _Wires(
+        into=np.concatenate([start + one.ports.drawn[:, 0] for start, one in pairs]),
+        out=np.concatenate([start + one.ports.read[:, 0] for start, one in pairs]),
+        rest=np.delete(np.arange(size), added),
+        of=np.eye(len(sites))[whose],
+        sums=np.tril(whose[:, None] == whose, -1).astype(np.float64),
+        peers=np.array(counts, dtype=np.float64)[whose],
+        seconds=np.array([float(one) for site in sites for one in site.seconds]),
+        starts=starts,
+    )
+
+
 def _port_loop(
     system: CompiledSystem, loop: Loop, touched: dict[int, Touched], *, weighted: bool
 ) -> PortLoop:
     """Return the map of a loop whose devices are moved from outside."""
     closed = close_loop(loop)
-    whole = with_radius(closed.matrix, closed.error)
     sites = [touched[id(group.schedule)] for group in loop.sites]
     counts = [group.count if weighted and len(loop.sites) > 1 else 1 for group in loop.sites]
-    drawn, read, added = [], [], []
-    for start, one in zip(closed.offsets, sites, strict=True):
-        drawn.append(start + one.ports.drawn[:, 0])
-        read.append(start + one.ports.read[:, 0])
-        added += [start + place for place in one.ports.added]
-    rest = np.delete(np.arange(len(closed.matrix)), added)
-    into, out = np.concatenate(drawn), np.concatenate(read)
-    if len(into) > MOST_INTERVALS:
-        what = f"devices are sampled and pushed over {len(into):,} intervals of a frame"
+    at = _wires(closed.offsets, len(closed.matrix), sites, counts)
+    if len(at.into) > MOST_INTERVALS:
+        what = f"devices are sampled and pushed over {len(at.into):,} intervals of a frame"
         hint = f"{MOST_INTERVALS:,} at most"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
-    # A device is where it was as the frame began, and the intervals before have moved it since.
-    sums, of = np.zeros((len(into), len(into))), np.zeros((len(into), len(sites)))
-    scale, start = np.zeros(len(into)), 0
-    many = np.zeros(len(into))
-    for k, one in enumerate(sites):
-        own = slice(start, start + len(one.seconds))
-        sums[own, own] = np.tril(np.ones((len(one.seconds),) * 2), -1)
-        of[own, k] = 1.0
-        many[own] = counts[k]
-        scale[own] = [float(seconds / counts[k]) ** 0.5 for seconds in one.seconds]
-        start = own.stop
-    a = whole[:, rest[:, None], rest]
-    placed, pushed = whole[:, rest[:, None], into], whole[:, out[:, None], into]
-    answered = RADII.multiply(RADII.exact(np.diag(many)), whole[:, out[:, None], rest])
-    at_once = RADII.multiply(RADII.exact(np.diag(many)), pushed)
-    aside = solve(RADII.subtract(RADII.exact(np.eye(len(rest))), a), RADII.multiply(placed, RADII.exact(of)))
+    whole, exact = with_radius(closed.matrix, closed.error), RADII.exact
+    peers, of, across = exact(np.diag(at.peers)), exact(at.of), exact(at.of.T.copy())
+    a, placed, felt = _moving(whole, at, np.zeros((len(at.rest), 0)))
+    aside = _aside(a, placed, of)
+    if aside is None:
+        rigid = find_rigid_modes(loop).basis
+        if rigid.size and not rigid[at.out].any():  # a motion that no device feels
+            a, placed, felt = _moving(whole, at, rigid[at.rest])
+            aside = _aside(a, placed, of)
     if aside is None:
         what = "with its devices clamped the scene has a motion that nothing holds back"
         hint = "couplers that hold each object to a device"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
-    forces = RADII.add(RADII.multiply(answered, aside), RADII.multiply(at_once, RADII.exact(of)))
-    static = forces[:, [int(np.flatnonzero(of[:, k])[0]) for k in range(len(sites))]]
-    b = RADII.subtract(
-        RADII.multiply(placed, RADII.exact(sums)), RADII.multiply(aside, RADII.exact(of.T.copy()))
-    )
-    d = RADII.multiply(at_once, RADII.exact(sums))
-    pole = RADII.multiply(RADII.multiply(RADII.exact(of), static), RADII.exact(of.T.copy()))
-    dampers = np.zeros_like(pole)
-    listed = [
-        one.damping * count / seconds
-        for one, count in zip(sites, counts, strict=True)
-        for seconds in one.seconds
-    ]
-    values = np.array([float(one) for one in listed])
-    dampers[0], dampers[1] = np.diag(values), np.diag(UNIT * values)
-    half = RADII.multiply(
-        RADII.add(pole, np.swapaxes(pole, -1, -2)), RADII.exact(np.diag(np.full(len(into), 0.25)))
-    )
-    units = RADII.exact(np.diag(scale))
+    # A device is where it was as the frame began, and the intervals before have moved it since.
+    felt, at_once = RADII.multiply(peers, felt), RADII.multiply(peers, whole[:, at.out[:, None], at.into])
+    forces = RADII.add(RADII.multiply(felt, aside), RADII.multiply(at_once, of))
+    static = forces[:, np.argmax(at.of, axis=0)]
+    b = RADII.subtract(RADII.multiply(placed, exact(at.sums)), RADII.multiply(aside, across))
+    pole = RADII.multiply(RADII.multiply(of, static), across)
+    half = RADII.multiply(RADII.add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(len(at.into)) / 4))
+    dampings = [float(one.damping) for one in sites]
+    dampers = np.diag((at.of @ dampings) * at.peers / at.seconds)
+    units = exact(np.diag(np.sqrt(at.seconds / at.peers)))
 
     def scaled(matrix: Matrix) -> Matrix:
         return RADII.multiply(RADII.multiply(units, matrix), units)
 
-    starts = np.concatenate([np.cumsum([0.0, *map(float, one.seconds[:-1])]) for one in sites])
     return PortLoop(
         name=loop.name,
         multiplicity=loop.multiplicity,
         a=a,
         b=RADII.multiply(b, units),
-        c=RADII.multiply(units, answered),
-        d=scaled(d),
-        weight=scaled(RADII.subtract(dampers, half)),
+        c=RADII.multiply(units, felt),
+        d=scaled(RADII.multiply(at_once, exact(at.sums))),
+        weight=scaled(RADII.subtract(with_radius(dampers, 4 * UNIT * dampers), half)),
         static=static,
         dampings=tuple(one.damping for one in sites),
-        starts=starts,
-        seconds=np.concatenate([[float(one) for one in site.seconds] for site in sites]),
+        starts=at.starts,
+        seconds=at.seconds,
         frame_s=closed.frame_s,
     )
+
+
+def _moving(whole: Matrix, at: _Wires, rigid: Floats) -> tuple[Matrix, Matrix, Matrix]:
+    """Return what moves by itself, what moves it, and what is felt of it, less rigid motions (n, d)."""
+    rest, into, out = at.rest, at.into, at.out
+    a, placed, felt = (whole[:, rows[:, None], of] for rows, of in ((rest, rest), (rest, into), (out, rest)))
+    if not rigid.size:
+        return a, placed, felt
+    to = relative_coordinates(rigid)
+    weights = with_radius(to.weights, to.doubt)
+    both = np.concatenate([a, placed], axis=-1)
+    less = RADII.subtract(both[:, to.rest], RADII.multiply(weights, both[:, to.held]))
+    return less[..., to.rest], less[..., len(rest) :], felt[..., to.rest]
+
+
+def _aside(a: Matrix, placed: Matrix, of: Matrix) -> Matrix | None:
+    """Return where all else is while devices stand aside by 1, site by site; None where it can't be said."""
+    return solve(RADII.subtract(RADII.exact(np.eye(a.shape[-1])), a), RADII.multiply(placed, of))

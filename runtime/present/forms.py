@@ -1,6 +1,6 @@
 """The forms that all results share: plain data, JSON, indented notes.
 
-Takes: frozen values, texts. Gives: `document`, `json_text`, `note`.
+Takes: frozen values, texts. Gives: `document`, `json_text`, `note`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text.
 Does not: know a result.
 """
@@ -16,6 +16,12 @@ from fractions import Fraction
 from typing import Any
 
 from apc.compiler.words import wrapped
+
+# What stable means by a criterion, where it is not that motions die out.
+MEANT = {
+    "mean-square": "stable in mean square, over the network as it is",
+    "passive": "stable with every passive hand at every device",
+}
 
 PLAIN = {str, int, bool, type(None)}
 

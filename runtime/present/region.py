@@ -23,7 +23,7 @@ from apc.compiler.words import known_digits, measured, with_unit
 from apc.distribution import program_version
 from apc.optional import need
 from apc.present.analysis import range_document
-from apc.present.forms import document, json_text, note
+from apc.present.forms import MEANT, document, json_text, note
 from apc.present.pictures import FORMATS, write_figure
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
 from apc.suffixes import check_suffix
@@ -45,8 +45,8 @@ def region_text(found: Region) -> str:
     """Return what `apc region` prints of one region."""
     width = max(len(found.x.free.label), len(found.y.free.label))
     lines = [f"{found.topology}: {_words(found)}"]
-    if found.criterion == "mean-square":
-        lines += note("stable in mean square, over the network as it is")
+    if found.criterion in MEANT:
+        lines += note(MEANT[found.criterion])
     for text in found.left_out:
         lines += note(text)
     lines.append("")

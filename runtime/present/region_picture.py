@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.optional import need
+from apc.present.forms import MEANT
 from apc.regions.curves import between
 from apc.regions.region import side_of_curves
 
@@ -107,9 +108,7 @@ def panels_picture(found: Panels) -> Any:
 
 def _entitle(ax: Any, title: str, regions: Sequence[Region]) -> None:
     """Set a title, and beneath it what stable means and what the regions leave out."""
-    meant = ["stable in mean square, over the network"] * any(
-        one.criterion == "mean-square" for one in regions
-    )
+    meant = [MEANT[one.criterion].removesuffix(" as it is") for one in regions if one.criterion in MEANT]
     notes = dict.fromkeys([*meant, *(note for one in regions for note in one.left_out)])
     lines = [line for text in (title, *notes) for line in textwrap.wrap(text, 48)]
     if lines:

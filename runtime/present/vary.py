@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.words import counted, in_hertz, known_digits, measured, with_unit, wrapped
 from apc.optional import need
-from apc.present.forms import document, note
+from apc.present.forms import MEANT, document, note
 
 if TYPE_CHECKING:
     import pandas
@@ -45,8 +45,8 @@ def critical_text(found: Critical) -> str:
         whom = "groups" if len(found.groups) > 1 else "its peers"
         lines = [f"{found.topology}: {found.parameter}, one value for all {whom}"]
         lines += note(f"now {', '.join(own)}")
-    if found.criterion == "mean-square":
-        lines += note("stable in mean square, over the network as it is")
+    if found.criterion in MEANT:
+        lines += note(MEANT[found.criterion])
     for text in found.left_out:
         lines += note(text)
     lines.append("")

@@ -40,6 +40,7 @@ from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_time
 from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.mean_square import (
+    BY_GROWTH,
     MEAN_SQUARE,
     NOMINAL,
     MeanSquareEvaluator,
@@ -95,7 +96,7 @@ class Curve:
     def mode(self) -> str:
         """The name of the closed system that makes the boundary here, or the criterion that does."""
         if isinstance(self.source, MeanSquareEvaluator):
-            return MEAN_SQUARE
+            return self.source.criterion
         middle = len(self.knots) // 2
         return _identify(self.source, self.knots[middle], complex(self.eigenvalues[middle]))[0]
 
@@ -250,7 +251,7 @@ def region(
         if meant == NOMINAL:
             refuse_channel_number(system, one, PLACE, instead=f"--in {MEAN_SQUARE}")
         else:
-            refuse_time(system, one, PLACE)
+            refuse_time(system, one, PLACE, meant)
     rectangle = rectangle_of(*axes)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
@@ -258,9 +259,9 @@ def region(
         affine = all(site.affine for site in used)
         times = [place for place, one in enumerate(free) if reaches_time(system, one)]
         source: Source
-        if meant == MEAN_SQUARE:
+        if meant in BY_GROWTH:
             times = []
-            source = MeanSquareEvaluator(system, free, prepared, PLACE)
+            source = MeanSquareEvaluator(system, free, prepared, PLACE, meant)
         elif times:
             source = PointEvaluator(system, free, prepared)
         else:
@@ -287,7 +288,7 @@ def region(
         stepped=stepped,
         linearized=not affine,
         criterion=meant,
-        left_out=left_out(system, linear=affine, network=meant == NOMINAL),
+        left_out=left_out(system, linear=affine, network=meant != MEAN_SQUARE),
         system=system,
     )
 
@@ -428,8 +429,9 @@ def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
             for axis, number in zip((found.x, found.y), value, strict=True)
         ]
         changed = apply(found.system, overrides)
-        if found.criterion == MEAN_SQUARE:
-            decided.append(bool(growth_at(changed, prepared, [], PLACE).stable))
+        if found.criterion in BY_GROWTH:
+            judged = growth_at(changed, prepared, [], PLACE, criterion=found.criterion)
+            decided.append(bool(judged.stable))
         else:
             decided.append(bool(analyze(changed, prepared=prepared).stable))
     return np.array(decided, dtype=bool)

@@ -1,8 +1,7 @@
 """What a sweep can compute at each of its points.
 
 Takes: a `CompiledSystem` and a name such as `analyze` or `critical:coordination.stiffness`.
-Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`; `in_mean_square`,
-`is_in_mean_square`.
+Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`; `by_criterion`.
 Guarantees: what all points share is prepared once; a row does not depend on the parts computed before; a
 point that can't be computed is a row that says why; a number that isn't finite is left out of a row.
 Does not: choose points, or hold results.
@@ -24,11 +23,12 @@ from apc.frame.overrides import apply
 from apc.sweeps.grid import Grid
 from apc.tables import Column, Row
 from apc.vary.many import FAULT, ManyAnalyses, Varied, by_matrices, many_analyses
+from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, PASSIVE
 
 PLACE = Place("sweep")
 
-# How the name of a quantity in mean square begins.
-IN_MEAN_SQUARE = "in mean square: "
+# How the name of a quantity begins that is by another criterion than the nominal one.
+BEGINNINGS = {MEAN_SQUARE: "in mean square: ", PASSIVE: "with passive hands: "}
 
 VERDICT = Column("verdict", "", "text")
 MESSAGE = Column("message", "", "text")
@@ -62,28 +62,21 @@ def find_quantity(system: CompiledSystem, text: str) -> Quantity:
     ApcError
         E884 no such quantity; what the quantity's own argument can be wrong in.
     """
-    if is_in_mean_square(text):
-        text, by_chance = text.removeprefix(IN_MEAN_SQUARE), True
-    else:
-        by_chance = False
+    criterion = next((one for one, start in BEGINNINGS.items() if text.startswith(start)), NOMINAL)
+    text = text.removeprefix(BEGINNINGS.get(criterion, ""))
     name, _, argument = text.partition(":")
     make = QUANTITIES.get(name.strip())
     if make is None:
         what = f"{name[:80] or 'an empty name'} is nothing a sweep computes ({', '.join(QUANTITIES)})"
         raise ApcError(Mistake("E884", PLACE, what, hint=nearest(name, QUANTITIES)))
-    if by_chance:
-        make = _BY_CHANCE[name.strip()]
+    if criterion != NOMINAL:
+        make = _BY_GROWTH[criterion, name.strip()]
     return make(system, argument.strip())
 
 
-def in_mean_square(text: str) -> str:
-    """Return the name of a quantity in mean square."""
-    return IN_MEAN_SQUARE + text
-
-
-def is_in_mean_square(text: str) -> bool:
-    """Say whether a quantity is one in mean square."""
-    return text.startswith(IN_MEAN_SQUARE)
+def by_criterion(text: str, criterion: str) -> str:
+    """Return the name of a quantity by a criterion."""
+    return BEGINNINGS.get(criterion, "") + text
 
 
 def faulty(columns: tuple[Column, ...], error: ApcError) -> Row:
@@ -156,8 +149,38 @@ def _growth(system: CompiledSystem, argument: str) -> Quantity:
     return Quantity(columns, _one_by_one(system, columns, evaluate))
 
 
-def _critical_by_chance(system: CompiledSystem, argument: str) -> Quantity:
-    return _critical(system, argument, "mean-square")
+def _passive(system: CompiledSystem, argument: str) -> Quantity:
+    """Return the verdict with every passive hand, and how much damping of each device could be spared."""
+    from apc.hands.passivity import passive_hands  # the nominal quantities need none of it
+
+    if argument:
+        raise ApcError(Mistake("E884", PLACE, "analyze", "no parameter", argument[:80], "--of analyze"))
+    columns = (
+        VERDICT,
+        Column("spare_damping", "N*s/m", "number"),
+        Column("spare_damping_error", "N*s/m", "number"),
+        Column("frequency", "Hz", "number"),
+        MESSAGE,
+    )
+
+    def evaluate(changed: CompiledSystem) -> Row:
+        found = passive_hands(changed)
+        worst = found.worst
+        if worst is None or worst.more is None or worst.error is None:
+            return (found.verdict, None, None, None, found.why or "no damping is enough")
+        return (
+            found.verdict,
+            finite(-worst.more),
+            finite(worst.error),
+            finite(worst.frequency_hz or 0.0),
+            "",
+        )
+
+    return Quantity(columns, _one_by_one(system, columns, evaluate))
+
+
+def _critical_by(criterion: str) -> Callable[[CompiledSystem, str], Quantity]:
+    return lambda system, argument: _critical(system, argument, criterion)
 
 
 def _one_by_one(
@@ -211,7 +234,9 @@ QUANTITIES: Mapping[str, Callable[[CompiledSystem, str], Quantity]] = {
     "critical": _critical,
 }
 
-_BY_CHANCE: Mapping[str, Callable[[CompiledSystem, str], Quantity]] = {
-    "analyze": _growth,
-    "critical": _critical_by_chance,
+_BY_GROWTH: Mapping[tuple[str, str], Callable[[CompiledSystem, str], Quantity]] = {
+    (MEAN_SQUARE, "analyze"): _growth,
+    (MEAN_SQUARE, "critical"): _critical_by(MEAN_SQUARE),
+    (PASSIVE, "analyze"): _passive,
+    (PASSIVE, "critical"): _critical_by(PASSIVE),
 }

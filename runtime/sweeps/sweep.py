@@ -30,11 +30,11 @@ from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
-from apc.sweeps.quantities import VERDICT, find_quantity, in_mean_square, is_in_mean_square
+from apc.sweeps.quantities import BEGINNINGS, VERDICT, by_criterion, find_quantity
 from apc.sweeps.store import Parts, open_parts, remove_parts
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
 from apc.tables import Cell, Column, Row, check_table_path, write_table
-from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, criterion_of
+from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 
 if TYPE_CHECKING:
     import pandas
@@ -150,9 +150,11 @@ def sweep(
     check_size(list(texts.values()))
     grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
     meant = criterion_of(system, criterion, PLACE, [axis.free for axis in grid.axes])
-    work_of = of if meant == NOMINAL else in_mean_square(of)
+    work_of = by_criterion(of, meant)
     quantity = find_quantity(system, work_of)
     for axis in grid.axes:
+        if meant == PASSIVE:
+            refuse_time(system, axis.free, PLACE, meant)
         if meant == NOMINAL:
             refuse_channel_number(system, axis.free, PLACE, instead=f"--in {MEAN_SQUARE}")
         if axis.free.label == of.partition(":")[2].strip():
@@ -214,7 +216,7 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
             left_out(
                 system,
                 linear=all(jacobians(kind).affine for kind in system.kinds),
-                network=not is_in_mean_square(work.of),
+                network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]),
             )
         ),
         "points": work.grid.points,

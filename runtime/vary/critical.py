@@ -30,7 +30,14 @@ from apc.threads import single_threaded
 from apc.vary.crossings import CELL
 from apc.vary.delays import delay_now
 from apc.vary.evaluator import reaches_time
-from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, criterion_of, growth_at, search_mean_square
+from apc.vary.mean_square import (
+    BY_GROWTH,
+    MEAN_SQUARE,
+    NOMINAL,
+    criterion_of,
+    growth_at,
+    search_mean_square,
+)
 from apc.vary.search import Crossing, Search, Told, search, search_delay
 
 _PLACE = Place("critical value")
@@ -100,7 +107,8 @@ def critical(
         value (of a delay, as far as `search.delay_reach` says).
     criterion
         "mean-square": what becomes of second moments over the network as it is; "nominal": every packet on
-        time. None: mean square where a link is unreliable.
+        time; "passive": with every passive hand at every device. None: mean square where a link is
+        unreliable.
     told
         Is told how far the search is.
 
@@ -113,8 +121,8 @@ def critical(
     """
     free = find(system, name.strip(), _PLACE)
     chosen_criterion = criterion_of(system, criterion, _PLACE, [free])
-    by_chance = chosen_criterion == MEAN_SQUARE
-    if not by_chance:
+    by_growth = chosen_criterion in BY_GROWTH
+    if not by_growth:
         refuse_channel_number(system, free, _PLACE, instead=f"--in {MEAN_SQUARE}")
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         timed = reaches_time(system, free)
@@ -124,9 +132,11 @@ def critical(
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
-        if by_chance:
+        if by_growth:
             low, high = (None if one is None else float(one) for one in limits)
-            found = search_mean_square(system, free, low, high, present, prepared, _PLACE, told=told)
+            found = search_mean_square(
+                *(system, free, low, high, present, prepared, _PLACE), told=told, criterion=chosen_criterion
+            )
         elif timed:
             start = _at_start(system, prepared)
             found = search_delay(system, free, limits[0] or Fraction(0), limits[1], start, told=told)
@@ -135,8 +145,8 @@ def critical(
             found = search(system, free, low, high, prepared, told=told)
 
         def stable_now() -> bool | None:
-            if by_chance:
-                return growth_at(system, prepared, [], _PLACE).stable
+            if by_growth:
+                return growth_at(system, prepared, [], _PLACE, criterion=chosen_criterion).stable
             return analyze(system, prepared=prepared).stable
 
         chosen = _chosen(found, present, stable_now)
@@ -164,7 +174,7 @@ def critical(
         looked=found.looked,
         enters=found.enters,
         verdict="" if chosen else verdict,
-        left_out=left_out(system, linear=linear, network=not by_chance),
+        left_out=left_out(system, linear=linear, network=chosen_criterion != MEAN_SQUARE),
         criterion=chosen_criterion,
         groups=_by_group(system, free),
         stretches=found.stretches,

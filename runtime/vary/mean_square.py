@@ -1,9 +1,10 @@
-"""The values of one parameter at which a scene becomes stable or unstable in mean square.
+"""The values of one parameter at which one number passes 1: in mean square, or with passive hands.
 
-Takes: a `CompiledSystem` with unreliable links and the name of a parameter, or of what links lose.
-Gives: `MEAN_SQUARE`, `NOMINAL`, `criterion_of`; `search_mean_square`; `first_lost`, `FirstLost`; `growth_at`,
-`allowed`; `MeanSquareEvaluator`.
-Guarantees: on either side of a crossing, by its error, bounds on the growth of second moments decide.
+Takes: a `CompiledSystem` and the name of a parameter, or of what its links lose.
+Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`; `search_mean_square`; `first_lost`,
+`FirstLost`; `growth_at`, `allowed`; `MeanSquareEvaluator`.
+Guarantees: on either side of a crossing, by its error, bounds on the growth of second moments decide, or on
+what hands can draw, which counts as a growth (see `passivity.passive_growth`).
 Does not: find two crossings between neighbouring samples; follow a delay, whose pieces are the nominal
 search's (see `delays`).
 """
@@ -24,6 +25,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
+from apc.hands.passivity import passive_growth
 from apc.moments.network import Growth, growth, unreliable
 from apc.network.nominal import channel_numbers
 from apc.vary.evaluator import reaches_time
@@ -34,7 +36,10 @@ Floats = NDArray[np.float64]
 # The step of a difference, of a direction, whose cut-off and rounding are then alike; roots above 0.
 DIFFERENCE, LEAST = 1e-5, 1e-9
 
-MEAN_SQUARE, NOMINAL = "mean-square", "nominal"
+MEAN_SQUARE, NOMINAL, PASSIVE = "mean-square", "nominal", "passive"
+
+# The criteria of one number, and how a verdict is by each.
+BY_GROWTH = {MEAN_SQUARE: "in mean square", PASSIVE: "with passive hands"}
 
 # Values looked at between 0 and 1 of a probability.
 SHARES = 33
@@ -57,7 +62,7 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied
     system
         The compiled scene.
     asked
-        "mean-square", "nominal", or None.
+        "mean-square", "nominal", "passive", or None.
     place
         Where it was asked for.
     varied
@@ -68,15 +73,15 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied
     ApcError
         E898 no such criterion.
     """
-    if asked not in (None, MEAN_SQUARE, NOMINAL):
+    if asked not in (None, MEAN_SQUARE, NOMINAL, PASSIVE):
         what = f"{str(asked)[:40]} is no criterion ({MEAN_SQUARE}, {NOMINAL})"
         raise ApcError(Mistake("E898", place, what, hint=f"--in {MEAN_SQUARE}"))
     by_chance = unreliable(system) or any(one.name in channel_numbers(system) for one in varied)
     return asked or (MEAN_SQUARE if by_chance else NOMINAL)
 
 
-def refuse_time(system: CompiledSystem, free: Free, place: Place) -> None:
-    """Refuse to vary a period, phase or delay in mean square; how much delays vary may.
+def refuse_time(system: CompiledSystem, free: Free, place: Place, criterion: str = MEAN_SQUARE) -> None:
+    """Refuse to vary a period, phase or delay by a criterion of one number; how much delays vary may.
 
     Parameters
     ----------
@@ -84,16 +89,23 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place) -> None:
         The compiled scene and what is to vary.
     place
         Where it was asked for.
+    criterion
+        One of `BY_GROWTH`.
 
     Raises
     ------
     ApcError
-        E898 it reaches when something happens.
+        E898 or, with passive hands, E930: it reaches when something happens.
     """
     jitter = {link.channel.jitter for link in system.links if link.channel is not None}
     if reaches_time(system, free) and free.name not in jitter:
-        what = f"{free.label} can't be varied in mean square: what happens when would change with it"
+        what = f"{free.label} can't be varied {BY_GROWTH[criterion]}: what happens when would change with it"
+        if criterion == PASSIVE:
+            raise ApcError(Mistake("E930", place, what, hint="--hands clamped"))
         raise ApcError(Mistake("E898", place, what, hint=f"--in {NOMINAL}"))
+    if criterion == PASSIVE and free.name in channel_numbers(system):
+        what = f"{free.label} can't be varied with passive hands: every packet takes its nominal delay there"
+        raise ApcError(Mistake("E930", place, what, hint=f"--in {MEAN_SQUARE}, with free hands"))
 
 
 def growth_at(
@@ -103,8 +115,9 @@ def growth_at(
     place: Place,
     *,
     bounded: bool = True,
+    criterion: str = MEAN_SQUARE,
 ) -> Growth:
-    """Return what second moments grow by with other numbers.
+    """Return what second moments grow by with other numbers, or what stands for that by another criterion.
 
     Parameters
     ----------
@@ -116,13 +129,17 @@ def growth_at(
         Where they were asked for.
     bounded
         Whether bounds are asked for.
+    criterion
+        One of `BY_GROWTH`.
 
     Raises
     ------
     ApcError
-        E898 the network can't be judged with these numbers, by name.
+        E898 the network can't be judged with these numbers, by name; those of `passivity.passive_hands`.
     """
     changed = apply(system, overrides)
+    if criterion == PASSIVE:
+        return passive_growth(changed, prepared, bounded=bounded)
     found = growth(changed, prepared, bounded=bounded)
     if found.why:
         what = f"the scene can't be judged in mean square: {found.why}"
@@ -134,7 +151,7 @@ def growth_at(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanSquareEvaluator:
-    """An `Evaluator` of one number: the root of what second moments grow by in a frame, as a matrix (1, 1).
+    """An `Evaluator` of one number: the root of what is said to grow in a frame, as a matrix (1, 1).
 
     Derivatives are differences over a small part of the directions, right to about 1e-9 of them.
     """
@@ -143,13 +160,16 @@ class MeanSquareEvaluator:
     free: tuple[Free, ...]
     prepared: Prepared
     place: Place
+    criterion: str = MEAN_SQUARE
 
     def growth(self, value: Sequence[float], *, bounded: bool = False) -> Growth:
         """Return what second moments grow by at a point (m,)."""
         overrides = [
             Override(one, Fraction(float(number))) for one, number in zip(self.free, value, strict=True)
         ]
-        return growth_at(self.system, self.prepared, overrides, self.place, bounded=bounded)
+        return growth_at(
+            *(self.system, self.prepared, overrides, self.place), bounded=bounded, criterion=self.criterion
+        )
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
         """Return the root (k, 1, 1) at values (k, m)."""
@@ -202,8 +222,9 @@ def search_mean_square(
     place: Place,
     *,
     told: Told | None = None,
+    criterion: str = MEAN_SQUARE,
 ) -> Search:
-    """Find where second moments begin or cease to grow as one parameter varies.
+    """Find where second moments begin or cease to grow as one parameter varies, or what stands for them.
 
     Parameters
     ----------
@@ -220,15 +241,17 @@ def search_mean_square(
         Where it was asked for.
     told
         Is told how far the search is.
+    criterion
+        One of `BY_GROWTH`.
 
     Raises
     ------
     ApcError
-        E898 the network can't be judged, or a delay is to vary.
+        E898 the network can't be judged, or a delay is to vary; E930 the same with passive hands.
     """
-    refuse_time(system, free, place)
+    refuse_time(system, free, place, criterion)
     samples = _samples(system, free, low, high, present)
-    looking = _Looking(system, free, prepared, place, {})
+    looking = _Looking(system, free, prepared, place, {}, criterion)
     known = looking.known
     for number, value in enumerate(samples):
         if told is not None:
@@ -261,6 +284,7 @@ class _Looking:
     prepared: Prepared
     place: Place
     known: dict[float, Growth]
+    criterion: str = MEAN_SQUARE
 
     def at(self, value: float) -> Growth:
         """Return what second moments grow by, without bounds."""
@@ -270,7 +294,9 @@ class _Looking:
 
     def _growth(self, value: float, *, bounded: bool) -> Growth:
         overrides = [Override(self.free, Fraction(value))]
-        return growth_at(self.system, self.prepared, overrides, self.place, bounded=bounded)
+        return growth_at(
+            *(self.system, self.prepared, overrides, self.place), bounded=bounded, criterion=self.criterion
+        )
 
     def crossing(self, low: float, high: float) -> Crossing:
         """Return the crossing between two values of other verdicts, and how far bounds leave it open.
@@ -297,7 +323,7 @@ class _Looking:
             sides = [self._growth(one, bounded=True) for one in (value - width, value + width)]
             below, above = (one.stable for one in sides)
             if None not in (below, above) and below != above:
-                proof = BOUNDED if all(one.proved for one in sides) else ITERATED
+                proof = BOUNDED[self.criterion] if all(one.proved for one in sides) else ITERATED
                 proof = proof if all(one.exact for one in sides) else TAGGED
                 return Crossing(value, width, "below" if below else "above", math.nan, "crossing", proof)
             width *= 4
@@ -370,7 +396,10 @@ def _samples(
     return [float(one) for one in np.linspace(bottom, top, 6 * SAMPLES + 1)]
 
 
-BOUNDED = "second moments bounded on either side"
+BOUNDED = {
+    MEAN_SQUARE: "second moments bounded on either side",
+    PASSIVE: "what hands can draw bounded on either side",
+}
 ESTIMATED = "an estimate: bounds leave either side open"
 ITERATED = "second moments by iteration in floats, not proved"
 TAGGED = "an estimate, not proved: of second moments that are themselves estimates"
