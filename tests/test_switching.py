@@ -153,6 +153,23 @@ def test_what_is_proved_never_grows_whatever_switches(count: int) -> None:
         assert np.abs(product[[7 * i + k for i in range(count) for k in (0, 2)]][:, 2::7]).max() < 10
 
 
+def test_what_is_proved_of_random_scenes_never_grows() -> None:
+    generator = np.random.default_rng(8)
+    proved = 0
+    for _ in range(12):
+        count, tie = int(generator.integers(2, 4)), float(np.exp(generator.uniform(3, 6.5)))
+        stiffness = float(np.exp(generator.uniform(3, 6)))
+        text = replaced(HELD, ("count: 3", f"count: {count}"), ("mass: 0.6 kg", f"mass: {0.2 * count} kg"))
+        text = replaced(text, ("stiffness: 500 N/m", f"stiffness: {tie!r} N/m"))
+        if not judged(stiff(text, stiffness)).stable:
+            continue
+        proved += 1
+        for _ in range(15):
+            patterns = (generator.random((3, 8, count)) < generator.random()).tolist()
+            assert growth(played(count, stiffness, patterns, tie=tie)) <= 1 + 1e-9
+    assert proved >= 4
+
+
 def test_a_pattern_that_is_told_to_grow_does_so_by_as_much() -> None:
     system = stiff(HELD, 1000.0)
     found = judged(system)
