@@ -260,3 +260,14 @@ def test_a_limited_force_is_in_a_sector_too() -> None:
         (CONTACT, "type: ForceSaturation, a: device, b: cube, limit: 2 N, stiffness: 100 N/m"),
     )
     assert judged(compiled(limited)).reach == pytest.approx(judged(compiled(HELD)).reach, rel=1e-12)
+
+
+def test_peers_that_touch_nothing_stand_beside_those_that_do() -> None:
+    text = replaced(
+        HELD,
+        ("  user: {count: 3}", "  user: {count: 2}\n  idle: {count: 1, set: {contact.stiffness: 0 N/m}}"),
+    )
+    found = judged(compiled(text))
+    assert found.verdict == STABLE
+    whole = judged(compiled(HELD)).reach
+    assert found.reach is not None and whole is not None and found.reach >= whole * (1 - 1e-9)
