@@ -271,3 +271,9 @@ def test_peers_that_touch_nothing_stand_beside_those_that_do() -> None:
     assert found.verdict == STABLE
     whole = judged(compiled(HELD)).reach
     assert found.reach is not None and whole is not None and found.reach >= whole * (1 - 1e-9)
+
+
+def test_over_a_lossy_link_nothing_is_called_proved() -> None:
+    found = judged(compiled(replaced(HELD, ("delay: 8 ms}", "delay: 8 ms, loss: 1 %}"))))
+    assert (found.verdict, found.stable) == (OPEN, None)
+    assert found.reason == "packets may be lost or late, and it is looked for on time only"
