@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import apc
 from apc.analysis.analysis import prepare
 from apc.analysis.pushes import Push, push_of
 from apc.analysis.switches import find_switches, switching_parts
@@ -40,13 +41,13 @@ couplers: {it: {type: Own, a: device, k: 700 N/m, clock: tick}}
 """
 
 
-def push(system: CompiledSystem) -> Push | str:
+def push(system: CompiledSystem) -> Push | str | None:
     switched, vector = find_switches(system.kinds[0]), resolve(system).parameters[0][0]
     [part] = switching_parts(switched, vector)
     return push_of(switched, part, prepare(system).jacobians[0], vector)
 
 
-def own(law: str, folder: Path) -> Push | str:
+def own(law: str, folder: Path) -> Push | str | None:
     return push(compiled(SCENE, library(folder, OWN.format(law=law))))
 
 
@@ -84,3 +85,8 @@ def test_a_law_of_force_is_in_a_sector_or_not(law: str, sector: str, one_sided: 
 )
 def test_a_law_that_is_no_piece_of_straight_lines_is_named(law: str, why: str, tmp_path: Path) -> None:
     assert own(law, tmp_path) == why
+
+
+def test_a_spring_without_stiffness_pushes_nothing(tmp_path: Path) -> None:
+    system = compiled(SCENE, library(tmp_path, OWN.format(law="k*max(0, d)")))
+    assert push(apc.set_parameters(system, {"it.k": "0 N/m"})) is None

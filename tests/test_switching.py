@@ -153,6 +153,23 @@ def test_what_is_proved_never_grows_whatever_switches(count: int) -> None:
         assert np.abs(product[[7 * i + k for i in range(count) for k in (0, 2)]][:, 2::7]).max() < 10
 
 
+def test_what_is_proved_of_random_scenes_never_grows() -> None:
+    generator = np.random.default_rng(8)
+    proved = 0
+    for _ in range(12):
+        count, tie = int(generator.integers(2, 4)), float(np.exp(generator.uniform(3, 6.5)))
+        stiffness = float(np.exp(generator.uniform(3, 6)))
+        text = replaced(HELD, ("count: 3", f"count: {count}"), ("mass: 0.6 kg", f"mass: {0.2 * count} kg"))
+        text = replaced(text, ("stiffness: 500 N/m", f"stiffness: {tie!r} N/m"))
+        if not judged(stiff(text, stiffness)).stable:
+            continue
+        proved += 1
+        for _ in range(15):
+            patterns = (generator.random((3, 8, count)) < generator.random()).tolist()
+            assert growth(played(count, stiffness, patterns, tie=tie)) <= 1 + 1e-9
+    assert proved >= 4
+
+
 def test_a_pattern_that_is_told_to_grow_does_so_by_as_much() -> None:
     system = stiff(HELD, 1000.0)
     found = judged(system)
@@ -243,3 +260,20 @@ def test_a_limited_force_is_in_a_sector_too() -> None:
         (CONTACT, "type: ForceSaturation, a: device, b: cube, limit: 2 N, stiffness: 100 N/m"),
     )
     assert judged(compiled(limited)).reach == pytest.approx(judged(compiled(HELD)).reach, rel=1e-12)
+
+
+def test_peers_that_touch_nothing_stand_beside_those_that_do() -> None:
+    text = replaced(
+        HELD,
+        ("  user: {count: 3}", "  user: {count: 2}\n  idle: {count: 1, set: {contact.stiffness: 0 N/m}}"),
+    )
+    found = judged(compiled(text))
+    assert found.verdict == STABLE
+    whole = judged(compiled(HELD)).reach
+    assert found.reach is not None and whole is not None and found.reach >= whole * (1 - 1e-9)
+
+
+def test_over_a_lossy_link_nothing_is_called_proved() -> None:
+    found = judged(compiled(replaced(HELD, ("delay: 8 ms}", "delay: 8 ms, loss: 1 %}"))))
+    assert (found.verdict, found.stable) == (OPEN, None)
+    assert found.reason == "packets may be lost or late, and it is looked for on time only"

@@ -110,22 +110,22 @@ def contact_groups(
         bind(one, site, settings(listed, on=True)) if one.decisions else site
         for one, site, listed in zip(switched, prepared.jacobians, parts, strict=True)
     )
-    for place, one in enumerate(system.groups):
-        for listed in parts[one.kind]:
-            site, vector = prepared.jacobians[one.kind], numbers.parameters[place][0]
-            told = push_of(switched[one.kind], listed, site, vector)
-            if isinstance(told, str):
-                return told
-        if not on[one.kind].parameters_suffice:
-            return f"some force at {one.name} is not linear, or looks at each of the others by itself"
+    for place, group in enumerate(system.groups):
+        kind, vector = group.kind, numbers.parameters[place][0]
+        told = [push_of(switched[kind], one, prepared.jacobians[kind], vector) for one in parts[kind]]
+        for one in told:
+            if isinstance(one, str):
+                return one
+        if not on[kind].parameters_suffice:
+            return f"some force at {group.name} is not linear, or looks at each of the others by itself"
     exchange = build_exchange(system, numbers.timings)
     kinds = {id(one): kind for kind, one in enumerate(on)}
     found = []
-    for group in peer_groups(system, on, prepared.schedules, numbers, exchange):
-        kind = kinds[id(group.jacobians)]
+    for peers in peer_groups(system, on, prepared.schedules, numbers, exchange):
+        kind = kinds[id(peers.jacobians)]
         site = prepared.jacobians[kind]
-        pushes = [push_of(switched[kind], listed, site, group.parameters) for listed in parts[kind]]
-        found.append((group, tuple(one for one in pushes if isinstance(one, Push))))
+        pushes = [push_of(switched[kind], one, site, peers.parameters) for one in parts[kind]]
+        found.append((peers, tuple(one for one in pushes if isinstance(one, Push))))
     return found
 
 

@@ -54,8 +54,10 @@ class Push:
 
 def push_of(
     switched: SwitchedKind, part: SwitchingPart, site: SiteJacobians, parameters: Floats
-) -> Push | str:
+) -> Push | str | None:
     """Return a part's force where it is on, or why it is none that is computed from tick to tick.
+
+    None where it is 0 whatever moves, as that of a spring without stiffness.
 
     Parameters
     ----------
@@ -104,8 +106,8 @@ def push_of(
 
     values, steepest = piece(part.on)
     line, square = steepest[0], float(steepest[0] @ steepest[0])
-    if not square or not np.isfinite(square):
-        return f"{part.name} follows no motion"
+    if not square:
+        return None
     offset = float(values[0] - line @ start)
     tick, sizes = switched.kind.clocks[partition].tick, [one.numel() for one in inputs]
 

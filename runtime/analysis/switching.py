@@ -3,7 +3,8 @@
 Takes: a `CompiledSystem` whose peers have parts that switch, and its modes of contact.
 Gives: `Switching`, `switching`.
 Guarantees: what is called stable is proved, for every pattern of contacts that are on, off or anything
-between, each peer and tick by itself; the cost grows with the different peers, not with their number.
+between, each peer and tick by itself: motions die out, but for what drifts with all contacts open, and that
+stays within bounds. The cost grows with the different peers, not with their number.
 Does not: look for functions that are not quadratic, or that change with the contacts; say that a scene whose
 proof fails is unstable, unless a mode of contact is, or contacts that close and open by turns make it grow.
 
@@ -83,12 +84,9 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
         Its modes of contact.
     prepared
         From `analysis.prepare`, of this system with these timings.
-
-    Raises
-    ------
-    ApcError
-        E863 a part that takes too many decisions.
     """
+    if any(link.channel is not None for link in system.links):
+        return Switching(system.name, OPEN, "packets may be lost or late, and it is looked for on time only")
     if modes.unstable:
         named = " or ".join(modes.unstable)
         when = "in any mode" if len(modes.unstable) == len(modes.modes) else f"when {named}"

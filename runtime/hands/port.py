@@ -239,7 +239,7 @@ def _loops(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Wires:
-    """The intervals of a loop's devices: `into` and `out` (m,) are where in the closed state, `rest` all else.
+    """The intervals of a loop's devices: `into`, `out` (m,) are where in the closed state, `rest` all else.
 
     `of` (m, k) says of which site each is, `sums` (m, m) which came before it in a frame, `peers` (m,) how
     many peers it stands for, `seconds` and `starts` (m,) how long it is and when it begins.
