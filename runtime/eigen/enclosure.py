@@ -155,15 +155,15 @@ def _enclose(
         own = form[large:, large:]
         small = own.real if np.isrealobj(matrix) else own
         centres[large:], radii[large:] = 0.0, pseudospectral_radius(small, float(totals[-1]))
-    found = discs(values, centres, radii)
+    told = discs(values, centres, radii)
     ones, grown = np.ones(n, dtype=np.bool_), radii.copy()
     for block in [*several, np.arange(large, n)]:
         ones[block] = False
     outermost = int(np.argmax(np.abs(centres) + radii))
     touching = np.abs(centres - centres[outermost]) <= radii + radii[outermost]
-    wide = found.high - found.low > WIDE * max(found.low, 1.0)
+    wide = told.high - told.low > WIDE * max(told.low, 1.0)
     if not (wide and ones[outermost] and touching.sum() == 1):
-        return found
+        return told
     for block in several:
         about, radius = _blockdiscs(form[np.ix_(block, block)], GROWN * float(totals[block[0]]))
         grown[block] = radius + np.abs(about - centres[block])
