@@ -216,9 +216,9 @@ def _multiply(matrix: Balls, rows: Balls) -> Balls:
         lines = np.flatnonzero(left[:, between].any(axis=1))
         columns = np.flatnonzero(right[between].any(axis=0))
         whole = _flint(matrix[np.ix_(lines, between)]) * _flint(rows[np.ix_(between, columns)])
-        found = np.empty(len(lines) * len(columns), dtype=object)
-        found[:] = whole.entries()
-        found = found.reshape(len(lines), len(columns))
+        entries = np.empty(len(lines) * len(columns), dtype=object)
+        entries[:] = whole.entries()
+        found = entries.reshape(len(lines), len(columns))
         found[~(left[np.ix_(lines, between)] @ right[np.ix_(between, columns)])] = 0
         product[np.ix_(lines, columns)] = found
         return product
@@ -248,7 +248,8 @@ def _all_balls(*blocks: Balls) -> bool:
 
 def _flint(block: Balls) -> Any:
     """Return an array (n, m) of balls as a matrix of python-flint."""
-    return flint.arb_mat(*block.shape, block.ravel().tolist())
+    height, width = block.shape
+    return flint.arb_mat(height, width, block.ravel().tolist())
 
 
 BALLS = Arithmetic(_multiply, np.add, np.subtract, lambda value: value.astype(object))

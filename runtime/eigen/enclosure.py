@@ -155,22 +155,21 @@ def _enclose(
         own = form[large:, large:]
         small = own.real if np.isrealobj(matrix) else own
         centres[large:], radii[large:] = 0.0, pseudospectral_radius(small, float(totals[-1]))
-    found = discs(values, centres, radii)
-    if not found.high - found.low > WIDE * max(found.low, 1.0) or not _apart(centres, radii)[:large].any():
-        return found
+    told = discs(values, centres, radii)
     ones, grown = np.ones(n, dtype=np.bool_), radii.copy()
+    for block in [*several, np.arange(large, n)]:
+        ones[block] = False
+    outermost = int(np.argmax(np.abs(centres) + radii))
+    touching = np.abs(centres - centres[outermost]) <= radii + radii[outermost]
+    wide = told.high - told.low > WIDE * max(told.low, 1.0)
+    if not (wide and ones[outermost] and touching.sum() == 1):
+        return told
     for block in several:
         about, radius = _blockdiscs(form[np.ix_(block, block)], GROWN * float(totals[block[0]]))
-        ones[block], grown[block] = False, radius + np.abs(about - centres[block])
+        grown[block] = radius + np.abs(about - centres[block])
     if large < n:
-        ones[large:], grown[large:] = False, pseudospectral_radius(small, GROWN * float(totals[-1]))
+        grown[large:] = pseudospectral_radius(small, GROWN * float(totals[-1]))
     return discs(values, centres, _alone(centres, radii, ones, grown, sizes, totals))
-
-
-def _apart(centres: Complexes, radii: Floats) -> NDArray[np.bool_]:
-    """Say of each disc whether no other touches it."""
-    touching = np.abs(centres[:, None] - centres) <= radii[:, None] + radii
-    return np.asarray(touching.sum(axis=0) == 1)
 
 
 def _alone(

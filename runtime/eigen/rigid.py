@@ -511,9 +511,10 @@ def _null_space(equations: Sequence[Form], size: int, *, split: int, known: int)
     reduced, rank = flint.fmpq_mat([[_fmpq(entry) for entry in vector] for vector in vectors]).rref()
     basis = []
     for line in range(rank):
-        vector = [Fraction(int(entry.p), int(entry.q)) for entry in (reduced[line, c] for c in range(size))]
-        if any(vector[:split]):
-            basis.append(vector)
+        entries = (reduced[line, column] for column in range(size))
+        whole = [Fraction(int(entry.p), int(entry.q)) for entry in entries]
+        if any(whole[:split]):
+            basis.append(whole)
     return basis
 
 

@@ -95,10 +95,10 @@ def turns(
         # A real course is half the work of a complex one.
         alike = [left[real[left]], left[~real[left]]]
         for some in (one[first : first + chunk] for one in alike for first in range(0, len(one), chunk)):
-            z, r = start[:, some], heard[:, some]
+            given: list[NDArray[Any]] = [start[:, some], heard[:, some]]
             if real[some[0]]:
-                z, r = z.real, r.real
-            course = _course(site, schedule, steps, points, z, r, states[some])
+                given = [block.real for block in given]
+            course = _course(site, schedule, steps, points, given[0], given[1], states[some])
             angle, widest = turned_along(course)
             before, _ = turned_along(course[::2])  # half as finely
             agreed = (np.abs(angle - before) < OFF) | (widest < CLOSE)
