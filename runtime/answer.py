@@ -144,7 +144,7 @@ def answer(
     nominal = _margins(system, prepared, found)
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
-        network=_over_network(system, prepared, nominal, certify=certify),
+        network=_over_network(system, prepared, found, nominal, certify=certify),
         sensitivities=sensitivities_of(system, prepared, found),
         margins=nominal,
         contact_modes=modes,
@@ -157,7 +157,7 @@ def answer(
 
 
 def _over_network(
-    system: CompiledSystem, prepared: Prepared, nominal: Margins, *, certify: bool
+    system: CompiledSystem, prepared: Prepared, found: Analysis, nominal: Margins, *, certify: bool
 ) -> NetworkAnswer | None:
     """Return the answer over the network as it is; imported here, as most scenes have an ideal one."""
     if all(link.channel is None for link in system.links):
@@ -168,6 +168,8 @@ def _over_network(
     verdict = judge_network(system, prepared, certify=certify)
     if verdict is None:
         return None
+    if why := _too_large(system, prepared, found):
+        return NetworkAnswer(verdict, _not_told(0.0, why), Margins((), why))
     moved = network_sensitivities(system, prepared)
     return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal))
 
@@ -223,18 +225,21 @@ def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis
         Its analysis.
     """
     if why := _too_large(system, prepared, found):
-        return Sensitivities(found.spectral_radius, (), (), f"what moves it most: {why}")
+        return _not_told(found.spectral_radius, why)
     try:
         told = sensitivities(system, prepared=prepared)
     except ApcError as error:
-        note = f"what moves it most: not looked for: {error.mistakes[0].what}"
-        return Sensitivities(found.spectral_radius, (), (), note)
+        return _not_told(found.spectral_radius, f"not looked for: {error.mistakes[0].what}")
     # Derivatives are of matrices in floats, the analysis is of exact exponentials: both have one radius.
     apart = abs(told.radius - found.spectral_radius) - found.spectral_radius_error
     if told.active and not apart <= SAME_RADIUS * max(1.0, found.spectral_radius):
-        note = "what moves it most: not told: floats lose the digits of what would be differentiated"
-        return Sensitivities(found.spectral_radius, (), (), note)
+        why = "not told: floats lose the digits of what would be differentiated"
+        return _not_told(found.spectral_radius, why)
     return told
+
+
+def _not_told(radius: float, why: str) -> Sensitivities:
+    return Sensitivities(radius, (), (), f"what moves it most: {why}")
 
 
 def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> str:

@@ -45,6 +45,9 @@ STEP = 2.0**-7
 # Values of a probability or jitter to look at, from the present one to the largest.
 SHARES = 16
 
+# More numbers than this are not varied: at some ten milliseconds a value they would take a minute.
+MOST_VARIED = 60
+
 # What grows is called so.
 MOMENTS = "second moments"
 
@@ -60,7 +63,8 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
         The margins over the nominal network: how far to look from a value of 0.
     """
     with part("margins"), single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        here = _looked_at(system, prepared)
+        free = [*coupler_parameters(system), *_of_channels(system)]
+        here = _looked_at(system, prepared, len(free))
         if isinstance(here, str):
             return Margins((), f"not looked for: {here}")
         if not here.stable:
@@ -68,16 +72,18 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
         scales = {one.parameter: one.value or one.scanned / GROWTH for one in nominal.rows}
         rows: list[Margin] = []
         notes, open_sides, looked = [], [], 0
-        for one in (*coupler_parameters(system), *_of_channels(system)):
+        beyond: dict[str, list[str]] = {}
+        for one in free:
             found = first_lost(system, one, _samples(system, one, scales), prepared, PLACE)
             looked += found.looked
             if not found.enters:
                 continue
             rows.append(_margin(system, one, found))
             if found.why:
-                notes.append(f"{one.label}: {found.why}")
+                beyond.setdefault(found.why, []).append(one.label)
             if found.crossing is not None and found.crossing.proof != BOUNDED:
                 open_sides.append(f"{one.label} ({found.crossing.proof})")
+    notes += [f"farther of {', '.join(labels)}, {why}" for why, labels in beyond.items()]
     if open_sides:
         notes.append(f"not bounded on either side: {', '.join(open_sides)}")
     notes.append(
@@ -87,8 +93,10 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
     return Margins(tuple(rows), "; ".join(notes))
 
 
-def _looked_at(system: CompiledSystem, prepared: Prepared) -> Growth | str:
-    """Return what second moments grow by, or why nothing is looked at for many values."""
+def _looked_at(system: CompiledSystem, prepared: Prepared, count: int) -> Growth | str:
+    """Return what second moments grow by, or why nothing is looked at for many values of so many numbers."""
+    if count > MOST_VARIED:
+        return f"over this network, {count} numbers take too long to vary (apc critical varies one)"
     found = growth(system, prepared)
     if found.why:
         return f"over the network, the scene is not judged: {found.why}"
@@ -149,11 +157,12 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
         The compiled scene, and what `analysis.prepare` made of it.
     """
     with part("sensitivities"), single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        here = _looked_at(system, prepared)
+        free = [*varied(system), *_of_channels(system)]
+        here = _looked_at(system, prepared, len(free))
         if isinstance(here, str):
             return Sensitivities(0.0, (), (), f"what moves it most: not looked for: {here}")
         rows, without = [], []
-        for one in (*varied(system), *_of_channels(system)):
+        for one in free:
             present = value_now(system, one)
             try:
                 told = _derivative(system, one, present, prepared, here)
