@@ -35,9 +35,6 @@ UNDECIDED, NEVER = "undecided", "unstable with some passive hands, however much 
 # what part of that a proof may leave over for rounding.
 WIDTHS, SPARED = (1e-9, 1e-7, 1e-5), (0.03, 1e-3)
 
-# Less damping than this counts as so much, in N·s/m.
-HOPELESS = 1e12
-
 # Two frequencies fit a motion alike, relatively.
 ALIKE = 1e-6
 
@@ -151,7 +148,9 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
 def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> Growth:
     """Return a number below 1 where a scene is stable with every passive hand, and above it elsewhere.
 
-    With s the damping that could be spared at each device, in N·s/m, it is e^{−2 asinh s}.
+    With n the damping needed at each device and b the largest there is, it is e^{2 (n − b)/(n + b)}. n grows
+    without end where the scene becomes unstable with devices clamped, and as 1/n this goes there evenly; beyond
+    it is e².
 
     Parameters
     ----------
@@ -163,13 +162,14 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
     refuse_hands(system, OPTION)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
-        found = [(-np.inf, -np.inf, -np.inf)]
+        found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
         if not isinstance(loops, str):
             found = [_bounds(loop)[:3] if bounded else (_least(loop)[0],) * 3 for loop in loops]
-    spared = (max(min(one[place] for one in found), -HOPELESS) for place in range(3))
-    radius, high, low = (float(np.exp(-2 * np.arcsinh(one))) for one in spared)
-    # Unstable with devices clamped, where nothing is bounded: that is told of by floats alone.
-    return Growth(radius, low if np.isfinite(low) else 0.0, high, exact=True, proved=True)
+            scale = max(float(one) for loop in loops for one in loop.dampings) or 1.0
+    needed = [scale - min(one[place] for one in found) for place in range(3)]
+    logs = [1.0 if np.isinf(one) else (one - scale) / (abs(one) + scale) for one in needed]
+    radius, high, low = (float(np.exp(2 * one)) for one in logs)
+    return Growth(radius, low, high, exact=True, proved=True)
 
 
 def _judge(loop: PortLoop) -> PassiveMode:

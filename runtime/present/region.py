@@ -69,7 +69,9 @@ def region_text(found: Region) -> str:
     )
     lines += ["", f"  Looked at in cells of {cell}, and finer where the"]
     lines.append("  eigenvalues hint at more; an island inside one cell could be missed.")
-    if found.stepped:
+    if found.stepped and found.criterion == "passive":
+        lines.append("  Between the edges of cells it is drawn straight: there it is right to a cell.")
+    elif found.stepped:
         lines.append("  Along these times the boundary has steps: it is right to a cell only.")
     return "\n".join(lines)
 

@@ -43,6 +43,7 @@ from apc.vary.mean_square import (
     BY_GROWTH,
     MEAN_SQUARE,
     NOMINAL,
+    PASSIVE,
     MeanSquareEvaluator,
     criterion_of,
     growth_at,
@@ -270,9 +271,10 @@ def region(
         start = prepare_at_start(system, prepared) if len(times) == 1 else None
         if start is not None:
             found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
-        stepped = bool(times) and found is None
+        # What hands can draw grows without end within a hair of where clamped devices shake.
+        stepped = (bool(times) or meant == PASSIVE) and found is None
         if found is None:
-            found = _surveyed(source, rectangle, bool(times), cells, tolerance, told)
+            found = _surveyed(source, rectangle, stepped, cells, tolerance, told)
         curves = tuple(_curve(source, rectangle, arc) for arc in found.arcs)
     whole = float(rectangle.width.prod())
     return Region(
@@ -296,13 +298,13 @@ def region(
 def _surveyed(
     source: Source,
     rectangle: Rectangle,
-    timed: bool,
+    stepped: bool,
     cells: int,
     tolerance: float,
     told: Told | None,
 ) -> Striped:
-    """Survey the whole rectangle and follow the boundary through it; in steps where a time varies."""
-    family = _family(source, rectangle, timed)
+    """Survey the whole rectangle and follow the boundary through it, or go by steps from cell to cell."""
+    family = _family(source, rectangle, timed=stepped)
     looked = 0
 
     def samples(points: Floats) -> Floats:
@@ -313,7 +315,7 @@ def _surveyed(
         return _samples(family, source, rectangle, points)
 
     found = survey(samples, cells=cells)
-    if timed:
+    if stepped:
         arcs = trace_steps(
             lambda points: samples(points)[:, 0],
             lambda point: largest(family.matrices(point[None])),
@@ -325,7 +327,7 @@ def _surveyed(
     return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
 
 
-def _family(source: Source, rectangle: Rectangle, timed: bool) -> Family:
+def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
     if isinstance(source, BatchEvaluator):
         return resolve_family(source, rectangle, partial(matrix_errors, source))

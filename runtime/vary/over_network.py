@@ -32,7 +32,7 @@ from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
 from apc.vary.evaluator import free_parameters
 from apc.vary.margins import GROWTH, Margin, Margins, coupler_parameters
-from apc.vary.mean_square import BOUNDED, FirstLost, allowed, first_lost, growth_at
+from apc.vary.mean_square import BOUNDED, MEAN_SQUARE, FirstLost, allowed, first_lost, growth_at
 from apc.vary.search import SAMPLES
 from apc.vary.sensitivity import Sensitivities, Sensitivity, varied
 
@@ -81,7 +81,7 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
             rows.append(_margin(system, one, found))
             if found.why:
                 beyond.setdefault(found.why, []).append(one.label)
-            if found.crossing is not None and found.crossing.proof != BOUNDED:
+            if found.crossing is not None and found.crossing.proof != BOUNDED[MEAN_SQUARE]:
                 open_sides.append(f"{one.label} ({found.crossing.proof})")
     notes += [f"farther of {', '.join(labels)}, {why}" for why, labels in beyond.items()]
     if open_sides:
