@@ -80,6 +80,7 @@ PARTS = (
     Part("critical", "Critical values", _own("critical")),
     Part("region", "Regions", _own("region"), _own("region", "--quick")),
     Part("network", "Unreliable networks", _own("network"), _own("network", "--quick")),
+    Part("hands", "Hands", _own("hands")),
     Part("map", "The paper's map", _own("map"), _own("map", "--points", "400")),
     Part("sweep", "Sweeps", _own("sweep"), _own("sweep", "--points", "5000", "--kills", "1"), timed=False),
 )

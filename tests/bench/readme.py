@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
 
 # How a command that draws a picture begins.
-MAKERS = ("apc ", "python -m tests.bench.losses ")
+MAKERS = ("apc ", "python -m tests.bench.losses ", "python -m tests.bench.hands ")
 
 BLOCK = re.compile(r"<!-- output: (?P<words>[^>]*) -->\n```text\n(?P<text>.*?)```", re.DOTALL)
 # The block of a mistake: the topology shown, with this line broken.
