@@ -159,6 +159,17 @@ def test_no_damping_helps_where_a_velocity_is_sampled() -> None:
     assert "backward difference" in str(found)
 
 
+def test_springs_that_push_one_more_than_back_give_energy_to_slow_motions() -> None:
+    """Two users who pull at each other by 100 and by 50 N/m: a circulating stiffness, at any damping."""
+    two = "user: {count: 1, set: {coordination.stiffness: 100 N/m}}\n  other: {count: 1}"
+    text = replaced(AVERAGE, ("user: {count: 3}", two), ("stiffness: 500", "stiffness: 50"))
+    found = passive_hands(compiled(text))
+    assert found.stable is False
+    assert found.clamped_stable is True
+    assert found.modes[0].more is None
+    assert "slowly round" in str(found)
+
+
 def test_hands_in_the_scene_are_not_doubled() -> None:
     text = AVERAGE + "hands: {grip: {type: SpringDamperArm, flange: device, stiffness: 100 N/m}}\n"
     for hands in ("clamped", "held", "passive"):

@@ -192,8 +192,11 @@ def _judge(loop: PortLoop) -> PassiveMode:
 def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     """Return the least eigenvalue of He H + diag(b/τ), what is proved below and above it, and its angle.
 
-    −∞ where the scene is unstable with its devices clamped, of which this is no proof.
+    −∞ where the scene is unstable with its devices clamped, of which this is no proof, and where no damping
+    is enough for slow motions.
     """
+    if _circulates(loop):
+        return -np.inf, -np.inf, -np.inf, 0.0
     matrices = loop.a, loop.b, loop.c, loop.d
     least, angle = _least(loop)
     if not np.isfinite(least):
@@ -209,7 +212,7 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     else:
         if least > 0 and proves_positive(*matrices, loop.weight):
             low = 0.0
-    return least, _asymmetry(loop, low), _draws(loop, angle), angle
+    return least, low, _draws(loop, angle), angle
 
 
 def _least(loop: PortLoop) -> tuple[float, float]:
@@ -217,19 +220,18 @@ def _least(loop: PortLoop) -> tuple[float, float]:
     return least_real(*map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight)))
 
 
-def _asymmetry(loop: PortLoop, low: float) -> float:
-    """Return what is proved below, nothing where the stiffness at rest is not that of any spring.
+def _circulates(loop: PortLoop) -> bool:
+    """Say whether the stiffness at rest is surely not that of any springs: not symmetric, or negative.
 
     Notes
     -----
-    The residue at z = 1 has to be symmetric and not negative, or hands that move devices slowly round draw
-    energy from it. What rounding leaves of one that vanishes counts as none.
+    Hands that move devices slowly round then draw energy at each turn, whatever the damping, as what that
+    takes falls with the speed. What rounding leaves of a stiffness that vanishes counts as none.
     """
     value, off = value_of(loop.static), radius_of(loop.static)
     turned = np.abs(value - value.T) > off + off.T
-    symmetric = (value + value.T) / 2
-    least = float(np.linalg.eigvalsh(symmetric).min())
-    return -np.inf if turned.any() or least < -float((off + off.T).sum()) else low
+    least = float(np.linalg.eigvalsh((value + value.T) / 2).min())
+    return bool(turned.any()) or least < -float((off + off.T).sum())
 
 
 def _draws(loop: PortLoop, angle: float) -> float:
@@ -239,11 +241,6 @@ def _draws(loop: PortLoop, angle: float) -> float:
     -----
     e^{jθ} is a rational point of the circle; complex numbers are pairs of real ones.
     """
-    value, off = value_of(loop.static), radius_of(loop.static)
-    if (np.abs(value - value.T) > off + off.T).any() or np.linalg.eigvalsh(
-        value + value.T
-    ).min() < -4 * float((off + off.T).sum()):
-        return -UNIT
     n = len(loop.b[0])
     tangent = np.tan(angle / 2) if angle < 3.0 else None
     cosine, sine = (
