@@ -45,7 +45,7 @@ class PassiveMode:
 
     `damping` is what its devices have in N·s/m, None where they differ; `more` what each of them needs beside
     it, negative if some could be spared, ± `error`; None where none suffices, as the scene is unstable with
-    its devices clamped. `frequency_hz` is where most energy can be taken out. `stiffness` is what its devices
+    its devices clamped or pushes them round at rest. `frequency_hz` is where most energy can be taken out. `stiffness` is what its devices
     feel at rest, N/m, None where several groups move in it.
     """
 
@@ -128,11 +128,12 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
         stable = False
     elif all(one.passive for one in modes) and fixed.stable:
         stable = True
+    lost = any(one.more is None for one in modes)
     verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
     of = ", of the linearization" if not linear else ""
     return PassiveHands(
         topology=system.name,
-        verdict=NEVER if isinstance(loops, str) else verdict,
+        verdict=NEVER if isinstance(loops, str) or (fixed.stable and lost) else verdict,
         stable=stable,
         clamped_stable=fixed.stable,
         clamped_radius=fixed.spectral_radius,
@@ -149,8 +150,8 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
     """Return a number below 1 where a scene is stable with every passive hand, and above it elsewhere.
 
     With n the damping needed at each device and b the largest there is, it is e^{2 (n − b)/(n + b)}. n grows
-    without end where the scene becomes unstable with devices clamped, and as 1/n this goes there evenly; beyond
-    it is e².
+    without end where the scene becomes unstable with devices clamped, and as 1/n this goes there evenly;
+    beyond it is e².
 
     Parameters
     ----------
@@ -192,12 +193,12 @@ def _judge(loop: PortLoop) -> PassiveMode:
 def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     """Return the least eigenvalue of He H + diag(b/τ), what is proved below and above it, and its angle.
 
-    −∞ where the scene is unstable with its devices clamped, of which this is no proof.
+    −∞ where the scene is unstable with its devices clamped, of which this is no proof, or `goes_round`.
     """
     matrices = loop.a, loop.b, loop.c, loop.d
     least, angle = _least(loop)
     if not np.isfinite(least):
-        return least, -np.inf, np.inf, angle
+        return least, -np.inf, -np.inf if goes_round(loop) else np.inf, angle
     scale = max(abs(least), float(np.abs(value_of(loop.weight)).max()))
     low = -np.inf
     for width in WIDTHS:
@@ -209,27 +210,29 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     else:
         if least > 0 and proves_positive(*matrices, loop.weight):
             low = 0.0
-    return least, _asymmetry(loop, low), _draws(loop, angle), angle
+    return least, low, _draws(loop, angle), angle
 
 
 def _least(loop: PortLoop) -> tuple[float, float]:
     """Return the least eigenvalue of He H + diag(b/τ) over all angles, and its angle, in floats."""
+    if goes_round(loop):
+        return -np.inf, 0.0
     return least_real(*map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight)))
 
 
-def _asymmetry(loop: PortLoop, low: float) -> float:
-    """Return what is proved below, nothing where the stiffness at rest is not that of any spring.
+def goes_round(loop: PortLoop) -> bool:
+    """Say whether what devices feel at rest is proved not to be that of springs.
 
     Notes
     -----
     The residue at z = 1 has to be symmetric and not negative, or hands that move devices slowly round draw
-    energy from it. What rounding leaves of one that vanishes counts as none.
+    energy from it, and dampers take ever less of that the slower they go. What rounding leaves of one that
+    vanishes counts as none.
     """
     value, off = value_of(loop.static), radius_of(loop.static)
     turned = np.abs(value - value.T) > off + off.T
-    symmetric = (value + value.T) / 2
-    least = float(np.linalg.eigvalsh(symmetric).min())
-    return -np.inf if turned.any() or least < -float((off + off.T).sum()) else low
+    least = float(np.linalg.eigvalsh((value + value.T) / 2).min())
+    return bool(turned.any()) or least < -2 * float((off + off.T).sum())
 
 
 def _draws(loop: PortLoop, angle: float) -> float:
@@ -239,11 +242,6 @@ def _draws(loop: PortLoop, angle: float) -> float:
     -----
     e^{jθ} is a rational point of the circle; complex numbers are pairs of real ones.
     """
-    value, off = value_of(loop.static), radius_of(loop.static)
-    if (np.abs(value - value.T) > off + off.T).any() or np.linalg.eigvalsh(
-        value + value.T
-    ).min() < -4 * float((off + off.T).sum()):
-        return -UNIT
     n = len(loop.b[0])
     tangent = np.tan(angle / 2) if angle < 3.0 else None
     cosine, sine = (
