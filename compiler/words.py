@@ -56,9 +56,10 @@ def measured(value: float, error: float, unit: str = "1") -> str:
             break
         place = whole.adjusted()
     digits = max(exact.adjusted() - place, 0)
-    text = (
-        "0" if not shown else f"{shown:f}" if -5 < exact.adjusted() < _DIGITS else _scientific(shown, digits)
-    )
+    if -5 < exact.adjusted() < _DIGITS:
+        text = f"{shown:f}"
+    else:
+        text = _scientific(shown, digits) if shown else "0"
     return f"{with_unit(text, unit)} ± {float(whole):.0e}"
 
 

@@ -141,11 +141,12 @@ def answer(
     compared = conventions(system, prepared=prepared, default=found, quick=not every_convention)
     if compared.not_repeated and not every_convention:
         notes = (*notes, compared.not_repeated)
+    moved = sensitivities_of(system, prepared, found)
     nominal = _margins(system, prepared, found)
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
         network=_over_network(system, prepared, found, nominal, certify=certify),
-        sensitivities=sensitivities_of(system, prepared, found),
+        sensitivities=moved,
         margins=nominal,
         contact_modes=modes,
         switching=_switching(system, prepared, modes) if modes else None,

@@ -7,6 +7,7 @@ tick, acting a tick later; a spring K_T to the mean of what the others sent, as 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,13 @@ class Users:
     drag: float = 5.0
     tick: float = 1e-3
     ticks: int = 8
+    ring: bool = False
+
+    def heard(self, positions: NDArray[Any]) -> NDArray[Any]:
+        """Return what each user takes the mean of others, or of its two neighbours, to be."""
+        if self.ring:
+            return np.asarray((np.roll(positions, 1) + np.roll(positions, -1)) / 2)
+        return np.asarray((positions.sum() - positions) / (self.count - 1))
 
     @property
     def equations(self) -> tuple[Floats, Floats, Floats]:
@@ -74,7 +82,7 @@ def response(users: Users, hertz: float, frames: int = 700) -> tuple[complex, co
         for tick in range(users.ticks):
             z[:, 4], z[:, 5] = contact, pull
             contact = users.contact * (z[:, 0] - z[:, 2])
-            pull = users.coupling * ((heard.sum() - heard) / (n - 1) - z[:, 2])
+            pull = users.coupling * (users.heard(heard) - z[:, 2])
             z[:, 6] = 0
             z[0, 6] = np.exp(1j * omega * (frame * users.ticks + tick) * users.tick)
             z = z @ step.T
@@ -110,7 +118,7 @@ def work(users: Users, moved: Complex, angle: float, *, apart: bool, frames: int
         for tick in range(users.ticks):
             acting, pulling = contact, pull
             contact = users.contact * (x - z[:, 0])
-            pull = users.coupling * ((heard.sum() - heard) / (n - 1) - z[:, 0])
+            pull = users.coupling * (users.heard(heard) - z[:, 0])
             gone = shape * (moved[tick] * np.exp(1j * angle * frame)).real
             spent = acting * gone + users.damping * gone**2 / users.tick
             taken += float(weights[frame] * spent.sum())

@@ -39,6 +39,16 @@ def test_responses_agree_with_a_force_played_tick_by_tick(count: int) -> None:
     assert (found.bound < 1e-7).all()
 
 
+def test_five_in_a_ring_feel_their_neighbours() -> None:
+    text = replaced(users(5, 300), ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
+    found = feel(compiled(text), TEN[2::3], quick=True)
+    for place, hertz in enumerate(TEN[2::3]):
+        here, there, apart = response(Users(5, 300.0, ring=True), hertz)
+        assert found.impedance[place] == pytest.approx(1 / here, rel=1e-8)
+        assert found.transmitted_admittance[place] == pytest.approx(there, rel=1e-6)
+        assert found.error_per_force[place] == pytest.approx(apart, rel=1e-7)
+
+
 def test_a_lone_mass_feels_like_itself() -> None:
     """No tick, no network: Z = b + jωm."""
     text = ONE_MASS + (
@@ -165,6 +175,30 @@ def test_noise_of_sensors_is_that_of_ticks_played() -> None:
             pull = told.coupling * (packets[1][::-1] - z[:, 2])
             z = np.column_stack([z, acting, pulling]) @ step.T
     assert sensors.error_m == pytest.approx(math.sqrt(np.mean(squares)), rel=0.05)
+
+
+# Of hands and of sensors, at the first of either group: error and velocity.
+LATE = (
+    (0.0006186312153860953, 0.024083674107722355),
+    (0.7540385753605653, 47.12558066384142),
+    (0.0005761712228761279, 0.03485259984618143),
+    (0.41276535974762935, 51.980325413245716),
+)
+
+
+def test_noise_of_groups_whose_forces_switch_at_other_times() -> None:
+    """By an independent program, which adds up the answers to each tick's noise."""
+    late = "contact.delay: 1.5 ms, device.mass: 0.2 kg"
+    text = replaced(
+        AVERAGE,
+        ("stiffness: 500", "stiffness: 200"),
+        ("user: {count: 3}", f"left: {{count: 2, set: {{{late}}}}}\n  right: {{count: 2}}"),
+    )
+    for at, known in (("left[1]", LATE[:2]), ("right[1]", LATE[2:])):
+        found = feel(compiled(text), [1.0], at=at).h2
+        for one, (error, velocity) in zip(found, known, strict=True):
+            assert one.error_m == pytest.approx(error, rel=1e-8)
+            assert one.velocity_m_s == pytest.approx(velocity, rel=1e-8)
 
 
 def test_an_unstable_scene_has_no_response_in_time_but_its_map_has_one(tmp_path: Path) -> None:

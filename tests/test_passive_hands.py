@@ -15,7 +15,7 @@ from apc.compiler.errors import ApcError
 from apc.eigen.dissipation import least_real
 from apc.frame.devices import clamped, held, with_hands
 from apc.frame.radius import value_of
-from apc.hands.passivity import passive_hands
+from apc.hands.passivity import passive_growth, passive_hands
 from apc.hands.port import port_loops
 from tests.handled import Users, work
 from tests.topologies import AVERAGE, MESH, compiled, replaced, wall
@@ -159,15 +159,23 @@ def test_no_damping_helps_where_a_velocity_is_sampled() -> None:
     assert "backward difference" in str(found)
 
 
-def test_springs_that_push_one_more_than_back_give_energy_to_slow_motions() -> None:
-    """Two users who pull at each other by 100 and by 50 N/m: a circulating stiffness, at any damping."""
-    two = "user: {count: 1, set: {coordination.stiffness: 100 N/m}}\n  other: {count: 1}"
-    text = replaced(AVERAGE, ("user: {count: 3}", two), ("stiffness: 500", "stiffness: 50"))
-    found = passive_hands(compiled(text))
+def test_no_damping_helps_where_one_is_pulled_harder_than_it_pulls() -> None:
+    """K_T of 50 N/m against 100 N/m: three copies at rest are no springs, whatever else."""
+    text = replaced(
+        AVERAGE,
+        ("user: {count: 3}", "a: {count: 1, set: {coordination.stiffness: 50 N/m}}\n  b: {count: 2}"),
+        ("stiffness: 500 N/m", "stiffness: 100 N/m"),
+    )
+    system = compiled(text)
+    found = passive_hands(system)
     assert found.stable is False
-    assert found.clamped_stable is True
+    assert [one.passive for one in found.modes] == [False, True]
     assert found.modes[0].more is None
-    assert "slowly round" in str(found)
+    assert "no damping at the devices helps" in " ".join(str(found).split())
+    assert passive_growth(system, prepare(system)).radius > 1
+    assert passive_growth(system, prepare(system), bounded=False).radius > 1
+    equal = apc.set_parameters(system, {"a.coordination.stiffness": "100 N/m"})
+    assert passive_hands(equal).modes[0].passive
 
 
 def test_hands_in_the_scene_are_not_doubled() -> None:

@@ -386,15 +386,21 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
 
 def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
     """Return one loop of all classes of equal peers, and one of each class apart; or all peers in one."""
-    found = arrange(groups, exchange)
-    if found.loops[0].name in ("common", "single"):
-        return found.loops
+    first, *apart = arrange(groups, exchange).loops
+    if first.name in ("common", "single") and _by_classes(first, apart):
+        return first, *apart
     states = sum(group.count * len(group.lifted.z_names) for group in groups)
     if states > MOST_STATES:
         what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and readings"
         hint = f"peers on complete graphs, or {MOST_STATES:,} in all"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
     return (dense_loop(groups, exchange),)
+
+
+def _by_classes(common: Loop, apart: Sequence[Loop]) -> bool:
+    """Say whether each other loop is all there is of one class apart: a ring has more of them, one a wave."""
+    many = {site.name: site.count - 1 for site in common.sites}
+    return all(len(loop.sites) == 1 and loop.multiplicity == many.get(loop.sites[0].name) for loop in apart)
 
 
 @dataclass(frozen=True, slots=True)

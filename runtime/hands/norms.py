@@ -190,13 +190,11 @@ def noise_variance(
                 )
         columns.append(inputs)
     inputs = np.concatenate(columns, axis=1)
-    (first, _), *_ = outputs
-    starts = loop.sites[first].starts
-    rows = [place for place, start in enumerate(starts) if start in ticks]
-    read = np.zeros((len(rows), c.shape[0]))
+    read = np.zeros((len(ticks), c.shape[0]))
     for (site, state), weight in outputs.items():
-        for line, place in enumerate(rows):
-            read[line, loop.reads[site][place, state]] += weight
+        place_of = {start: place for place, start in enumerate(loop.sites[site].starts)}
+        for line, tick in enumerate(ticks):
+            read[line, loop.reads[site][place_of[tick], state]] += weight
     at = relative_coordinates(basis)
     b, seen = k @ inputs, read @ c
     if basis.size and np.abs(seen @ basis).max() > UNSEEN * np.abs(seen).max() * np.abs(basis).max():

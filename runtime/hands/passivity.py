@@ -45,7 +45,7 @@ class PassiveMode:
 
     `damping` is what its devices have in N·s/m, None where they differ; `more` what each of them needs beside
     it, negative if some could be spared, ± `error`; None where none suffices, as the scene is unstable with
-    its devices clamped. `frequency_hz` is where most energy can be taken out. `stiffness` is what its devices
+    its devices clamped or pushes them round at rest. `frequency_hz` is where most energy can be taken out. `stiffness` is what its devices
     feel at rest, N/m, None where several groups move in it.
     """
 
@@ -128,11 +128,12 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
         stable = False
     elif all(one.passive for one in modes) and fixed.stable:
         stable = True
+    lost = any(one.more is None for one in modes)
     verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
     of = ", of the linearization" if not linear else ""
     return PassiveHands(
         topology=system.name,
-        verdict=NEVER if isinstance(loops, str) else verdict,
+        verdict=NEVER if isinstance(loops, str) or (fixed.stable and lost) else verdict,
         stable=stable,
         clamped_stable=fixed.stable,
         clamped_radius=fixed.spectral_radius,
@@ -192,15 +193,12 @@ def _judge(loop: PortLoop) -> PassiveMode:
 def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     """Return the least eigenvalue of He H + diag(b/τ), what is proved below and above it, and its angle.
 
-    −∞ where the scene is unstable with its devices clamped, of which this is no proof, and where no damping
-    is enough for slow motions.
+    −∞ where the scene is unstable with its devices clamped, of which this is no proof, or `goes_round`.
     """
-    if _circulates(loop):
-        return -np.inf, -np.inf, -np.inf, 0.0
     matrices = loop.a, loop.b, loop.c, loop.d
     least, angle = _least(loop)
     if not np.isfinite(least):
-        return least, -np.inf, np.inf, angle
+        return least, -np.inf, -np.inf if goes_round(loop) else np.inf, angle
     scale = max(abs(least), float(np.abs(value_of(loop.weight)).max()))
     low = -np.inf
     for width in WIDTHS:
@@ -217,21 +215,24 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
 
 def _least(loop: PortLoop) -> tuple[float, float]:
     """Return the least eigenvalue of He H + diag(b/τ) over all angles, and its angle, in floats."""
+    if goes_round(loop):
+        return -np.inf, 0.0
     return least_real(*map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight)))
 
 
-def _circulates(loop: PortLoop) -> bool:
-    """Say whether the stiffness at rest is surely not that of any springs: not symmetric, or negative.
+def goes_round(loop: PortLoop) -> bool:
+    """Say whether what devices feel at rest is proved not to be that of springs.
 
     Notes
     -----
-    Hands that move devices slowly round then draw energy at each turn, whatever the damping, as what that
-    takes falls with the speed. What rounding leaves of a stiffness that vanishes counts as none.
+    The residue at z = 1 has to be symmetric and not negative, or hands that move devices slowly round draw
+    energy from it, and dampers take ever less of that the slower they go. What rounding leaves of one that
+    vanishes counts as none.
     """
     value, off = value_of(loop.static), radius_of(loop.static)
     turned = np.abs(value - value.T) > off + off.T
     least = float(np.linalg.eigvalsh((value + value.T) / 2).min())
-    return bool(turned.any()) or least < -float((off + off.T).sum())
+    return bool(turned.any()) or least < -2 * float((off + off.T).sum())
 
 
 def _draws(loop: PortLoop, angle: float) -> float:

@@ -67,14 +67,14 @@ def passive_text(found: PassiveHands) -> str:
 def _worst(found: PassiveHands, worst: PassiveMode) -> str:
     """Say how the devices move that take most energy out, or need most damping."""
     moved = "all alike" if worst.name in ("common", "single") else f"in the mode {worst.name}"
-    if worst.more is None:
-        if found.clamped_stable is False:
-            held = "with its devices clamped the scene is unstable, and no damping of theirs helps"
-            return f"Devices that move {moved}: {held}."
-        slow = "hands that move them slowly round get energy out at each turn, whatever the damping"
+    if worst.more is None and found.clamped_stable:
         return (
-            f"Devices that move {moved}: the springs between them push one more than they push back; {slow}."
+            "At rest one device pulls another harder than it is pulled back: hands that are joined, and move "
+            "them slowly round, get energy out, and no damping at the devices helps."
         )
+    if worst.more is None:
+        held = "with its devices clamped the scene is unstable, and no damping of theirs helps"
+        return f"Devices that move {moved}: {held}."
     enough = f"With {worst.more:.4g} N*s/m more damping at each device they can't"
     if found.stable:
         return (
