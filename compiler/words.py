@@ -56,10 +56,8 @@ def measured(value: float, error: float, unit: str = "1") -> str:
             break
         place = whole.adjusted()
     digits = max(exact.adjusted() - place, 0)
-    if -5 < exact.adjusted() < _DIGITS:
-        text = f"{shown:f}"
-    else:
-        text = _scientific(shown, digits) if shown else "0"
+    near = -5 < exact.adjusted() < _DIGITS
+    text = f"{shown:f}" if near else _scientific(shown, digits) if shown else "0"
     return f"{with_unit(text, unit)} ± {float(whole):.0e}"
 
 
