@@ -149,8 +149,8 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
     """Return a number below 1 where a scene is stable with every passive hand, and above it elsewhere.
 
     With n the damping needed at each device and b the largest there is, it is e^{2 (n − b)/(n + b)}. n grows
-    without end where the scene becomes unstable with devices clamped, and as 1/n this goes there evenly; beyond
-    it is e².
+    without end where the scene becomes unstable with devices clamped, and as 1/n this goes there evenly;
+    beyond it is e².
 
     Parameters
     ----------

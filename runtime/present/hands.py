@@ -37,7 +37,7 @@ LINEARIZED = ", linearized at its start"
 
 def passive_text(found: PassiveHands) -> str:
     """Return whether a scene is stable with any passive hands, in words and numbers."""
-    lines = [f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}"]
+    lines = wrapped(f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}", "", "  ")
     for text in found.left_out:
         lines += note(text)
     lines.append("")
@@ -54,7 +54,7 @@ def passive_text(found: PassiveHands) -> str:
     if found.proof:
         lines.append(f"  proof            {found.proof}")
     if found.modes:
-        rows = [("  mode", "damping", "needed", "at", "stiffness at rest", ""), *map(_mode, found.modes)]
+        rows = [("  mode", "damping", "needed", "at", "at rest", ""), *map(_mode, found.modes)]
         widths = [max(len(row[column]) for row in rows) for column in range(6)]
         lines.append("")
         lines += [
