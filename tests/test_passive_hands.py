@@ -17,6 +17,7 @@ from apc.frame.devices import clamped, held, with_hands
 from apc.frame.radius import value_of
 from apc.hands.passivity import passive_hands
 from apc.hands.port import port_loops
+from apc.vary.critical import critical
 from tests.handled import Users, work
 from tests.topologies import AVERAGE, MESH, compiled, replaced, wall
 
@@ -157,6 +158,29 @@ def test_no_damping_helps_where_a_velocity_is_sampled() -> None:
     assert found.stable is False
     assert "samples the velocity of device" in found.why
     assert "backward difference" in str(found)
+
+
+def test_no_damping_helps_where_peers_feel_each_other_otherwise_than_springs_do() -> None:
+    """A teacher hears the mean of all, each of whom hears the teacher: K is not symmetric."""
+    star = compiled(
+        replaced(
+            AVERAGE,
+            ("count: 3", "count: 4"),
+            ("stiffness: 500", "stiffness: 100"),
+            ("delay: 8 ms}", "delay: 8 ms, graph: star}"),
+        )
+    )
+    for damping in ("5 N*s/m", "500 N*s/m"):
+        found = passive_hands(apc.set_parameters(star, {"device.damping": damping}))
+        assert found.stable is False
+        assert found.clamped_stable
+        assert found.worst is not None
+        assert found.worst.more is None
+        assert "not what springs give" in str(found)
+        assert "more damping at each device they can't" not in str(found)
+    answer = critical(star, "device.damping", criterion="passive")
+    assert not answer.crossings
+    assert answer.verdict.startswith("unstable whatever its value: apc analyze --hands passive")
 
 
 def test_hands_in_the_scene_are_not_doubled() -> None:

@@ -43,6 +43,7 @@ def passive_text(found: PassiveHands) -> str:
     lines.append("")
     if found.why:
         lines += wrapped(f"{found.why}.", "  ", "  ")
+    if found.why and not found.modes:
         hint = (
             "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
         )
