@@ -288,6 +288,11 @@ def test_the_command_line_says_what_python_does(
     assert "E935" in capsys.readouterr().err
     assert run(["feel", "three.yaml", "--out", "bode.txt"]) == 1
     assert "E878" in capsys.readouterr().err
+    assert run(["feel", "three.yaml", "--at", "user[3]", "--between", "user[1]:user[2]"]) == 2
+    assert run(["feel", "three.yaml", "--nyquist", "--out", "table.csv"]) == 2
+    capsys.readouterr()
+    assert run(["feel", "three.yaml", "--frequencies", "1 Hz", "--set", "haptic.phase=0.3 ms"]) == 0
+    assert "noise" in capsys.readouterr().out.splitlines()[1]
 
 
 def test_lost_packets_are_left_out_and_that_is_said_first() -> None:

@@ -275,6 +275,8 @@ def feel(
         for one, device in ((port, modes.device), (other, modes.other))
     )
     notes = () if verdict.stable is not False else ("of the map: the scene is unstable",)
+    if steady and not h2:
+        notes = (*notes, "what noise does is not told: the fastest clock has a phase")
     return Feel(
         topology=system.name,
         at=here,

@@ -114,7 +114,8 @@ def passive_document(found: PassiveHands) -> dict[str, Any]:
 
 def feel_text(found: Feel) -> str:
     """Return what is felt at a device, in words and numbers."""
-    lines = [f"{found.topology}: what a hand feels at {found.at}{LINEARIZED if found.linearized else ''}"]
+    whole = f"{found.topology}: what a hand feels at {found.at}{LINEARIZED if found.linearized else ''}"
+    lines = wrapped(whole, "", "  ")
     for text in (*found.notes, *found.left_out):
         lines += note(text)
     lines.append("")
