@@ -153,6 +153,44 @@ def test_a_million_users_and_groups_are_as_right_as_all_peers_in_one() -> None:
     assert many.bound[0] < 1e-4
 
 
+def test_multiples_of_the_frame_rate_are_as_their_neighbours() -> None:
+    """The scene may rest anywhere: e^{sT} = 1 is a pole of its frames, and none of its responses."""
+    system = compiled(AVERAGE)
+    for rate in (125.0, 250.0):
+        found = feel(system, [rate, rate - 0.01, rate + 0.01], quick=True)
+        assert np.isfinite(found.bound).all()
+        for name in ("impedance", "transmitted_admittance", "error_per_force"):
+            one, *two = getattr(found, name)
+            assert abs(one - np.mean(two)) < abs(one) * (1e-6 + found.bound.max())
+
+
+def test_a_push_at_a_device_moves_a_copy_as_one_there_moves_the_device() -> None:
+    """A copy is a third of the mass of all, and what holds it to its device pulls both alike."""
+    text = replaced(AVERAGE, ("stiffness: 500", "stiffness: 0"))
+    text = text.replace("type: SampledSpringDamper, ", "type: SpringDamper, ").replace(
+        "stiffness: 1000 N/m, clock: haptic, delay: 1 ms", "stiffness: 1000 N/m"
+    )
+    system = compiled(text)
+    ends = "user[1].device", "user[1].cube"
+    there, back = (feel(system, [1.0, 7.0], at=a, between=b, quick=True) for a, b in (ends, ends[::-1]))
+    assert (there.between, back.between) == ("user[1].cube", "user[1].device")
+    np.testing.assert_allclose(there.transmitted_admittance, back.transmitted_admittance, rtol=1e-9)
+    s = 2j * np.pi * np.array([1.0, 7.0])
+    device, copy, spring = 0.1 * s + 5, 0.2 * s + 5, 1000 / s
+    np.testing.assert_allclose(back.impedance, copy + device * spring / (device + spring), rtol=1e-9)
+    np.testing.assert_allclose(
+        there.transmitted_admittance, spring / (device * copy + spring * (device + copy)), rtol=1e-9
+    )
+
+
+def test_an_advice_about_a_name_keeps_what_was_right_of_it() -> None:
+    system = compiled(AVERAGE)
+    with pytest.raises(ApcError, match=r'--at "user\[3\].device"'):
+        feel(system, [1.0], at="user[4].device")
+    with pytest.raises(ApcError, match=r'--at "user\[2\].device"'):
+        feel(system, [1.0], at="usr[2].device")
+
+
 def test_noise_of_sensors_is_that_of_ticks_played() -> None:
     """White noise on samples: 4,000 frames of two users played, whose rms is known to some 3 %."""
     system = compiled(users(2, 500))
@@ -284,6 +322,11 @@ def test_the_command_line_says_what_python_does(
     assert "E935" in capsys.readouterr().err
     assert run(["feel", "three.yaml", "--out", "bode.txt"]) == 1
     assert "E878" in capsys.readouterr().err
+    assert run(["feel", "three.yaml", "--at", "user[3]", "--between", "user[1]:user[2]"]) == 2
+    assert run(["feel", "three.yaml", "--nyquist", "--out", "table.csv"]) == 2
+    capsys.readouterr()
+    assert run(["feel", "three.yaml", "--frequencies", "1 Hz", "--set", "haptic.phase=0.3 ms"]) == 0
+    assert "noise" in capsys.readouterr().out.splitlines()[1]
 
 
 def test_lost_packets_are_left_out_and_that_is_said_first() -> None:

@@ -15,8 +15,9 @@ from apc.compiler.errors import ApcError
 from apc.eigen.dissipation import least_real
 from apc.frame.devices import clamped, held, with_hands
 from apc.frame.radius import value_of
-from apc.hands.passivity import passive_growth, passive_hands
+from apc.hands.passivity import passive_hands
 from apc.hands.port import port_loops
+from apc.vary.critical import critical
 from tests.handled import Users, work
 from tests.topologies import AVERAGE, MESH, compiled, replaced, wall
 
@@ -159,23 +160,27 @@ def test_no_damping_helps_where_a_velocity_is_sampled() -> None:
     assert "backward difference" in str(found)
 
 
-def test_no_damping_helps_where_one_is_pulled_harder_than_it_pulls() -> None:
-    """K_T of 50 N/m against 100 N/m: three copies at rest are no springs, whatever else."""
-    text = replaced(
-        AVERAGE,
-        ("user: {count: 3}", "a: {count: 1, set: {coordination.stiffness: 50 N/m}}\n  b: {count: 2}"),
-        ("stiffness: 500 N/m", "stiffness: 100 N/m"),
+def test_no_damping_helps_where_peers_feel_each_other_otherwise_than_springs_do() -> None:
+    """A teacher hears the mean of all, each of whom hears the teacher: K is not symmetric."""
+    star = compiled(
+        replaced(
+            AVERAGE,
+            ("count: 3", "count: 4"),
+            ("stiffness: 500", "stiffness: 100"),
+            ("delay: 8 ms}", "delay: 8 ms, graph: star}"),
+        )
     )
-    system = compiled(text)
-    found = passive_hands(system)
-    assert found.stable is False
-    assert [one.passive for one in found.modes] == [False, True]
-    assert found.modes[0].more is None
-    assert "no damping at the devices helps" in " ".join(str(found).split())
-    assert passive_growth(system, prepare(system)).radius > 1
-    assert passive_growth(system, prepare(system), bounded=False).radius > 1
-    equal = apc.set_parameters(system, {"a.coordination.stiffness": "100 N/m"})
-    assert passive_hands(equal).modes[0].passive
+    for damping in ("5 N*s/m", "500 N*s/m"):
+        found = passive_hands(apc.set_parameters(star, {"device.damping": damping}))
+        assert found.stable is False
+        assert found.clamped_stable
+        assert found.worst is not None
+        assert found.worst.more is None
+        assert "not what springs give" in str(found)
+        assert "more damping at each device they can't" not in str(found)
+    answer = critical(star, "device.damping", criterion="passive")
+    assert not answer.crossings
+    assert answer.verdict.startswith("unstable whatever its value: apc analyze --hands passive")
 
 
 def test_hands_in_the_scene_are_not_doubled() -> None:

@@ -121,5 +121,5 @@ def _judge_passive(system: CompiledSystem, asked: list[str], *, as_json: bool) -
 
     for option in asked:
         what = f"{option} and --hands passive don't go together: what hands can draw has no modes of its own"
-        raise ApcError(Mistake("E930", Place("--hands"), what, hint=f"--hands clamped {option}"))
+        raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
     print_result(passive_hands(system), as_json=as_json)

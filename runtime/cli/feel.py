@@ -81,11 +81,16 @@ def feel_command(
     from apc.hands.feel import feel, read_frequencies
     from apc.inputs import open_scene
     from apc.present.hands import check_feel_path, write_feel
+    from apc.present.pictures import FORMATS
 
+    first, colon, second = between.partition(":")
+    if at and colon and at != first:
+        raise click.UsageError("--between A:B names the hand's device, A: no --at with it")
+    if nyquist and (out is None or out.suffix.lower() not in FORMATS):
+        raise click.UsageError(f"--nyquist is for a picture: --out with {', '.join(FORMATS)}")
     if out is not None:
         check_feel_path(out)
     system = open_scene(file, settings, {"--out": out})
-    first, colon, second = between.partition(":")
     found = feel(
         system,
         read_frequencies(system, frequencies, low, high, points),

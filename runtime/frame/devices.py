@@ -8,7 +8,7 @@ Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
 A device is what a peer moves and does not tell others about: what it tells them of is a copy of what all
 hold. With m v' = f + …, a slope of v' over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at
-that place does, whatever is rigidly connected with it.
+that place does, whatever is rigidly connected with it. A copy of a shared mass is one of n: there J = n j/m.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind, Parameter, Ports, Receive
+from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
@@ -91,6 +91,8 @@ def find_device(
     }
     masses = tuple(place for place, name in enumerate(kind.parameters) if unit_of.get(name) == "kg")
     x, u, _, _, p, t = start_arguments(site, exact_numbers(kind, parameters), Fraction, listening)
+    peers = kind.parameters.index(PEERS) if PEERS in kind.parameters else None
+    over = masses if peers is None else (*masses, peers)
     found: dict[str, Device | str] = {}
     for place, state in enumerate(kind.states):
         driven = np.flatnonzero(site.pattern.a[place])
@@ -99,16 +101,22 @@ def find_device(
         if state.unit != "m" or not wanted or len(driven) != 1 or site.pattern.b[place].any():
             continue
         velocity = int(driven[0])
-        slopes, *changes = evaluate_exact(_slopes(kind, velocity, masses), [x, u, p, t])
+        slopes, *changes = evaluate_exact(_slopes(kind, velocity, over), [x, u, p, t])
+        count, copied = Fraction(1), [False] * len(slopes)
+        if peers is not None:
+            count = p[peers]
+            copied = [count * by == slope for slope, by in zip(slopes, changes[-1], strict=True)]
         inverses = {
-            (mass, at): -change[at] / slopes[at]
-            for mass, change in enumerate(changes)
+            (mass, at): -change[at] / slopes[at] * (count if copied[at] else 1)
+            for mass, change in enumerate(changes[: len(masses)])
             for at in range(len(slopes))
             if slopes[at] and change[at]
         }
         if len(set(inverses.values())) == 1:
             (mass, at), inverse = next(iter(inverses.items()))
-            found[own] = Device(own, place, velocity, inverse, _inverse(kind, velocity, masses[mass], at))
+            shared = peers if copied[at] else None
+            symbolic = _inverse(kind, velocity, masses[mass], at, shared)
+            found[own] = Device(own, place, velocity, inverse, symbolic)
         elif inverses:
             found[own] = f"{own} moves with masses that move otherwise, and a hand may hold any of them"
     if not found:
@@ -140,10 +148,14 @@ def _rates(kind: Kind, velocity: int, masses: Sequence[int]) -> tuple[Any, list[
 
 
 @functools.lru_cache(maxsize=64)
-def _inverse(kind: Kind, velocity: int, mass: int, at: int) -> Any:
-    """Return 1/m as a function of (x, u, p, t), from one slope and how it changes with a mass."""
+def _inverse(kind: Kind, velocity: int, mass: int, at: int, peers: int | None) -> Any:
+    """Return 1/m as a function of (x, u, p, t), from one slope and how it changes with a mass.
+
+    Of a mass that peers share it is that of a copy: `peers` is where their number is among the parameters.
+    """
     slopes, (change,), inputs = _rates(kind, velocity, [mass])
-    return casadi.Function("inverse_inertia", inputs, [casadi.simplify(-change[at] / slopes[at])])
+    copies = 1 if peers is None else inputs[2][peers]
+    return casadi.Function("inverse_inertia", inputs, [casadi.simplify(-copies * change[at] / slopes[at])])
 
 
 def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands") -> dict[int, Device]:

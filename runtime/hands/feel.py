@@ -50,6 +50,10 @@ ALIASES = (0, 1, -1)
 # Points of a circle about s = 0, and its radii in 1/s, one after the other half as large.
 AROUND, RADIUS, HALVINGS = 16, 4.0, 10
 
+# Turns a frame, so near a whole number of which a scene that may rest anywhere is asked around a frequency,
+# and how far around, in 1/s.
+NEAR, ASIDE = 1e-5, 0.25
+
 # What of slow motions two circles may tell differently, beside the largest.
 SETTLED = 1e-6
 
@@ -167,20 +171,23 @@ def find_port(system: CompiledSystem, text: str, option: str) -> Port:
         if first in names:
             group, number, own = first, "1", rest
     parts = sorted({name.name.rpartition(".")[0] for kind in system.kinds for name in kind.states})
-    example = f'{option} "{names[0]}[1].{parts[0] if parts else "device"}"'
+    named = own if own in parts else "device" if "device" in parts else next(iter(parts), "device")
+    example = f'{option} "{names[0]}[1].{named}"'
     if group is not None and group not in names:
         what = f"{option}: no group of peers is called {group[:40]}"
         hint = nearest(group, names)
-        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint or example))
+        hint = f'{option} "{hint}[{number}].{named}"' if hint else example
+        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint))
     place = 0 if group is None else names.index(group)
     peer = int(number or 1)
     if not 1 <= peer <= counts[place]:
+        example = f'{option} "{names[place]}[{counts[place]}].{named}"'
         what = f"{option}: {names[place]} has {counts[place]:,} peers, counted from 1; there is no {peer}"
         raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=example))
     if own and own not in parts:
         what = f"{option}: nothing that moves is called {own[:40]}"
-        hint = nearest(own, parts)
-        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint or example))
+        hint = f'{option} "{names[place]}[{peer}].{nearest(own, parts) or named}"'
+        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint))
     return Port(starts[place] + peer - 1, own)
 
 
@@ -188,7 +195,8 @@ def find_port(system: CompiledSystem, text: str, option: str) -> Port:
 class _Modes:
     """A scene as modes of which any device may be pushed: `common` first, then each class apart.
 
-    `class_of` gives the site of `common` that a peer is in; `bases` are the modes' rigid motions.
+    `class_of` gives the site of `common` that a peer is in; `bases` are the modes' rigid motions; `device` is
+    what is pushed, `other` what else is looked at.
     """
 
     loops: tuple[Pushed, ...]
@@ -197,6 +205,8 @@ class _Modes:
     apart: dict[int, int]
     class_of: dict[int, int]
     members: tuple[int, ...]
+    device: Device
+    other: Device
 
 
 @part("feel")
@@ -251,19 +261,26 @@ def feel(
         modes, exchange = _modes(system, prepared, port, other)
         responses = _Responses(modes, port.peer, other.peer)
         s = np.asarray(2j * np.pi * found, dtype=np.complex128)
-        own, across, error, alias = responses.at(s, ALIASES)
+        own, *aliases, across, error = responses.steady(s, ALIASES)
         one = 1 / own[0]
+        alias = np.max([np.abs(value) for value, _ in aliases], axis=0) / np.abs(own[0])
         bound = np.max([off / np.abs(value) for value, off in (own, across, error) if value.any()], axis=0)
         steady = verdict.stable is not False and not quick
         slow = responses.slow() if not quick else None
         hinf = _extremes(modes, responses) if steady else ()
         h2 = _noise(system, modes, responses) if steady else ()
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
+    here, there = (
+        f"{exchange.peer_name(one.peer)}.{device.part}"
+        for one, device in ((port, modes.device), (other, modes.other))
+    )
     notes = () if verdict.stable is not False else ("of the map: the scene is unstable",)
+    if steady and not h2:
+        notes = (*notes, "what noise does is not told: the fastest clock has a phase")
     return Feel(
         topology=system.name,
-        at=f"{exchange.peer_name(port.peer)}.{responses.device.part}",
-        between="" if other.peer == port.peer else f"{exchange.peer_name(other.peer)}.{responses.other.part}",
+        at=here,
+        between="" if there == here else there,
         copy=responses.copy,
         frequency_hz=found,
         impedance=one,
@@ -311,6 +328,9 @@ def read_frequencies(
     if not 0 < first < last:
         what = f"from {first:.6g} Hz to {last:.6g} Hz there is nothing above 0 Hz"
         hint = '--from "0.1 Hz" --to "60 Hz"'
+        if first > 0 and high is None:
+            what = f"{first:.6g} Hz is not below {last:.6g} Hz, where it ends without --to"
+            hint = f'--from "{first:.6g} Hz" --to "{fastest(system) / 2:.6g} Hz"'
         raise ApcError(Mistake("E935", Place("--from"), what, hint=hint))
     return np.geomspace(first, last, points)
 
@@ -331,7 +351,7 @@ def _check_frequencies(system: CompiledSystem, found: Floats) -> None:
     """Refuse frequencies that no response is told of: ApcError E935."""
     most = fastest(system) / 2
     place = Place(system.origin.topology)
-    hint = f'--to "{most:.6g} Hz"'
+    hint = f"{most:.6g} Hz at most"
     if not found.size or not np.isfinite(found).all() or found.min() <= 0:
         got = "none" if not found.size else f"{found.min():.6g} Hz"
         raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, '--from "0.1 Hz"'))
@@ -344,17 +364,21 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
     """Open all peers of a scene, and put them together to modes."""
     groups, exchange = lifted_groups(system, prepared=prepared)
     unit_of = {one.name: one.unit for one in system.parameters}
-    opened, sites = [], {}
+    opened, sites, held = [], {}, {}
     for group in groups:
-        wanted = {one.peer: one.part for one in (other, port)}
-        names = {wanted[peer] for peer in wanted if peer in group.peers}
-        device = find_device(
-            group.jacobians, group.parameters, unit_of, group.listening, part=max(names, default="")
-        )
-        if names and not isinstance(device, Device):
-            what = device or f"{group.name} has no device"
-            hint = "--at with the part that is held, as user[1].device"
-            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+        device = None
+        for one in (other, port):
+            if one.peer not in group.peers:
+                continue
+            named = one.part or (port.part if port.peer in group.peers else "")
+            device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=named)
+            if not isinstance(device, Device):
+                what = device or f"{group.name} has no device"
+                hint = "--at with the part that is held, as user[1].device"
+                raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+            held[one] = device
+        if device is None:
+            device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
         kicks = len(group.schedule.events) * len(group.site.a)
         if kicks > MOST_KICKS:
             what = f"a frame of {group.name} has too many events and states: {kicks:,} together"
@@ -381,7 +405,7 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
             if loop.sites[0].name == alike.name:
                 apart[place] = number
     bases = tuple(find_rigid_modes(loop).basis for loop in plain)
-    return _Modes(loops, bases, 0, apart, class_of, counts), exchange
+    return _Modes(loops, bases, 0, apart, class_of, counts, held[port], held[other]), exchange
 
 
 def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
@@ -418,37 +442,61 @@ class _Responses:
         self.modes = modes
         self.peer, self.across = peer, other
         self.own, self.to = modes.class_of[peer], modes.class_of[other]
+        self.device, self.other = modes.device, modes.other
         common = modes.loops[modes.common]
-        device, found = common.sites[self.own].device, common.sites[self.to].device
-        assert device is not None and found is not None
-        self.device: Device = device
-        self.other: Device = found
         self.copies = [_copy(site.group) for site in common.sites]
         named = self.copies[self.own]
         self.copy = named[0] if named else ""
 
-    def at(self, s: Complex, aliases: Sequence[int] = (0,)) -> tuple[Carried, Carried, Carried, Floats]:
-        """Return the velocities here and there, the copy's error, and the largest alias here (k,)."""
+    def at(self, s: Complex, aliases: Sequence[int] = (0,)) -> list[Carried]:
+        """Return the velocity here at each alias, the velocity there, and the copy's error (k,)."""
         common = self.modes.loops[self.modes.common]
         n = self.modes.members[self.own]
         copies = [(place, one[1], 0) for place, one in enumerate(self.copies) if one]
-        here, own = self.device.velocity, self.copies[self.own]
+        here, there, own = self.device.velocity, self.other.velocity, self.copies[self.own]
         wanted = [(self.own, here, alias) for alias in aliases]
-        wanted = [*wanted, (self.to, self.other.velocity, 0), *copies]
+        wanted = [*wanted, (self.to, there, 0), *copies]
         together = [_scaled(one, 1 / n) for one in spectra(common, self.own, wanted, s)]
-        velocity, (there, *rest) = together[: len(aliases)], together[len(aliases) :]
+        velocity, (across, *rest) = together[: len(aliases)], together[len(aliases) :]
         parts = dict(zip([place for place, _, _ in copies], rest, strict=True))
         apart: list[Carried] = []
         if n > 1:
             loop = self.modes.loops[self.modes.apart[self.own]]
-            rows = [(0, here, alias) for alias in aliases] + ([(0, own[1], 0)] if own else [])
+            rows = [(0, here, alias) for alias in aliases]
+            rows += ([(0, there, 0)] if self.own == self.to else []) + ([(0, own[1], 0)] if own else [])
             apart = spectra(loop, 0, rows, s)
             velocity = [_plus(a, _scaled(b, 1 - 1 / n)) for a, b in zip(velocity, apart, strict=False)]
             if self.own == self.to:
-                there = _plus(there, _scaled(apart[0], 1 - 1 / n if self.peer == self.across else -1 / n))
+                share = 1 - 1 / n if self.peer == self.across else -1 / n
+                across = _plus(across, _scaled(apart[len(aliases)], share))
         error = self._error(parts, apart[-1] if own and n > 1 else None, len(s))
-        sizes = np.abs([one[0] for one in velocity])
-        return velocity[0], there, error, sizes[1:].max(axis=0, initial=0.0) / sizes[0]
+        return [*velocity, across, error]
+
+    def steady(self, s: Complex, aliases: Sequence[int]) -> list[Carried]:
+        """Return the same on the imaginary axis, at multiples of the frame rate too.
+
+        Notes
+        -----
+        There e^{sT} = 1, and where a scene may rest anywhere its equations of a frame say nothing, though the
+        response has a value: the mean over a circle about s. Its mean against the direction is 0 if no pole
+        is within.
+        """
+        turns = s.imag * float(self.modes.loops[0].frame) / (2 * np.pi)
+        drifting = any(basis.size for basis in self.modes.bases)
+        near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5) & drifting
+        found = [(np.zeros(len(s), complex), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
+        if not near.all():
+            for (value, off), (own, doubt) in zip(found, self.at(s[~near], aliases), strict=True):
+                value[~near], off[~near] = own, doubt
+        around = ASIDE * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
+        for place in np.flatnonzero(near):
+            circles = self.at(s[place] + np.concatenate([2 * around, around]), aliases)
+            for (value, off), (own, doubt) in zip(found, circles, strict=True):
+                inner = own[AROUND:]
+                pole = abs((inner * around).mean()) / ASIDE
+                value[place] = inner.mean()
+                off[place] = abs(own[:AROUND].mean() - value[place]) + pole + doubt.max()
+        return found
 
     @property
     def velocity_weights(self) -> _Weights:
@@ -511,7 +559,7 @@ class _Responses:
         least = SETTLED
         for _ in range(HALVINGS):
             s = radius * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
-            (velocity, off), _, _, _ = self.at(s)
+            (velocity, off), *_ = self.at(s)
             values, powers = s / velocity, radius ** np.arange(3)
             doubt = float((np.abs(values) * off / np.abs(velocity)).max())
             found = np.array([(values / s**power).mean().real for power in range(3)])

@@ -31,6 +31,11 @@ OPTION = "--hands passive"
 STABLE, UNSTABLE = "stable with any passive hands", "unstable with some passive hands"
 UNDECIDED, NEVER = "undecided", "unstable with some passive hands, however much damping there is"
 
+CIRCULATES = (
+    "What devices feel of one another at rest is not what springs give: moved slowly round, they give back "
+    "more energy than they got, whatever their damping"
+)
+
 # How far below the least that is found, relatively, what is proved may lie, the first that can be proved; and
 # what part of that a proof may leave over for rounding.
 WIDTHS, SPARED = (1e-9, 1e-7, 1e-5), (0.03, 1e-3)
@@ -45,8 +50,9 @@ class PassiveMode:
 
     `damping` is what its devices have in N·s/m, None where they differ; `more` what each of them needs beside
     it, negative if some could be spared, ± `error`; None where none suffices, as the scene is unstable with
-    its devices clamped or pushes them round at rest. `frequency_hz` is where most energy can be taken out.
-    `stiffness` is what its devices feel at rest, N/m, None where several groups move in it.
+    its devices clamped, or what devices feel at rest is not what springs give. `frequency_hz` is where most
+    energy can be taken out. `stiffness` is what its devices feel at rest, N/m, None where several groups move
+    in it.
     """
 
     name: str
@@ -122,24 +128,24 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
         modes = () if isinstance(loops, str) else tuple(_judge(loop) for loop in loops)
+        why = loops if isinstance(loops, str) else CIRCULATES if any(map(_circulates, loops)) else ""
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     stable: bool | None = None
     if isinstance(loops, str) or fixed.stable is False or any(one.passive is False for one in modes):
         stable = False
     elif all(one.passive for one in modes) and fixed.stable:
         stable = True
-    lost = any(one.more is None for one in modes)
     verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
     of = ", of the linearization" if not linear else ""
     return PassiveHands(
         topology=system.name,
-        verdict=NEVER if isinstance(loops, str) or (fixed.stable and lost) else verdict,
+        verdict=NEVER if why else verdict,
         stable=stable,
         clamped_stable=fixed.stable,
         clamped_radius=fixed.spectral_radius,
         clamped_error=fixed.spectral_radius_error,
         modes=modes,
-        why=loops if isinstance(loops, str) else "",
+        why=why,
         proof="" if stable is None else f"proved by floats whose every rounding is bounded{of}",
         linearized=not linear,
         left_out=left_out(system, linear=linear),
@@ -165,7 +171,10 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
         loops = port_loops(system, prepared, option=OPTION)
         found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
         if not isinstance(loops, str):
-            found = [_bounds(loop)[:3] if bounded else (_least(loop)[0],) * 3 for loop in loops]
+            found = [
+                _bounds(loop)[:3] if bounded else (-np.inf if _circulates(loop) else _least(loop)[0],) * 3
+                for loop in loops
+            ]
             scale = max(float(one) for loop in loops for one in loop.dampings) or 1.0
     needed = [scale - min(one[place] for one in found) for place in range(3)]
     logs = [1.0 if np.isinf(one) else (one - scale) / (abs(one) + scale) for one in needed]
@@ -193,12 +202,15 @@ def _judge(loop: PortLoop) -> PassiveMode:
 def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     """Return the least eigenvalue of He H + diag(b/τ), what is proved below and above it, and its angle.
 
-    −∞ where the scene is unstable with its devices clamped, of which this is no proof, or `goes_round`.
+    −∞ where the scene is unstable with its devices clamped, of which this is no proof, and where slow motions
+    draw energy, of which it is one.
     """
+    if _circulates(loop):
+        return -np.inf, -np.inf, -np.inf, 0.0
     matrices = loop.a, loop.b, loop.c, loop.d
     least, angle = _least(loop)
     if not np.isfinite(least):
-        return least, -np.inf, -np.inf if goes_round(loop) else np.inf, angle
+        return least, -np.inf, np.inf, angle
     scale = max(abs(least), float(np.abs(value_of(loop.weight)).max()))
     low = -np.inf
     for width in WIDTHS:
@@ -215,19 +227,16 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
 
 def _least(loop: PortLoop) -> tuple[float, float]:
     """Return the least eigenvalue of He H + diag(b/τ) over all angles, and its angle, in floats."""
-    if goes_round(loop):
-        return -np.inf, 0.0
     return least_real(*map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight)))
 
 
-def goes_round(loop: PortLoop) -> bool:
-    """Say whether what devices feel at rest is proved not to be that of springs.
+def _circulates(loop: PortLoop) -> bool:
+    """Say whether the stiffness at rest is not that of any spring.
 
     Notes
     -----
     The residue at z = 1 has to be symmetric and not negative, or hands that move devices slowly round draw
-    energy from it, and dampers take ever less of that the slower they go. What rounding leaves of one that
-    vanishes counts as none.
+    energy from it. What rounding leaves of one that vanishes counts as none.
     """
     value, off = value_of(loop.static), radius_of(loop.static)
     turned = np.abs(value - value.T) > off + off.T

@@ -37,12 +37,13 @@ LINEARIZED = ", linearized at its start"
 
 def passive_text(found: PassiveHands) -> str:
     """Return whether a scene is stable with any passive hands, in words and numbers."""
-    lines = [f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}"]
+    lines = wrapped(f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}", "", "  ")
     for text in found.left_out:
         lines += note(text)
     lines.append("")
     if found.why:
         lines += wrapped(f"{found.why}.", "  ", "  ")
+    if found.why and not found.modes:
         hint = (
             "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
         )
@@ -54,7 +55,7 @@ def passive_text(found: PassiveHands) -> str:
     if found.proof:
         lines.append(f"  proof            {found.proof}")
     if found.modes:
-        rows = [("  mode", "damping", "needed", "at", "stiffness at rest", ""), *map(_mode, found.modes)]
+        rows = [("  mode", "damping", "needed", "at", "at rest", ""), *map(_mode, found.modes)]
         widths = [max(len(row[column]) for row in rows) for column in range(6)]
         lines.append("")
         lines += [
@@ -67,11 +68,6 @@ def passive_text(found: PassiveHands) -> str:
 def _worst(found: PassiveHands, worst: PassiveMode) -> str:
     """Say how the devices move that take most energy out, or need most damping."""
     moved = "all alike" if worst.name in ("common", "single") else f"in the mode {worst.name}"
-    if worst.more is None and found.clamped_stable:
-        return (
-            "At rest one device pulls another harder than it is pulled back: hands that are joined, and move "
-            "them slowly round, get energy out, and no damping at the devices helps."
-        )
     if worst.more is None:
         held = "with its devices clamped the scene is unstable, and no damping of theirs helps"
         return f"Devices that move {moved}: {held}."
@@ -118,7 +114,8 @@ def passive_document(found: PassiveHands) -> dict[str, Any]:
 
 def feel_text(found: Feel) -> str:
     """Return what is felt at a device, in words and numbers."""
-    lines = [f"{found.topology}: what a hand feels at {found.at}{LINEARIZED if found.linearized else ''}"]
+    whole = f"{found.topology}: what a hand feels at {found.at}{LINEARIZED if found.linearized else ''}"
+    lines = wrapped(whole, "", "  ")
     for text in (*found.notes, *found.left_out):
         lines += note(text)
     lines.append("")

@@ -34,6 +34,7 @@ from apc.vary.mean_square import (
     BY_GROWTH,
     MEAN_SQUARE,
     NOMINAL,
+    PASSIVE,
     criterion_of,
     growth_at,
     search_mean_square,
@@ -158,6 +159,8 @@ def critical(
     verdict = f"{words} at every value scanned"
     if not found.enters:
         verdict = f"{words} whatever its value: nothing that decides stability depends on it"
+        if chosen_criterion == PASSIVE and side is False:
+            verdict = f"{words} whatever its value: apc analyze --hands passive says why"
     return Critical(
         topology=system.name,
         parameter=free.label,
