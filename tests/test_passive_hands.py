@@ -161,26 +161,50 @@ def test_no_damping_helps_where_a_velocity_is_sampled() -> None:
 
 
 def test_no_damping_helps_where_peers_feel_each_other_otherwise_than_springs_do() -> None:
-    """A teacher hears the mean of all, each of whom hears the teacher: K is not symmetric."""
-    star = compiled(
+    """Each hears one other, in a circle: what devices feel at rest is no spring's, however it is weighed."""
+    round_ = compiled(
         replaced(
             AVERAGE,
-            ("count: 3", "count: 4"),
             ("stiffness: 500", "stiffness: 100"),
-            ("delay: 8 ms}", "delay: 8 ms, graph: star}"),
+            ("delay: 8 ms}", "delay: 8 ms, graph: {arcs: [[1, 2, 1], [2, 3, 1], [3, 1, 1]]}}"),
         )
     )
     for damping in ("5 N*s/m", "500 N*s/m"):
-        found = passive_hands(apc.set_parameters(star, {"device.damping": damping}))
+        found = passive_hands(apc.set_parameters(round_, {"device.damping": damping}))
         assert found.stable is False
         assert found.clamped_stable
         assert found.worst is not None
         assert found.worst.more is None
         assert "not what springs give" in str(found)
         assert "more damping at each device they can't" not in str(found)
-    answer = critical(star, "device.damping", criterion="passive")
+    answer = critical(round_, "device.damping", criterion="passive")
     assert not answer.crossings
     assert answer.verdict.startswith("unstable whatever its value: apc analyze --hands passive")
+
+
+STAR = replaced(AVERAGE, ("count: 3", "count: 4"), ("delay: 8 ms}", "delay: 8 ms, graph: star}"))
+UNEVEN = replaced(
+    AVERAGE, ("user: {count: 3}", "a: {count: 1, set: {coordination.stiffness: 50 N/m}}\n  b: {count: 2}")
+)
+
+
+@pytest.mark.parametrize("text", [STAR, UNEVEN])
+def test_where_one_is_pulled_harder_than_it_pulls_hands_by_themselves_do_no_harm(text: str) -> None:
+    """What devices feel at rest is that of springs if energies are weighed: no hand alone gets any out."""
+    system = compiled(replaced(text, ("stiffness: 500", "stiffness: 100")))
+    found = passive_hands(system)
+    assert found.stable
+    assert not found.joined
+    assert "each by itself" in " ".join(str(found).split())
+    random = np.random.default_rng(3)
+    ready = held(system, option="")
+    drawn = 10 ** random.uniform(-6, [3, 4, 7], size=(60, 3))
+    names = ("hand.mass", "hand.damping", "hand.stiffness")
+    many = apc.analyze_many(ready, dict(zip(names, drawn.T, strict=True)))
+    assert not (many.stable == 0).any()
+    # Where the criterion isn't met, nothing is said of them.
+    stiff = passive_hands(compiled(replaced(text, ("stiffness: 500", "stiffness: 400"))))
+    assert stiff.stable is None or stiff.stable
 
 
 def test_hands_in_the_scene_are_not_doubled() -> None:

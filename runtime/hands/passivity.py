@@ -3,7 +3,8 @@
 Takes: a `CompiledSystem`.
 Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`.
 Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
-anything that gives back no more energy than it was given, each by itself or joined to each other.
+anything that gives back no more energy than it was given, each by itself, or, where devices feel each other
+alike, joined to each other too.
 Does not: say with which hand it shakes: which motion of the devices takes energy out.
 """
 
@@ -75,7 +76,8 @@ class PassiveHands(Result):
     """Whether a scene is stable whatever passive hands hold its devices.
 
     `clamped_radius` ± `clamped_error` is the spectral radius with all devices held fast, the hardest of
-    hands. `why` says why no damping suffices, where that follows from the equations alone.
+    hands. `joined` says that hands may be joined to each other, too; where some devices feel others more than
+    those feel them, what is said is of hands each by itself. `why` says why no damping suffices, where that follows from the equations alone.
     """
 
     shown_by = "hands:passive"
@@ -87,6 +89,7 @@ class PassiveHands(Result):
     clamped_radius: float
     clamped_error: float
     modes: tuple[PassiveMode, ...]
+    joined: bool
     why: str
     proof: str
     linearized: bool
@@ -131,7 +134,9 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
         why = loops if isinstance(loops, str) else CIRCULATES if any(map(_circulates, loops)) else ""
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     stable: bool | None = None
-    if isinstance(loops, str) or fixed.stable is False or any(one.passive is False for one in modes):
+    joined = not isinstance(loops, str) and all(loop.joined for loop in loops)
+    drawn = [one.passive is False and (joined or one.more is None) for one in modes]
+    if isinstance(loops, str) or fixed.stable is False or any(drawn):
         stable = False
     elif all(one.passive for one in modes) and fixed.stable:
         stable = True
@@ -145,6 +150,7 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
         clamped_radius=fixed.spectral_radius,
         clamped_error=fixed.spectral_radius_error,
         modes=modes,
+        joined=joined,
         why=why,
         proof="" if stable is None else f"proved by floats whose every rounding is bounded{of}",
         linearized=not linear,

@@ -1,7 +1,7 @@
 """What devices are pushed by, while hands move them as they like: one map a mode.
 
 Takes: a `CompiledSystem`.
-Gives: `PortLoop`, `port_loops`.
+Gives: `PortLoop`, `port_loops`; `reciprocal`.
 Guarantees: exact for any motion of the hands: where nothing samples a device and no force on it switches,
 only how far it went counts, and the least that its damping takes of that. Matrices carry the radius of their
 rounding.
@@ -40,7 +40,7 @@ from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.lift import lift
 from apc.frame.ports import Ports, with_holds, with_ports
-from apc.frame.radius import RADII, solve, with_radius
+from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
 from apc.frame.site import LinearSite
 
@@ -50,6 +50,9 @@ Matrix = NDArray[Any]
 
 # Graphs whose modes are orthogonal: what hands give all peers together is the sum of what they give each.
 ORTHOGONAL = ("complete", "ring")
+
+# How alike devices feel each other to count alike: far more than rounding.
+EVEN = 1e-9
 
 # Intervals of all devices of a mode together.
 MOST_INTERVALS = 1000
@@ -71,7 +74,8 @@ class PortLoop:
     `a`, `b`, `c`, `d` (2, …) are over the states of the scene with clamped devices; `weight` (2, m, m) is
     what is added to the Hermitian part: dampers, and the pole's. Inputs and outputs are scaled: 1 more on the
     diagonal of `weight` is 1 N·s/m more at each device. `static` (2, k, k) is the stiffness of the pole
-    between the k kinds of devices, of all peers together. `seconds` are the intervals', `starts` when they
+    between the k kinds of devices, of all peers together. `joined` says that the energies of all devices
+    count alike, so that hands may be joined to each other. `seconds` are the intervals', `starts` when they
     begin.
     """
 
@@ -83,6 +87,7 @@ class PortLoop:
     d: Matrix
     weight: Matrix
     static: Matrix
+    joined: bool
     dampings: tuple[Fraction, ...]
     starts: Floats
     seconds: Floats
@@ -241,8 +246,8 @@ def _loops(
 class _Wires:
     """The intervals of a loop's devices: `into`, `out` (m,) are where in the closed state, `rest` all else.
 
-    `of` (m, k) says of which site each is, `sums` (m, m) which came before it in a frame, `peers` (m,) how
-    many peers it stands for, `seconds` and `starts` (m,) how long it is and when it begins.
+    `of` (m, k) says of which site each is, `sums` (m, m) which came before it in a frame, `seconds` and
+    `starts` (m,) how long it is and when it begins.
     """
 
     into: Places
@@ -250,12 +255,11 @@ class _Wires:
     rest: Places
     of: Floats
     sums: Floats
-    peers: Floats
     seconds: Floats
     starts: Floats
 
 
-def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched], counts: Sequence[int]) -> _Wires:
+def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched]) -> _Wires:
     """Return where the intervals are of sites whose states begin at offsets."""
     lengths = [len(one.seconds) for one in sites]
     whose = np.repeat(np.arange(len(sites)), lengths)
@@ -268,7 +272,6 @@ def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched], counts: 
         rest=np.delete(np.arange(size), added),
         of=np.eye(len(sites))[whose],
         sums=np.tril(whose[:, None] == whose, -1).astype(np.float64),
-        peers=np.array(counts, dtype=np.float64)[whose],
         seconds=np.array([float(one) for site in sites for one in site.seconds]),
         starts=starts,
     )
@@ -281,13 +284,13 @@ def _port_loop(
     closed = close_loop(loop)
     sites = [touched[id(group.schedule)] for group in loop.sites]
     counts = [group.count if weighted and len(loop.sites) > 1 else 1 for group in loop.sites]
-    at = _wires(closed.offsets, len(closed.matrix), sites, counts)
+    at = _wires(closed.offsets, len(closed.matrix), sites)
     if len(at.into) > MOST_INTERVALS:
         what = f"devices are sampled and pushed over {len(at.into):,} intervals of a frame"
         hint = f"{MOST_INTERVALS:,} at most"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
     whole, exact = with_radius(closed.matrix, closed.error), RADII.exact
-    peers, of, across = exact(np.diag(at.peers)), exact(at.of), exact(at.of.T.copy())
+    of, across = exact(at.of), exact(at.of.T.copy())
     a, placed, felt = _moving(whole, at, np.zeros((len(at.rest), 0)))
     aside = _aside(a, placed, of)
     if aside is None:
@@ -300,15 +303,19 @@ def _port_loop(
         hint = "couplers that hold each object to a device"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
     # A device is where it was as the frame began, and the intervals before have moved it since.
-    felt, at_once = RADII.multiply(peers, felt), RADII.multiply(peers, whole[:, at.out[:, None], at.into])
+    at_once = whole[:, at.out[:, None], at.into]
     forces = RADII.add(RADII.multiply(felt, aside), RADII.multiply(at_once, of))
-    static = forces[:, np.argmax(at.of, axis=0)]
+    first = np.argmax(at.of, axis=0)
+    many = reciprocal(forces[:, first], counts)
+    peers = exact(np.diag(at.of @ many))
+    felt, at_once, forces = (RADII.multiply(peers, one) for one in (felt, at_once, forces))
+    static = forces[:, first]
     b = RADII.subtract(RADII.multiply(placed, exact(at.sums)), RADII.multiply(aside, across))
     pole = RADII.multiply(RADII.multiply(of, static), across)
     half = RADII.multiply(RADII.add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(len(at.into)) / 4))
     dampings = [float(one.damping) for one in sites]
-    dampers = np.diag((at.of @ dampings) * at.peers / at.seconds)
-    units = exact(np.diag(np.sqrt(at.seconds / at.peers)))
+    dampers = np.diag(at.of @ (many * dampings) / at.seconds)
+    units = exact(np.diag(np.sqrt(at.seconds / (at.of @ many))))
 
     def scaled(matrix: Matrix) -> Matrix:
         return RADII.multiply(RADII.multiply(units, matrix), units)
@@ -322,11 +329,44 @@ def _port_loop(
         d=scaled(RADII.multiply(at_once, exact(at.sums))),
         weight=scaled(RADII.subtract(with_radius(dampers, 4 * UNIT * dampers), half)),
         static=static,
+        joined=bool((many == counts).all()),
         dampings=tuple(one.damping for one in sites),
         starts=at.starts,
         seconds=at.seconds,
         frame_s=closed.frame_s,
     )
+
+
+def reciprocal(static: Matrix, counts: Sequence[int]) -> Floats:
+    """Return what the energies of devices are to be multiplied by for their stiffness to be that of springs.
+
+    Parameters
+    ----------
+    static
+        What each kind of device is pushed back by as those of each stand aside (2, k, k), in N/m.
+    counts
+        How many peers have each, which is what to multiply by where that serves.
+
+    Notes
+    -----
+    Hands that give back no more than they got, each by itself, do so whatever their energies are multiplied
+    by. Where one device feels another more than that feels it, v_g K_gh = v_h K_hg leaves one choice.
+    """
+    value = value_of(static)
+    felt = np.abs(value) > radius_of(static)
+    found = np.zeros(len(counts))
+    for start, count in enumerate(counts):
+        if found[start]:
+            continue
+        found[start], waiting = count, [start]
+        while waiting:
+            g = waiting.pop()
+            for h in np.flatnonzero(felt[g] & felt[:, g] & (found == 0)):
+                ratio = value[g, h] / value[h, g]
+                found[h] = found[g] * ratio if ratio > 0 else counts[h]
+                waiting.append(int(h))
+    even = found * counts[0] / found[0] / counts
+    return np.array(counts, dtype=np.float64) if np.abs(even - 1).max() <= EVEN else found
 
 
 def _moving(whole: Matrix, at: _Wires, rigid: Floats) -> tuple[Matrix, Matrix, Matrix]:

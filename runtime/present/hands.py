@@ -71,17 +71,24 @@ def _worst(found: PassiveHands, worst: PassiveMode) -> str:
     if worst.more is None:
         held = "with its devices clamped the scene is unstable, and no damping of theirs helps"
         return f"Devices that move {moved}: {held}."
+    alone = "" if found.joined else ", each by itself"
     enough = f"With {worst.more:.4g} N*s/m more damping at each device they can't"
     if found.stable:
         return (
-            "Whatever gives back no more energy than it was given may hold the devices. Of their damping "
-            f"{-worst.more:.4g} N*s/m could be spared, with the least left as they move {moved} at "
+            f"Whatever gives back no more energy than it was given may hold the devices{alone}. Of their "
+            f"damping {-worst.more:.4g} N*s/m could be spared, with the least left as they move {moved} at "
             f"{worst.frequency_hz:.4g} Hz."
         )
     if found.stable is False:
         return (
             f"Hands that move the devices {moved} at {worst.frequency_hz:.4g} Hz get energy out of the scene "
             f"for ever, and can make it shake. {enough}."
+        )
+    if worst.passive is False:
+        return (
+            f"Hands that move the devices {moved} at {worst.frequency_hz:.4g} Hz get energy out if they are "
+            "joined to each other; as some devices feel others more than those feel them, what hands do each "
+            f"by itself is left open. {enough}."
         )
     return (
         f"Rounding leaves open whether hands get energy out, moving {moved} at {worst.frequency_hz:.4g} Hz."
