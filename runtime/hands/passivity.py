@@ -45,8 +45,8 @@ class PassiveMode:
 
     `damping` is what its devices have in N·s/m, None where they differ; `more` what each of them needs beside
     it, negative if some could be spared, ± `error`; None where none suffices, as the scene is unstable with
-    its devices clamped or pushes them round at rest. `frequency_hz` is where most energy can be taken out. `stiffness` is what its devices
-    feel at rest, N/m, None where several groups move in it.
+    its devices clamped or pushes them round at rest. `frequency_hz` is where most energy can be taken out.
+    `stiffness` is what its devices feel at rest, N/m, None where several groups move in it.
     """
 
     name: str
