@@ -2,8 +2,8 @@
 
 Of each scene: the verdict, and the damping needed, against the map of `joined` on a grid of angles; where it
 is passive, no hand may shake it, be it a mass, damper and spring at every device or a network that joins
-devices; where it isn't, a heavy hand tuned to the frequency told often does. Every third scene is of the paper's
-form and goes through hands alone.
+devices; where it isn't, a heavy hand tuned to the frequency told often does. Every third scene is of the
+paper's form and goes through hands alone.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ from tests.topologies import AVERAGE, MESH, compiled, library, replaced
 
 # Angles of a grid, to which those of the frequencies told are added; what damping may be off by, relatively.
 ANGLES, MISSED = 200, 1e-7
+
+# The least angle: at 0 the map has a pole, which rounding can't take out nearby.
+POLE = 3e-5
 
 # What a double eigenvalue 1 may be off by.
 ROUNDED = 1e-7
@@ -184,7 +187,8 @@ def check_table(table: Table, own: Library, random: np.random.Generator, hands: 
     truth = moved(table)
     turn = 2 * np.pi * float(table.frame)
     told = [turn * one.frequency_hz for one in found.modes if one.frequency_hz is not None]
-    angles = [3e-5, 1e-3, *np.linspace(np.pi / ANGLES, np.pi, ANGLES)]
+    told = [angle for angle in told if abs(np.sin(angle / 2)) > POLE]
+    angles = [POLE, 1e-3, *np.linspace(np.pi / ANGLES, np.pi, ANGLES)]
     least = min(map(truth.least, [*told, *angles]))
     largest = max(one.damping for one in table.groups)
     scale = max(largest, abs(least))
