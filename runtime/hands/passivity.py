@@ -77,7 +77,8 @@ class PassiveHands(Result):
 
     `clamped_radius` ± `clamped_error` is the spectral radius with all devices held fast, the hardest of
     hands. `joined` says that hands may be joined to each other, too; where some devices feel others more than
-    those feel them, what is said is of hands each by itself. `why` says why no damping suffices, where that follows from the equations alone.
+    those feel them, what is said is of hands each by itself. `why` says why no damping suffices, where that
+    follows from the equations alone.
     """
 
     shown_by = "hands:passive"
@@ -298,7 +299,7 @@ def _frequency(loop: PortLoop, angle: float) -> float:
     """Return the frequency of the motion that takes most energy out at an angle, in Hz.
 
     Frequencies that differ by a multiple of the frame rate have one angle: which of them it is, its course
-    within a frame says.
+    within a frame says: the one that most of it is at.
     """
     a, b, c, d, weight = map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight))
     response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
@@ -306,6 +307,11 @@ def _frequency(loop: PortLoop, angle: float) -> float:
     most = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
     found = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
     found.sort(key=abs)  # of two that can't be told apart, the slower
-    fits = [abs(np.exp(-1j * one * loop.starts / loop.frame_s) @ moved) for one in found]
+    # A device moves evenly through each interval: how much of that is at a frequency, over all devices.
+    middles, device = loop.starts + loop.seconds / 2, np.cumsum(loop.starts == 0) - 1
+    each = device == np.arange(device[-1] + 1)[:, None]
+    turned = np.outer(found, middles) / loop.frame_s
+    shares = np.sinc(np.outer(found, loop.seconds) / (2 * np.pi * loop.frame_s))
+    fits = np.linalg.norm((np.exp(-1j * turned) * shares * moved) @ each.T, axis=1)
     best = next(one for one, fit in zip(found, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
     return abs(best) / (2 * np.pi * loop.frame_s)

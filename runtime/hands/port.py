@@ -361,10 +361,10 @@ def reciprocal(static: Matrix, counts: Sequence[int]) -> Floats:
         found[start], waiting = count, [start]
         while waiting:
             g = waiting.pop()
-            for h in np.flatnonzero(felt[g] & felt[:, g] & (found == 0)):
+            for h in np.flatnonzero(felt[g] & felt[:, g] & (found == 0)).tolist():
                 ratio = value[g, h] / value[h, g]
                 found[h] = found[g] * ratio if ratio > 0 else counts[h]
-                waiting.append(int(h))
+                waiting.append(h)
     even = found * counts[0] / found[0] / counts
     return np.array(counts, dtype=np.float64) if np.abs(even - 1).max() <= EVEN else found
 
