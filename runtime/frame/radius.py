@@ -115,8 +115,9 @@ def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
 
     Notes
     -----
-    With an inverse Y in floats and F = I − Y M, an X in floats is off by E ≤ B + |F| E, B = |Y (R − M X)|;
-    with |F| B ≤ θ B, entry by entry, that is at most B/(1 − θ).
+    With an inverse Y in floats and F = I − Y M, an X in floats is off by E ≤ B + |F| E, B = |Y (R − M X)|.
+    For any T ≥ B with |F| T ≤ θ T, entry by entry, that is at most T/(1 − θ): T is B, or, where entries of B
+    are far apart, B and a little of the largest of its column.
     """
     n = matrix.shape[-1]
     try:
@@ -127,7 +128,10 @@ def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
     wrong = RADII.subtract(_exact(np.eye(n)), _multiply(exact, matrix))
     left = _multiply(exact, RADII.subtract(right, _multiply(matrix, _exact(found))))
     off = np.abs(value_of(left)) + radius_of(left) + np.finfo(np.float64).tiny
-    share = float(((np.abs(value_of(wrong)) + radius_of(wrong)) @ off / off).max(initial=0.0)) * (
-        1 + n * UNIT
-    )
-    return with_radius(found, off * (1 + 8 * UNIT) / (1 - share)) if share < 0.5 else None
+    size = (np.abs(value_of(wrong)) + radius_of(wrong)) * (1 + n * UNIT)
+    for spread in (0.0, 4 * float(size.sum(axis=1).max(initial=0.0))):
+        bound = off + spread * off.max(axis=0, initial=0.0)
+        share = float((size @ bound / bound).max(initial=0.0))
+        if share < 0.5:
+            return with_radius(found, bound * (1 + 8 * UNIT) / (1 - share))
+    return None

@@ -48,14 +48,17 @@ Complex = NDArray[np.complex128]
 ALIASES = (0, 1, -1)
 
 # Points of a circle about s = 0, and its radii in 1/s, one after the other half as large.
-AROUND, RADIUS, HALVINGS = 16, 4.0, 10
+AROUND, RADIUS, HALVINGS = 16, 4.0, 14
 
 # Turns a frame, so near a whole number of which a scene that may rest anywhere is asked around a frequency,
 # and how far around, in 1/s.
 NEAR, ASIDE = 1e-5, 0.25
 
+# By how much more than rounding means against negative powers may tell of a pole within a circle.
+DOUBTED = 10.0
+
 # What of slow motions two circles may tell differently, beside the largest.
-SETTLED = 1e-6
+SETTLED = 1e-3
 
 # The highest frequency in Hz, where none is named: hands feel more, and do less.
 HIGHEST = 60.0
@@ -66,7 +69,7 @@ MOST_KICKS = 4000
 
 @dataclass(frozen=True, slots=True)
 class Slow:
-    """What is felt of slow motions: Z = stiffness/s + damping + mass · s + …, in SI, each ± its `errors`."""
+    """What is felt of slow motions, down to some 1e-3 a second: Z = stiffness/s + damping + mass · s + …, in SI, each ± its `errors`."""
 
     mass: float
     damping: float
@@ -110,7 +113,7 @@ class Feel(Result):
     in m/s/N is the other device's velocity by the force here, `error_per_force` in m/N how far the copy of
     the object here is from the mean of the others'. All are complex, the fundamental's. `alias` is the
     largest of what else comes at the device, at frequencies a frame rate apart, beside the fundamental.
-    `bound` is what any of them may be off by, relatively.
+    `bound` is what the impedance may be off by, relatively; `transmitted_bound` and `error_bound` the others.
     """
 
     shown_by = "hands:feel"
@@ -125,6 +128,8 @@ class Feel(Result):
     error_per_force: Complex
     alias: Floats
     bound: Floats
+    transmitted_bound: Floats
+    error_bound: Floats
     low_frequency: Slow | None
     hinf: tuple[Extremes, ...]
     h2: tuple[Noise, ...]
@@ -264,7 +269,9 @@ def feel(
         own, *aliases, across, error = responses.steady(s, ALIASES)
         one = 1 / own[0]
         alias = np.max([np.abs(value) for value, _ in aliases], axis=0) / np.abs(own[0])
-        bound = np.max([off / np.abs(value) for value, off in (own, across, error) if value.any()], axis=0)
+        bounds = [
+            1.01 * off / np.where(value == 0, np.inf, np.abs(value)) for value, off in (own, across, error)
+        ]
         steady = verdict.stable is not False and not quick
         slow = responses.slow() if not quick else None
         hinf = _extremes(modes, responses) if steady else ()
@@ -275,6 +282,8 @@ def feel(
         for one, device in ((port, modes.device), (other, modes.other))
     )
     notes = () if verdict.stable is not False else ("of the map: the scene is unstable",)
+    if slow is None and not quick:
+        notes = (*notes, "of slow motions nothing is told: something of the scene is slower still")
     if steady and not h2:
         notes = (*notes, "what noise does is not told: the fastest clock has a phase")
     return Feel(
@@ -287,7 +296,9 @@ def feel(
         transmitted_admittance=across[0],
         error_per_force=error[0],
         alias=alias,
-        bound=bound * 1.01,
+        bound=bounds[0],
+        transmitted_bound=bounds[1],
+        error_bound=bounds[2],
         low_frequency=slow,
         hinf=hinf,
         h2=h2,
@@ -551,8 +562,9 @@ class _Responses:
 
         Notes
         -----
-        s Z(s) has no pole within a circle about 0, so its Taylor coefficients are the means of its values on
-        the circle against powers of s (Cauchy); those of two circles differ by what is left out.
+        s Z(s) has no pole within a small circle about 0, so its Taylor coefficients are the means of its
+        values on the circle against powers of s (Cauchy); those of two circles differ by what is left out.
+        With a pole within, means against negative powers don't vanish.
         """
         before, radius = None, RADIUS
         best: Slow | None = None
@@ -564,10 +576,11 @@ class _Responses:
             doubt = float((np.abs(values) * off / np.abs(velocity)).max())
             found = np.array([(values / s**power).mean().real for power in range(3)])
             if before is not None:
-                off = np.abs(found - before) + doubt / powers
+                inside = max(abs((values * (s / radius) ** power).mean()) for power in (1, 2, 3))
+                off = np.abs(found - before) + (doubt + inside) / powers
                 # At this speed, none matters that is far smaller than the largest.
                 share = float((off * powers).max() / np.abs(found * powers).max())
-                if share < least:
+                if share < least and inside <= DOUBTED * doubt:
                     least, (k, b, m), (off_k, off_b, off_m) = share, found.tolist(), off.tolist()
                     best = Slow(m, b, k, (off_m, off_b, off_k))
             before, radius = found, radius / 2

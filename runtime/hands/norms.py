@@ -13,6 +13,7 @@ Pearson, IEEE Trans. Autom. Control 37 (1992) 418, reduce the same operator; its
 
 from __future__ import annotations
 
+import warnings
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -201,7 +202,12 @@ def noise_variance(
         return None
     root = b[at.rest] - at.weights @ b[at.held]
     linalg = load_pool("scipy.linalg")
-    moments = linalg.solve_discrete_lyapunov(relative(m, at), root @ root.T)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", linalg.LinAlgWarning)
+        try:
+            moments = linalg.solve_discrete_lyapunov(relative(m, at), root @ root.T)
+        except linalg.LinAlgWarning:  # it all but drifts: no digit of it is known
+            return None
     seen = seen[:, at.rest]
     through = read @ d @ inputs
     return float((np.einsum("ij,jk,ik->i", seen, moments, seen) + (through**2).sum(axis=1)).mean())

@@ -346,5 +346,9 @@ def _steady(matrix: Matrix, at: Carried, driven: Carried) -> Carried:
     residual += (driven[1] + charge * np.abs(driven[0]))[:, :, None]
     bound = np.matmul(size, residual) + LEAST
     share = (np.matmul(wrong, bound) / bound).max(axis=(1, 2))
+    if (share >= 0.5).any():  # entries of it are far apart: a little of the largest is added to all
+        norm = wrong.sum(axis=2).max(axis=1)
+        bound += np.where(share < 0.5, 0.0, 4 * norm * bound.max(axis=(1, 2)))[:, None, None]
+        share = (np.matmul(wrong, bound) / bound).max(axis=(1, 2))
     bound *= np.where(share < 0.5, (1 + charge) / (1 - share), np.inf)[:, None, None]
     return value[:, :, 0], bound[:, :, 0]

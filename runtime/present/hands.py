@@ -163,13 +163,14 @@ def _rows_shown(found: Feel) -> Iterator[tuple[str, ...]]:
     """Yield some lines of the table, the first and the last among them."""
     count = len(found.frequency_hz)
     for place in sorted({round(one) for one in np.linspace(0, count - 1, min(SHOWN, count))}):
-        off = float(found.bound[place])
         numbers = (
-            abs(found.impedance[place]),
-            abs(found.transmitted_admittance[place]) * 1e3,
-            abs(found.error_per_force[place]) * 1e3,
+            (abs(found.impedance[place]), found.bound),
+            (abs(found.transmitted_admittance[place]) * 1e3, found.transmitted_bound),
+            (abs(found.error_per_force[place]) * 1e3, found.error_bound),
         )
-        size, arrives, apart = (known_digits(float(one), float(one) * off, DIGITS) for one in numbers)
+        size, arrives, apart = (
+            known_digits(float(one), float(one * off[place]), DIGITS) for one, off in numbers
+        )
         phase = f"{np.degrees(np.angle(found.impedance[place])):.2f}"
         yield (
             f"{found.frequency_hz[place]:.5g}",
@@ -284,6 +285,8 @@ def _columns() -> list[Column]:
         ("error per force imaginary", "m/N"),
         ("alias", ""),
         ("bound", ""),
+        ("transmitted bound", ""),
+        ("error bound", ""),
     )
     return [Column(name, unit) for name, unit in names]
 
@@ -293,4 +296,5 @@ def _rows(found: Feel) -> Iterator[Row]:
     for place, frequency in enumerate(found.frequency_hz.tolist()):
         numbers = (found.impedance[place], found.transmitted_admittance[place], found.error_per_force[place])
         parts = [float(part) for one in numbers for part in (one.real, one.imag)]
-        yield (frequency, *parts, float(found.alias[place]), float(found.bound[place]))
+        bounds = (float(one[place]) for one in (found.bound, found.transmitted_bound, found.error_bound))
+        yield (frequency, *parts, float(found.alias[place]), *bounds)
