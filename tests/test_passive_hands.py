@@ -18,6 +18,8 @@ from apc.frame.devices import clamped, held, with_hands
 from apc.frame.radius import value_of
 from apc.hands.passivity import passive_hands
 from apc.hands.port import port_loops
+from apc.regions.axes import parse_axes
+from apc.regions.region import region
 from apc.vary.critical import critical
 from tests.handled import Users, work
 from tests.joined import LIBRARY, MS, Group, Hands, Table, radii
@@ -246,6 +248,24 @@ def test_no_passive_hand_shakes_what_is_called_passive() -> None:
     assert not found.undecided
     assert 2 <= found.passive <= found.scenes - 2  # or the draws would say nothing
     assert found.shaken >= found.tried - 1  # some need more than a mass and a spring
+
+
+def test_region_and_sweep_say_what_critical_does(tmp_path: Path) -> None:
+    """At 1000 N/m of contact 458.24 N/m are borne, by an independent program."""
+    scene = tmp_path / "three.yaml"
+    scene.write_text(AVERAGE, encoding="utf-8")
+    axes = {"x": "contact.stiffness=900 N/m:1100 N/m", "y": "coordination.stiffness=300 N/m:600 N/m"}
+    found = region(apc.compile(scene), parse_axes(apc.compile(scene), **axes), cells=2, criterion="passive")
+    assert found.contains(1000.0, 455.0)
+    assert not found.contains(1000.0, 461.0)
+    middle = [point for curve in found.curves for point in curve.points if abs(point[0] - 1000) < 1e-6]
+    assert [y for _, y in middle] == pytest.approx([458.24], abs=0.01)
+    assert "stable with every passive hand" in str(found)
+    swept = apc.sweep(scene, {"coordination.stiffness": "455,461 N/m"}, criterion="passive", jobs=1)
+    assert swept.column("verdict").tolist() == [
+        "stable with any passive hands",
+        "unstable with some passive hands",
+    ]
 
 
 def test_the_command_line(

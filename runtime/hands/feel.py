@@ -69,7 +69,10 @@ MOST_KICKS = 4000
 
 @dataclass(frozen=True, slots=True)
 class Slow:
-    """What is felt of slow motions, down to some 1e-3 a second: Z = stiffness/s + damping + mass · s + …, in SI, each ± its `errors`."""
+    """What is felt of slow motions, down to some 1e-3 a second: mass, damping, stiffness in SI, ± `errors`.
+
+    Z = stiffness/s + damping + mass · s + …; the errors are in the order of the fields.
+    """
 
     mass: float
     damping: float
