@@ -63,6 +63,9 @@ SETTLED = 1e-3
 # The highest frequency in Hz, where none is named: hands feel more, and do less.
 HIGHEST = 60.0
 
+# States and readings of all kinds of peers together, in one matrix.
+MOST_TOGETHER = 2000
+
 # Intervals of a peer times its states, of what is kicked and read in a frame.
 MOST_KICKS = 4000
 
@@ -403,6 +406,10 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
         sites[id(own.schedule)] = site
     plain, wide = _arranged(system, groups, exchange), _arranged(system, opened, exchange)
     common = wide[0]
+    if (states := sum(len(site.lifted.z_names) for site in common.sites)) > MOST_TOGETHER:
+        what = f"{len(common.sites):,} peers that differ have {states:,} states and readings in a frame"
+        hint = f"fewer peers that differ: {MOST_TOGETHER:,} at most"
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
     class_of = {
         peer: place
         for place, site in enumerate(common.sites)

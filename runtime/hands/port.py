@@ -55,7 +55,7 @@ ORTHOGONAL = ("complete", "ring")
 EVEN = 1e-9
 
 # Intervals of all devices of a mode together.
-MOST_INTERVALS = 1000
+MOST_INTERVALS = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,14 +281,14 @@ def _port_loop(
     system: CompiledSystem, loop: Loop, touched: dict[int, Touched], *, weighted: bool
 ) -> PortLoop:
     """Return the map of a loop whose devices are moved from outside."""
-    closed = close_loop(loop)
     sites = [touched[id(group.schedule)] for group in loop.sites]
     counts = [group.count if weighted and len(loop.sites) > 1 else 1 for group in loop.sites]
-    at = _wires(closed.offsets, len(closed.matrix), sites)
-    if len(at.into) > MOST_INTERVALS:
-        what = f"devices are sampled and pushed over {len(at.into):,} intervals of a frame"
-        hint = f"{MOST_INTERVALS:,} at most"
+    if (intervals := sum(len(one.seconds) for one in sites)) > MOST_INTERVALS:
+        what = f"devices that differ are sampled and pushed over {intervals:,} intervals of a frame"
+        hint = f"fewer peers that differ: {MOST_INTERVALS:,} intervals at most"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+    closed = close_loop(loop)
+    at = _wires(closed.offsets, len(closed.matrix), sites)
     whole, exact = with_radius(closed.matrix, closed.error), RADII.exact
     of, across = exact(at.of), exact(at.of.T.copy())
     a, placed, felt = _moving(whole, at, np.zeros((len(at.rest), 0)))
