@@ -1,7 +1,7 @@
 """A scene with its contacts cut open: from the forces of a frame's ticks to what each follows.
 
 Takes: a `CompiledSystem` whose peers have parts that switch.
-Gives: `contact_groups`, `with_gain`; `Opened`, `OpenLoop`, `open_loops`.
+Gives: `contact_groups`, `with_gain`; `Opened`, `OpenLoop`, `open_loops`; `negated`.
 Guarantees: every matrix comes with its radii; what may drift with all contacts open is taken out, exactly.
 The cost grows with the different peers, not with their number.
 Does not: judge anything (see `switching`).
@@ -261,7 +261,7 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     each = list(zip(loop.sites, opened, strict=True))
     ports = tuple((site.name, *tick) for site, one in each for tick in one.ticks)
     counts = np.array([float(site.count) for site, one in each for _ in one.ticks])
-    plain = OpenLoop(loop.name, a, b, _turned(c), _turned(d), ports, counts, (), np.zeros((2, 1, len(ports))))
+    plain = OpenLoop(loop.name, a, b, negated(c), negated(d), ports, counts, (), np.zeros((2, 1, len(ports))))
     if free.exact and not all(one.plain for one in opened):
         return "what a contact follows is more than positions, and something may drift with all contacts open"
     seen = _seen(opened, free.exact, layout, n, outside)
@@ -280,11 +280,11 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     column = np.array([[(float(one),) for one in share], [(UNIT * abs(float(one)),) for one in share]])
     moved = RADII.add(RADII.multiply(factors, closed[:, held][..., n:]), RADII.multiply(along, b))
     return replace(
-        plain, c=_turned(RADII.subtract(c, RADII.multiply(column, along))), seen=tuple(share), moved=moved
+        plain, c=negated(RADII.subtract(c, RADII.multiply(column, along))), seen=tuple(share), moved=moved
     )
 
 
-def _turned(matrix: Matrix) -> Matrix:
+def negated(matrix: Matrix) -> Matrix:
     """Return a matrix with its radii times −1."""
     return with_radius(-value_of(matrix), radius_of(matrix))
 
@@ -318,13 +318,7 @@ def _seen(
     rows = []
     for offset, one in zip(layout.offsets, opened, strict=True):
         start = place_of[offset] if one.states else 0
-        rows += [
-            [
-                sum((s * x for s, x in zip(slopes, motion[start:], strict=False)), Fraction(0))
-                for motion in motions
-            ]
-            for slopes in one.slopes
-        ]
+        rows += [[_along(slopes, motion[start:]) for motion in motions] for slopes in one.slopes]
     first = next((row for row in rows if any(row)), None)
     if first is None:
         return ()

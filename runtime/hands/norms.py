@@ -26,7 +26,7 @@ from apc.eigen.dissipation import peak_gain
 from apc.eigen.relative import relative, relative_coordinates
 from apc.frame.discretize import exponential_rows
 from apc.frame.radius import value_of
-from apc.hands.response import Pushed, Site
+from apc.hands.response import Pushed, Site, force_lanes
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
@@ -113,11 +113,7 @@ def _with_nodes(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, nod
 def _lanes(site: Site, seconds: float, count: int) -> Floats:
     """Return γ_i (n_x, count) of an interval, σ^i/i! in units of it."""
     n = len(site.states)
-    generator = np.zeros((1, n + count, n + count))
-    generator[0, :n, :n] = value_of(site.a) * seconds
-    generator[0, :n, n] = site.push[0] * seconds
-    generator[0, range(n, n + count - 1), range(n + 1, n + count)] = 1.0
-    return np.asarray(exponential_rows(generator, np.zeros((1, n + count, 0)), 1.0).matrix[0, :n, n:])
+    return np.asarray(force_lanes(site, seconds, count).matrix[0, :n, n:])
 
 
 def _within(site: Site, seconds: float, at: Floats, row: int, forces: Floats) -> tuple[Floats, Floats]:

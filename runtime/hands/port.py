@@ -127,8 +127,8 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
         own, one = _ported(group, device)
         ported.append(own)
         touched[id(own.schedule)] = one
-    loops, weights = _loops(system, ported, exchange)
-    return tuple(_port_loop(system, loop, touched, weighted=weights) for loop in loops)
+    loops, weighted = _loops(system, ported, exchange, option=option)
+    return tuple(_port_loop(system, loop, touched, weighted=weighted, option=option) for loop in loops)
 
 
 def _felt_velocity(group: PeerGroup, device: Device) -> str:
@@ -226,7 +226,7 @@ def _driven(site: LinearSite, device: Device) -> LinearSite:
 
 
 def _loops(
-    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, option: str
 ) -> tuple[tuple[Loop, ...], bool]:
     """Return loops that share no energy, and whether a site of them stands for as many peers as it counts."""
     used = {one.way.link for group in groups for one in group.schedule.heard}
@@ -238,7 +238,7 @@ def _loops(
     if states > MOST_STATES:
         what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and intervals"
         hint = f"equal peers on complete graphs or rings, or {MOST_STATES:,} in all"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
     return (dense_loop(groups, exchange),), False
 
 
@@ -278,7 +278,7 @@ def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched]) -> _Wire
 
 
 def _port_loop(
-    system: CompiledSystem, loop: Loop, touched: dict[int, Touched], *, weighted: bool
+    system: CompiledSystem, loop: Loop, touched: dict[int, Touched], *, weighted: bool, option: str
 ) -> PortLoop:
     """Return the map of a loop whose devices are moved from outside."""
     closed = close_loop(loop)
@@ -288,7 +288,7 @@ def _port_loop(
     if len(at.into) > MOST_INTERVALS:
         what = f"devices are sampled and pushed over {len(at.into):,} intervals of a frame"
         hint = f"{MOST_INTERVALS:,} at most"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
     whole, exact = with_radius(closed.matrix, closed.error), RADII.exact
     of, across = exact(at.of), exact(at.of.T.copy())
     a, placed, felt = _moving(whole, at, np.zeros((len(at.rest), 0)))
@@ -301,7 +301,7 @@ def _port_loop(
     if aside is None:
         what = "with its devices clamped the scene has a motion that nothing holds back"
         hint = "couplers that hold each object to a device"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
     # A device is where it was as the frame began, and the intervals before have moved it since.
     at_once = whole[:, at.out[:, None], at.into]
     forces = RADII.add(RADII.multiply(felt, aside), RADII.multiply(at_once, of))
