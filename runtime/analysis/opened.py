@@ -33,11 +33,11 @@ from apc.eigen.closing import Feedback, Loop, StateLayout, close, close_loop, fe
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.peers import peer_groups
-from apc.eigen.relative import relative_coordinates
+from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT, discretize
 from apc.frame.exchange import build_exchange
-from apc.frame.lift import FrameMap, compose, lift, step_durations, with_roundings
+from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
 from apc.frame.parameters import resolve
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Heard, Sent, Tick, Value, Way
@@ -140,7 +140,7 @@ def with_gain(group: PeerGroup, pushes: Sequence[Push], gain: Fraction) -> PeerG
         The factor.
     """
     site, exact = (_pushing(one, pushes, gain) for one in (group.site, group.exact))
-    return replace(group, site=site, exact=exact, lifted=lift(site, group.schedule, exact=exact))
+    return group.with_site(site, exact, group.schedule)
 
 
 def _pushing(site: LinearSite, pushes: Sequence[Push], gain: Fraction) -> LinearSite:
@@ -250,12 +250,9 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     )
     n = len(layout.names)
     own = np.delete(np.arange(n), outside)
-    at = relative_coordinates(free.basis)
+    at = with_doubt(relative_coordinates(free.basis))
     rest, held = own[at.rest], own[at.held]
-    weights = with_radius(at.weights, at.doubt)
-    taken = closed[:, rest]
-    if len(held):
-        taken = RADII.subtract(taken, RADII.multiply(weights, closed[:, held]))
+    taken = relative_rows(closed[:, own], at, RADII)
     a, b = taken[..., rest], taken[..., n:]
     c, d = closed[:, outside][..., rest], closed[:, outside][..., n:]
     each = list(zip(loop.sites, opened, strict=True))
@@ -270,7 +267,7 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     # What y follows, over the coordinates held, is that of the first y that does times `seen`.
     first = next(place for place, one in enumerate(seen) if one)
     factors = RADII.add(
-        closed[:, outside[first : first + 1]][..., held], RADII.multiply(c[:, first : first + 1], weights)
+        closed[:, outside[first : first + 1]][..., held], RADII.multiply(c[:, first : first + 1], at.weights)
     )
     pushed = RADII.multiply(factors, closed[:, held][..., rest])
     along = _solved(pushed, a)

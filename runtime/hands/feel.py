@@ -30,7 +30,7 @@ from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup
 from apc.eigen.rigid import find_rigid_modes
 from apc.finite_equations import finite_equations
-from apc.frame.devices import Device, find_device
+from apc.frame.devices import OWN_MASS, Device, find_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.parameters import resolve
@@ -394,7 +394,7 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
             device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=named)
             if not isinstance(device, Device):
                 what = device or f"{group.name} has no device"
-                hint = "--at with the part that is held, as user[1].device"
+                hint = f"--at with the part that is held, as {group.name}[1].device" if device else OWN_MASS
                 raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
             held[one] = device
         if device is None:

@@ -33,12 +33,11 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of
-from apc.eigen.relative import relative_coordinates
+from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.devices import Device, find_device
+from apc.frame.devices import OWN_MASS, Device, find_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
-from apc.frame.lift import lift
 from apc.frame.ports import Ports, with_holds, with_ports
 from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
@@ -116,13 +115,12 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
         device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
         if not isinstance(device, Device):
             what = f"{option}: {device or f'{group.name} has no device'}"
-            hint = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
-            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=OWN_MASS))
         felt = _felt_velocity(group, device)
         if felt:
             return felt
-        if why := _other_touch(group, device):
-            hint = "a coupler that acts by sample and hold, as SampledSpringDamper"
+        if touch := _other_touch(group, device):
+            why, hint = touch
             raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {why}", hint=hint))
         own, one = _ported(group, device)
         ported.append(own)
@@ -147,17 +145,20 @@ def _felt_velocity(group: PeerGroup, device: Device) -> str:
     return ""
 
 
-def _other_touch(group: PeerGroup, device: Device) -> str:
-    """Say what touches a device otherwise than by samples and held forces, "" if nothing does."""
+def _other_touch(group: PeerGroup, device: Device) -> tuple[str, str] | None:
+    """Say what touches a device otherwise than by samples and held forces, and what to write instead."""
     a, own = group.exact.a, [device.position, device.velocity]
     others = [place for place in range(len(a)) if place not in own]
     both = a[np.ix_(others, own)].astype(np.bool_) | a[np.ix_(own, others)].T.astype(np.bool_)
     if both.any():
         name = group.jacobians.kind.states[others[int(np.flatnonzero(both.any(axis=1))[0])]].name
-        return f"{device.part} and what {name} is of act on one another at every moment"
+        return (
+            f"{device.part} and what {name} is of act on one another at every moment",
+            "a coupler that acts by sample and hold, as SampledSpringDamper",
+        )
     if a[device.velocity, device.position] > 0 or a[device.velocity, device.velocity] > 0:
-        return f"a spring or damper of {device.part} to the ground is negative"
-    return ""
+        return f"a spring or damper of {device.part} to the ground is negative", "values of 0 or more"
+    return None
 
 
 def _ported(group: PeerGroup, device: Device) -> tuple[PeerGroup, Touched]:
@@ -173,14 +174,7 @@ def _ported(group: PeerGroup, device: Device) -> tuple[PeerGroup, Touched]:
         zeros = np.zeros(len(sites[-1].a), dtype=one.b.dtype)
         readings.append(np.concatenate([zeros, push, np.zeros(1, dtype=one.b.dtype)])[None])
     (site, exact_site), full, ports = with_ports(sites, schedule, 1, at, readings, at)
-    own = replace(
-        group,
-        jacobians=replace(group.jacobians, kind=site.kind),
-        site=site,
-        exact=exact_site,
-        schedule=full,
-        lifted=lift(site, full, exact=exact_site),
-    )
+    own = group.with_site(site, exact_site, full)
     ends = np.diff([*at, schedule.frame]).tolist()
     damping = -group.exact.a[device.velocity, device.velocity] / device.inverse
     return own, Touched(damping, tuple(end * schedule.quantum for end in ends), ports)
@@ -375,10 +369,8 @@ def _moving(whole: Matrix, at: _Wires, rigid: Floats) -> tuple[Matrix, Matrix, M
     a, placed, felt = (whole[:, rows[:, None], of] for rows, of in ((rest, rest), (rest, into), (out, rest)))
     if not rigid.size:
         return a, placed, felt
-    to = relative_coordinates(rigid)
-    weights = with_radius(to.weights, to.doubt)
-    both = np.concatenate([a, placed], axis=-1)
-    less = RADII.subtract(both[:, to.rest], RADII.multiply(weights, both[:, to.held]))
+    to = with_doubt(relative_coordinates(rigid))
+    less = relative_rows(np.concatenate([a, placed], axis=-1), to, RADII)
     return less[..., to.rest], less[..., len(rest) :], felt[..., to.rest]
 
 

@@ -18,7 +18,7 @@ s' = s + 2πjk/T, the ends cancel, and the motion at s' is (s' − A)⁻¹ (B û
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -114,14 +114,7 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     found = discretize(group.exact.a, group.exact.b, [one * full.quantum for one in durations])
     kicked = [_with_kicks(step, n_x) for step in found]
     lifted = named(site.kind, full, *bounded(site, full, dict(zip(durations, kicked, strict=True))))
-    own = replace(
-        group,
-        jacobians=replace(group.jacobians, kind=site.kind),
-        site=site,
-        exact=exact,
-        schedule=full,
-        lifted=lifted,
-    )
+    own = group.with_site(site, exact, full, lifted)
     charge = COEFFICIENT_ROUNDINGS * UNIT
     push = np.zeros((2, n_x))
     if device is not None:
