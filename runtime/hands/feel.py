@@ -259,12 +259,7 @@ def feel(
     prepared = prepared or prepare(system)
     verdict = judge(system, prepared=prepared)
     if verdict.stable is False and not unstable:
-        what = (
-            f"the scene is unstable (spectral radius {verdict.spectral_radius:.6g}): what a push makes of it "
-            "grows, and it has no response in time"
-        )
-        hint = "--unstable, for that of the map from force to motion"
-        raise ApcError(Mistake("E934", Place(system.origin.topology), what, hint=hint))
+        raise _unstable(system, verdict.spectral_radius)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         modes, exchange = _modes(system, prepared, port, other)
         responses = _Responses(modes, port.peer, other.peer)
@@ -284,11 +279,11 @@ def feel(
         f"{exchange.peer_name(one.peer)}.{device.part}"
         for one, device in ((port, modes.device), (other, modes.other))
     )
-    notes = () if verdict.stable is not False else ("of the map: the scene is unstable",)
-    if slow is None and not quick:
-        notes = (*notes, "of slow motions nothing is told: something of the scene is slower still")
-    if steady and not h2:
-        notes = (*notes, "what noise does is not told: the fastest clock has a phase")
+    notes = {
+        "of the map: the scene is unstable": verdict.stable is False,
+        "of slow motions nothing is told: something of the scene is slower still": not slow and not quick,
+        "what noise does is not told: the fastest clock has a phase": steady and not h2,
+    }
     return Feel(
         topology=system.name,
         at=here,
@@ -308,8 +303,17 @@ def feel(
         stable=verdict.stable,
         linearized=not linear,
         left_out=left_out(system, linear=linear),
-        notes=notes,
+        notes=tuple(note for note, applies in notes.items() if applies),
     )
+
+
+def _unstable(system: CompiledSystem, radius: float) -> ApcError:
+    what = (
+        f"the scene is unstable (spectral radius {radius:.6g}): what a push makes of it grows, and it has no "
+        "response in time"
+    )
+    hint = "--unstable, for that of the map from force to motion"
+    return ApcError(Mistake("E934", Place(system.origin.topology), what, hint=hint))
 
 
 def read_frequencies(
