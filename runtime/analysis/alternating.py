@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.opened import Matrix, OpenLoop
+from apc.analysis.opened import Matrix, OpenLoop, negated
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of
@@ -105,8 +105,7 @@ def _with_drift(loop: OpenLoop) -> _Loop:
     """Return a loop's matrices, with their radii, over ξ and what may drift."""
     n, drifts = loop.a.shape[-1], int(bool(loop.seen))
     follows = np.zeros((2, len(loop.ports), n + drifts))
-    follows[..., :n] = np.stack([-value_of(loop.c), radius_of(loop.c)])
-    again = np.stack([-value_of(loop.d), radius_of(loop.d)])
+    follows[..., :n], again = negated(loop.c), negated(loop.d)
     pushes, moves = loop.b, np.zeros((2, n + drifts, n + drifts))
     moves[:, :n, :n] = loop.a
     if drifts:

@@ -34,8 +34,8 @@ from apc.frame.parameters import resolve
 # Gains tried between 0 and 1 on the way from 1 down, and halvings of the cell where the radius crosses 1.
 CELLS, HALVINGS = 32, 50
 
-# A motion slower than this part of a turn a frame doesn't swing.
-STILL = 1e-6
+# How near 1 the magnitude of a mode is that is marginal.
+MARGINAL = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
             below = middle
     found = at(above)
     frequency = max(
-        (mode.frequency_hz for mode in found.modes if abs(mode.magnitude - 1) < STILL), default=0.0
+        (mode.frequency_hz for mode in found.modes if abs(mode.magnitude - 1) < MARGINAL), default=0.0
     )
     if not frequency:
         return f"no buzz: with contacts of {above:.6g} of their stiffness it drifts away without swinging"

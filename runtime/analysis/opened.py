@@ -1,7 +1,7 @@
 """A scene with its contacts cut open: from the forces of a frame's ticks to what each follows.
 
 Takes: a `CompiledSystem` whose peers have parts that switch.
-Gives: `contact_groups`, `with_gain`; `Opened`, `OpenLoop`, `open_loops`.
+Gives: `contact_groups`, `with_gain`; `Opened`, `OpenLoop`, `open_loops`; `negated`.
 Guarantees: every matrix comes with its radii; what may drift with all contacts open is taken out, exactly.
 The cost grows with the different peers, not with their number.
 Does not: judge anything (see `switching`).
@@ -33,11 +33,11 @@ from apc.eigen.closing import Feedback, Loop, StateLayout, close, close_loop, fe
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.peers import peer_groups
-from apc.eigen.relative import relative_coordinates
+from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT, discretize
 from apc.frame.exchange import build_exchange
-from apc.frame.lift import FrameMap, compose, lift, step_durations, with_roundings
+from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
 from apc.frame.parameters import resolve
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Heard, Sent, Tick, Value, Way
@@ -140,7 +140,7 @@ def with_gain(group: PeerGroup, pushes: Sequence[Push], gain: Fraction) -> PeerG
         The factor.
     """
     site, exact = (_pushing(one, pushes, gain) for one in (group.site, group.exact))
-    return replace(group, site=site, exact=exact, lifted=lift(site, group.schedule, exact=exact))
+    return group.with_site(site, exact, group.schedule)
 
 
 def _pushing(site: LinearSite, pushes: Sequence[Push], gain: Fraction) -> LinearSite:
@@ -250,18 +250,15 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     )
     n = len(layout.names)
     own = np.delete(np.arange(n), outside)
-    at = relative_coordinates(free.basis)
+    at = with_doubt(relative_coordinates(free.basis))
     rest, held = own[at.rest], own[at.held]
-    weights = with_radius(at.weights, at.doubt)
-    taken = closed[:, rest]
-    if len(held):
-        taken = RADII.subtract(taken, RADII.multiply(weights, closed[:, held]))
+    taken = relative_rows(closed[:, own], at, RADII)
     a, b = taken[..., rest], taken[..., n:]
     c, d = closed[:, outside][..., rest], closed[:, outside][..., n:]
     each = list(zip(loop.sites, opened, strict=True))
     ports = tuple((site.name, *tick) for site, one in each for tick in one.ticks)
     counts = np.array([float(site.count) for site, one in each for _ in one.ticks])
-    plain = OpenLoop(loop.name, a, b, _turned(c), _turned(d), ports, counts, (), np.zeros((2, 1, len(ports))))
+    plain = OpenLoop(loop.name, a, b, negated(c), negated(d), ports, counts, (), np.zeros((2, 1, len(ports))))
     if free.exact and not all(one.plain for one in opened):
         return "what a contact follows is more than positions, and something may drift with all contacts open"
     seen = _seen(opened, free.exact, layout, n, outside)
@@ -270,7 +267,7 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     # What y follows, over the coordinates held, is that of the first y that does times `seen`.
     first = next(place for place, one in enumerate(seen) if one)
     factors = RADII.add(
-        closed[:, outside[first : first + 1]][..., held], RADII.multiply(c[:, first : first + 1], weights)
+        closed[:, outside[first : first + 1]][..., held], RADII.multiply(c[:, first : first + 1], at.weights)
     )
     pushed = RADII.multiply(factors, closed[:, held][..., rest])
     along = _solved(pushed, a)
@@ -280,11 +277,11 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     column = np.array([[(float(one),) for one in share], [(UNIT * abs(float(one)),) for one in share]])
     moved = RADII.add(RADII.multiply(factors, closed[:, held][..., n:]), RADII.multiply(along, b))
     return replace(
-        plain, c=_turned(RADII.subtract(c, RADII.multiply(column, along))), seen=tuple(share), moved=moved
+        plain, c=negated(RADII.subtract(c, RADII.multiply(column, along))), seen=tuple(share), moved=moved
     )
 
 
-def _turned(matrix: Matrix) -> Matrix:
+def negated(matrix: Matrix) -> Matrix:
     """Return a matrix with its radii times −1."""
     return with_radius(-value_of(matrix), radius_of(matrix))
 
@@ -318,13 +315,7 @@ def _seen(
     rows = []
     for offset, one in zip(layout.offsets, opened, strict=True):
         start = place_of[offset] if one.states else 0
-        rows += [
-            [
-                sum((s * x for s, x in zip(slopes, motion[start:], strict=False)), Fraction(0))
-                for motion in motions
-            ]
-            for slopes in one.slopes
-        ]
+        rows += [[_along(slopes, motion[start:]) for motion in motions] for slopes in one.slopes]
     first = next((row for row in rows if any(row)), None)
     if first is None:
         return ()

@@ -86,11 +86,11 @@ def analyze_command(
     """
     start_single_threaded()
     from apc.answer import answer
-    from apc.frame.devices import HANDS, published
+    from apc.frame.devices import HANDS, PASSIVE, published
     from apc.inputs import open_scene
 
     system = open_scene(file, settings, hands=hands)
-    if hands == "passive":
+    if hands == PASSIVE:
         asked = {"--method": method != AUTO, "--box": bool(box), "--conventions": every_convention}
         asked["--buzz"] = with_buzz
         _judge_passive(system, [name for name, given in asked.items() if given], as_json=as_json)
@@ -119,7 +119,8 @@ def _judge_passive(system: CompiledSystem, asked: list[str], *, as_json: bool) -
     """Say whether a scene is stable with any passive hands; refuse what is asked for besides."""
     from apc.hands.passivity import passive_hands
 
-    for option in asked:
-        what = f"{option} and --hands passive don't go together: what hands can draw has no modes of its own"
+    if asked:
+        options = " and ".join((*asked, "--hands passive"))
+        what = f"{options} don't go together: what hands can draw has no modes of its own"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
     print_result(passive_hands(system), as_json=as_json)

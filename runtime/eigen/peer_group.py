@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -115,6 +115,29 @@ class PeerGroup:
             return Fraction(1)
         listed = self.gains[way.edge, way.channel]
         return listed[0] if len(listed) == 1 else listed[sender.place]
+
+    def with_site(
+        self, site: LinearSite, exact: LinearSite, schedule: Schedule, lifted: LiftedSite | None = None
+    ) -> PeerGroup:
+        """Return the same peers with other equations and events in a frame.
+
+        Parameters
+        ----------
+        site, exact
+            The equations in floats and in rationals.
+        schedule
+            What happens in a frame.
+        lifted
+            Their map over a frame; without it, that of `lift`.
+        """
+        return replace(
+            self,
+            jacobians=replace(self.jacobians, kind=site.kind),
+            site=site,
+            exact=exact,
+            schedule=schedule,
+            lifted=lifted or lift(site, schedule, exact=exact),
+        )
 
 
 def build_group(

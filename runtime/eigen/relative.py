@@ -1,8 +1,8 @@
 """Rigid motions taken out of a matrix: the map of relative coordinates, in floats, at many points, in balls.
 
 Takes: rigid motions V, and matrices M whose invariant space they span.
-Gives: `Relative`, `relative_coordinates`; `relative`, `relative_bounded`; `relative_places`,
-`independent_places`.
+Gives: `Relative`, `relative_coordinates`, `with_doubt`; `relative`, `relative_rows`, `relative_bounded`;
+`relative_places`, `independent_places`.
 Guarantees: the bounds hold for all matrices within their errors, V itself rounded once.
 Does not: find the motions (see `rigid`).
 
@@ -54,10 +54,22 @@ def relative(matrix: Matrix, at: Relative, numbers: Arithmetic = FLOATS) -> Matr
     return numbers.subtract(within, numbers.multiply(at.weights, matrix[..., at.held[:, None], at.rest]))
 
 
+def relative_rows(matrix: Matrix, at: Relative, numbers: Arithmetic = FLOATS) -> Matrix:
+    """Return M_r − W M_p of the rows of matrices (…, n, m) of some kind of number: what moves x_r − W x_p."""
+    within = matrix[..., at.rest, :]
+    if not len(at.held):
+        return within
+    return numbers.subtract(within, numbers.multiply(at.weights, matrix[..., at.held, :]))
+
+
+def with_doubt(at: Relative) -> Relative:
+    """Return coordinates whose weights W come with their radii."""
+    return replace(at, weights=with_radius(at.weights, at.doubt))
+
+
 def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matrix, Floats]:
     """Return M_rr − W M_pr of matrices (…, n, n) known up to an error, and a bound on what that is off by."""
-    doubtful = replace(at, weights=with_radius(at.weights, at.doubt))
-    found = relative(with_radius(matrix, error), doubtful, RADII)
+    found = relative(with_radius(matrix, error), with_doubt(at), RADII)
     return value_of(found), radius_of(found)
 
 

@@ -2,7 +2,7 @@
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
 Gives: `Device`, `find_device`, `devices_of`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`;
-`published`.
+`published`; `OWN_MASS`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 # How hands can be taken: as the scene has them, holding devices fast, or as a mass, damper and spring each;
 # and as all that give back no more energy than they got, which changes no scene.
 FREE, CLAMPED, HELD, PASSIVE = HANDS = ("free", "clamped", "held", "passive")
+
+# What a peer without a device lacks.
+OWN_MASS = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
 
 # What the parameters of a hand that is put on every device are named after, and what each is.
 HAND = "hand"
@@ -190,8 +193,7 @@ def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands
             one
             or f"{group.name} has no {part or 'device: every mass of it is a copy that others are told of'}"
         )
-        hint = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
-        raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {why}", hint=hint))
+        raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {why}", hint=OWN_MASS))
     return found
 
 

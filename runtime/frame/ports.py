@@ -83,7 +83,7 @@ def with_ports(
     sites
         The site, its last holds the ways in; their clock is `INPUTS`.
     schedule
-        What happened in a frame.
+        What happens in a frame.
     inputs
         How many ways in there are.
     drawn_at

@@ -30,12 +30,12 @@ from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup
 from apc.eigen.rigid import find_rigid_modes
 from apc.finite_equations import finite_equations
-from apc.frame.devices import Device, find_device
+from apc.frame.devices import OWN_MASS, Device, find_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.parameters import resolve
 from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
-from apc.hands.response import Carried, Pushed, open_site, pushed_loop, spectra
+from apc.hands.response import Carried, Pushed, add, open_site, pushed_loop, spectra
 from apc.network.nominal import left_out
 from apc.option_value import option_value
 from apc.result import Result
@@ -204,15 +204,15 @@ def find_port(system: CompiledSystem, text: str, option: str) -> Port:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Modes:
-    """A scene as modes of which any device may be pushed: `common` first, then each class apart.
+    """A scene as modes of which any device may be pushed: that of all classes first, then each class apart.
 
-    `class_of` gives the site of `common` that a peer is in; `bases` are the modes' rigid motions; `device` is
-    what is pushed, `other` what else is looked at.
+    `bases` are the modes' rigid motions. A class is a site of the first: `apart` gives its own mode,
+    `members` how many peers it stands for, `class_of` the class of a peer. `device` is what is pushed,
+    `other` what else is looked at.
     """
 
     loops: tuple[Pushed, ...]
     bases: tuple[Floats, ...]
-    common: int
     apart: dict[int, int]
     class_of: dict[int, int]
     members: tuple[int, ...]
@@ -262,12 +262,7 @@ def feel(
     prepared = prepared or prepare(system)
     verdict = judge(system, prepared=prepared)
     if verdict.stable is False and not unstable:
-        what = (
-            f"the scene is unstable (spectral radius {verdict.spectral_radius:.6g}): what a push makes of it "
-            "grows, and it has no response in time"
-        )
-        hint = "--unstable, for that of the map from force to motion"
-        raise ApcError(Mistake("E934", Place(system.origin.topology), what, hint=hint))
+        raise _unstable(system, verdict.spectral_radius)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         modes, exchange = _modes(system, prepared, port, other)
         responses = _Responses(modes, port.peer, other.peer)
@@ -287,11 +282,11 @@ def feel(
         f"{exchange.peer_name(one.peer)}.{device.part}"
         for one, device in ((port, modes.device), (other, modes.other))
     )
-    notes = () if verdict.stable is not False else ("of the map: the scene is unstable",)
-    if slow is None and not quick:
-        notes = (*notes, "of slow motions nothing is told: something of the scene is slower still")
-    if steady and not h2:
-        notes = (*notes, "what noise does is not told: the fastest clock has a phase")
+    notes = {
+        "of the map: the scene is unstable": verdict.stable is False,
+        "of slow motions nothing is told: something of the scene is slower still": not slow and not quick,
+        "what noise does is not told: the fastest clock has a phase": steady and not h2,
+    }
     return Feel(
         topology=system.name,
         at=here,
@@ -311,8 +306,17 @@ def feel(
         stable=verdict.stable,
         linearized=not linear,
         left_out=left_out(system, linear=linear),
-        notes=notes,
+        notes=tuple(note for note, applies in notes.items() if applies),
     )
+
+
+def _unstable(system: CompiledSystem, radius: float) -> ApcError:
+    what = (
+        f"the scene is unstable (spectral radius {radius:.6g}): what a push makes of it grows, and it has no "
+        "response in time"
+    )
+    hint = "--unstable, for that of the map from force to motion"
+    return ApcError(Mistake("E934", Place(system.origin.topology), what, hint=hint))
 
 
 def read_frequencies(
@@ -354,9 +358,15 @@ def read_frequencies(
 
 def fastest(system: CompiledSystem) -> float:
     """Return the rate of the fastest clock in Hz."""
+    return float(1 / _fastest_clock(system)[0])
+
+
+def _fastest_clock(system: CompiledSystem) -> tuple[Fraction, Fraction]:
+    """Return the period and phase of the fastest clock that anything uses, in seconds."""
     timings = resolve(system).timings
     used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
-    return float(1 / min(timings[clock.period] for clock in system.clocks if clock.name in used))
+    clock = min((one for one in system.clocks if one.name in used), key=lambda one: timings[one.period])
+    return timings[clock.period], timings[clock.phase]
 
 
 def _next(system: CompiledSystem, port: Port) -> int:
@@ -391,7 +401,7 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
             device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=named)
             if not isinstance(device, Device):
                 what = device or f"{group.name} has no device"
-                hint = "--at with the part that is held, as user[1].device"
+                hint = f"--at with the part that is held, as {group.name}[1].device" if device else OWN_MASS
                 raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
             held[one] = device
         if device is None:
@@ -426,7 +436,7 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
             if loop.sites[0].name == alike.name:
                 apart[place] = number
     bases = tuple(find_rigid_modes(loop).basis for loop in plain)
-    return _Modes(loops, bases, 0, apart, class_of, counts, held[port], held[other]), exchange
+    return _Modes(loops, bases, apart, class_of, counts, held[port], held[other]), exchange
 
 
 def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
@@ -464,14 +474,13 @@ class _Responses:
         self.peer, self.across = peer, other
         self.own, self.to = modes.class_of[peer], modes.class_of[other]
         self.device, self.other = modes.device, modes.other
-        common = modes.loops[modes.common]
-        self.copies = [_copy(site.group) for site in common.sites]
+        self.copies = [_copy(site.group) for site in modes.loops[0].sites]
         named = self.copies[self.own]
         self.copy = named[0] if named else ""
 
     def at(self, s: Complex, aliases: Sequence[int] = (0,)) -> list[Carried]:
         """Return the velocity here at each alias, the velocity there, and the copy's error (k,)."""
-        common = self.modes.loops[self.modes.common]
+        common = self.modes.loops[0]
         n = self.modes.members[self.own]
         copies = [(place, one[1], 0) for place, one in enumerate(self.copies) if one]
         here, there, own = self.device.velocity, self.other.velocity, self.copies[self.own]
@@ -486,10 +495,10 @@ class _Responses:
             rows = [(0, here, alias) for alias in aliases]
             rows += ([(0, there, 0)] if self.own == self.to else []) + ([(0, own[1], 0)] if own else [])
             apart = spectra(loop, 0, rows, s)
-            velocity = [_plus(a, _scaled(b, 1 - 1 / n)) for a, b in zip(velocity, apart, strict=False)]
+            velocity = [add(a, _scaled(b, 1 - 1 / n)) for a, b in zip(velocity, apart, strict=False)]
             if self.own == self.to:
                 share = 1 - 1 / n if self.peer == self.across else -1 / n
-                across = _plus(across, _scaled(apart[len(aliases)], share))
+                across = add(across, _scaled(apart[len(aliases)], share))
         error = self._error(parts, apart[-1] if own and n > 1 else None, len(s))
         return [*velocity, across, error]
 
@@ -560,11 +569,11 @@ class _Responses:
             return nothing
         found = parts[self.own]
         for place, many in others.items():
-            found = _plus(found, _scaled(parts[place], -many / total))
+            found = add(found, _scaled(parts[place], -many / total))
         if apart is not None:
             # One peer less the mean of its class moves by 1 − 1/n here, and by −1/n at each of the others.
             n = self.modes.members[self.own]
-            found = _plus(found, _scaled(apart, (1 - 1 / n) * (1 + 1 / total)))
+            found = add(found, _scaled(apart, (1 - 1 / n) * (1 + 1 / total)))
         return found
 
     def slow(self) -> Slow | None:
@@ -610,25 +619,20 @@ def _copy(group: PeerGroup) -> tuple[str, int] | None:
 
 
 def _scaled(one: Carried, share: float) -> Carried:
-    return one[0] * share, one[1] * abs(share) + 2.0**-52 * np.abs(one[0] * share)
-
-
-def _plus(one: Carried, other: Carried) -> Carried:
-    value = one[0] + other[0]
-    return value, one[1] + other[1] + 2.0**-52 * np.abs(value)
+    return one[0] * share, one[1] * abs(share) + 2 * UNIT * np.abs(one[0] * share)
 
 
 def _extremes(modes: _Modes, responses: _Responses) -> tuple[Extremes, ...]:
     """Return the H∞ norms of the modes that the pushed peer is in."""
     found = []
-    for number in (modes.common, modes.apart.get(responses.own)):
+    for number in (0, modes.apart.get(responses.own)):
         if number is None:
             continue
         loop, basis = modes.loops[number], modes.bases[number]
-        site = responses.own if number == modes.common else 0
+        site = 0 if number else responses.own
         rows = [("velocity", responses.device.velocity)]
         copy = responses.copies[responses.own]
-        if number != modes.common and copy is not None:
+        if number and copy is not None:
             rows.append(("error", copy[1]))
         for name, row in rows:
             peaks = (one(loop, site, site, row, basis) for one in (tick_peak, sampled_data_peak))
@@ -656,7 +660,7 @@ def _variance(
     if weights is None:
         return None
     total = 0.0
-    loop, basis = modes.loops[modes.common], modes.bases[modes.common]
+    loop, basis = modes.loops[0], modes.bases[0]
     held = [place for place, site in enumerate(loop.sites) if site.device is not None]
     if weights.common:
         sources = {place: 1 / modes.members[place] for place in held}
@@ -678,9 +682,7 @@ def _variance(
 
 def _ticks(system: CompiledSystem, frame: float) -> list[Fraction] | None:
     """Return when in a frame the fastest clock ticks, None where a frame does not begin with a tick."""
-    timings = resolve(system).timings
-    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
-    clock = min((one for one in system.clocks if one.name in used), key=lambda one: timings[one.period])
-    if timings[clock.phase] % timings[clock.period]:
+    period, phase = _fastest_clock(system)
+    if phase % period:
         return None
-    return [number * timings[clock.period] for number in range(round(frame / float(timings[clock.period])))]
+    return [number * period for number in range(round(frame / float(period)))]

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.dissipation import peak_gain
-from apc.eigen.relative import relative, relative_coordinates
+from apc.eigen.relative import relative, relative_coordinates, relative_rows
 from apc.frame.discretize import exponential_rows
 from apc.frame.radius import value_of
-from apc.hands.response import Pushed, Site
+from apc.hands.response import Pushed, Site, force_lanes
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
@@ -113,11 +113,7 @@ def _with_nodes(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, nod
 def _lanes(site: Site, seconds: float, count: int) -> Floats:
     """Return γ_i (n_x, count) of an interval, σ^i/i! in units of it."""
     n = len(site.states)
-    generator = np.zeros((1, n + count, n + count))
-    generator[0, :n, :n] = value_of(site.a) * seconds
-    generator[0, :n, n] = site.push[0] * seconds
-    generator[0, range(n, n + count - 1), range(n + 1, n + count)] = 1.0
-    return np.asarray(exponential_rows(generator, np.zeros((1, n + count, 0)), 1.0).matrix[0, :n, n:])
+    return np.asarray(force_lanes(site, seconds, count).matrix[0, :n, n:])
 
 
 def _within(site: Site, seconds: float, at: Floats, row: int, forces: Floats) -> tuple[Floats, Floats]:
@@ -138,12 +134,19 @@ def _peak(loop: Pushed, inputs: Floats, outputs: Floats, through: Floats, basis:
     m, k, c, d = map(value_of, (loop.m, loop.k, loop.c, loop.d))
     b, c_y = k @ inputs, outputs @ c
     at = relative_coordinates(basis)
-    if basis.size and np.abs(c_y @ basis).max() > UNSEEN * np.abs(c_y).max() * np.abs(basis).max():
+    if _shows(basis, c_y):
         return Peak(np.inf, 0.0, 0.0)
     gain, angle = peak_gain(
-        relative(m, at), b[at.rest] - at.weights @ b[at.held], c_y[:, at.rest], outputs @ d @ inputs + through
+        relative(m, at), relative_rows(b, at), c_y[:, at.rest], outputs @ d @ inputs + through
     )
     return Peak(gain, 1e-12 * gain, angle / (2 * np.pi * float(loop.frame)))
+
+
+def _shows(basis: Floats, outputs: Floats) -> bool:
+    """Say whether outputs over states (m, n) see any of the rigid motions (n, d)."""
+    if not basis.size:
+        return False
+    return bool(np.abs(outputs @ basis).max() > UNSEEN * np.abs(outputs).max() * np.abs(basis).max())
 
 
 def noise_variance(
@@ -198,9 +201,9 @@ def noise_variance(
             read[line, loop.reads[site][place_of[tick], state]] += weight
     at = relative_coordinates(basis)
     b, seen = k @ inputs, read @ c
-    if basis.size and np.abs(seen @ basis).max() > UNSEEN * np.abs(seen).max() * np.abs(basis).max():
+    if _shows(basis, seen):
         return None
-    root = b[at.rest] - at.weights @ b[at.held]
+    root = relative_rows(b, at)
     linalg = load_pool("scipy.linalg")
     with warnings.catch_warnings():
         warnings.simplefilter("error", linalg.LinAlgWarning)

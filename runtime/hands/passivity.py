@@ -223,7 +223,7 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     for width in WIDTHS:
         shift = least - width * scale
         less = RADII.subtract(loop.weight, RADII.exact(shift * np.eye(len(loop.weight[0]))))
-        if proves_positive(*matrices, less, spared=[part * width for part in SPARED]):
+        if proves_positive(*matrices, less, spared=[share * width for share in SPARED]):
             low = shift
             break
     else:

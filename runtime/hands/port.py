@@ -33,12 +33,11 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of
-from apc.eigen.relative import relative_coordinates
+from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.devices import Device, find_device
+from apc.frame.devices import OWN_MASS, Device, find_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
-from apc.frame.lift import lift
 from apc.frame.ports import Ports, with_holds, with_ports
 from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
@@ -116,19 +115,18 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
         device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
         if not isinstance(device, Device):
             what = f"{option}: {device or f'{group.name} has no device'}"
-            hint = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
-            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=OWN_MASS))
         felt = _felt_velocity(group, device)
         if felt:
             return felt
-        if why := _other_touch(group, device):
-            hint = "a coupler that acts by sample and hold, as SampledSpringDamper"
+        if touch := _other_touch(group, device):
+            why, hint = touch
             raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {why}", hint=hint))
         own, one = _ported(group, device)
         ported.append(own)
         touched[id(own.schedule)] = one
-    loops, weights = _loops(system, ported, exchange)
-    return tuple(_port_loop(system, loop, touched, weighted=weights) for loop in loops)
+    loops, weighted = _loops(system, ported, exchange, option=option)
+    return tuple(_port_loop(system, loop, touched, weighted=weighted, option=option) for loop in loops)
 
 
 def _felt_velocity(group: PeerGroup, device: Device) -> str:
@@ -147,17 +145,20 @@ def _felt_velocity(group: PeerGroup, device: Device) -> str:
     return ""
 
 
-def _other_touch(group: PeerGroup, device: Device) -> str:
-    """Say what touches a device otherwise than by samples and held forces, "" if nothing does."""
+def _other_touch(group: PeerGroup, device: Device) -> tuple[str, str] | None:
+    """Say what touches a device otherwise than by samples and held forces, and what to write instead."""
     a, own = group.exact.a, [device.position, device.velocity]
     others = [place for place in range(len(a)) if place not in own]
     both = a[np.ix_(others, own)].astype(np.bool_) | a[np.ix_(own, others)].T.astype(np.bool_)
     if both.any():
         name = group.jacobians.kind.states[others[int(np.flatnonzero(both.any(axis=1))[0])]].name
-        return f"{device.part} and what {name} is of act on one another at every moment"
+        return (
+            f"{device.part} and what {name} is of act on one another at every moment",
+            "a coupler that acts by sample and hold, as SampledSpringDamper",
+        )
     if a[device.velocity, device.position] > 0 or a[device.velocity, device.velocity] > 0:
-        return f"a spring or damper of {device.part} to the ground is negative"
-    return ""
+        return f"a spring or damper of {device.part} to the ground is negative", "values of 0 or more"
+    return None
 
 
 def _ported(group: PeerGroup, device: Device) -> tuple[PeerGroup, Touched]:
@@ -173,14 +174,7 @@ def _ported(group: PeerGroup, device: Device) -> tuple[PeerGroup, Touched]:
         zeros = np.zeros(len(sites[-1].a), dtype=one.b.dtype)
         readings.append(np.concatenate([zeros, push, np.zeros(1, dtype=one.b.dtype)])[None])
     (site, exact_site), full, ports = with_ports(sites, schedule, 1, at, readings, at)
-    own = replace(
-        group,
-        jacobians=replace(group.jacobians, kind=site.kind),
-        site=site,
-        exact=exact_site,
-        schedule=full,
-        lifted=lift(site, full, exact=exact_site),
-    )
+    own = group.with_site(site, exact_site, full)
     ends = np.diff([*at, schedule.frame]).tolist()
     damping = -group.exact.a[device.velocity, device.velocity] / device.inverse
     return own, Touched(damping, tuple(end * schedule.quantum for end in ends), ports)
@@ -226,7 +220,7 @@ def _driven(site: LinearSite, device: Device) -> LinearSite:
 
 
 def _loops(
-    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, option: str
 ) -> tuple[tuple[Loop, ...], bool]:
     """Return loops that share no energy, and whether a site of them stands for as many peers as it counts."""
     used = {one.way.link for group in groups for one in group.schedule.heard}
@@ -238,7 +232,7 @@ def _loops(
     if states > MOST_STATES:
         what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and intervals"
         hint = f"equal peers on complete graphs or rings, or {MOST_STATES:,} in all"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
     return (dense_loop(groups, exchange),), False
 
 
@@ -278,7 +272,7 @@ def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched]) -> _Wire
 
 
 def _port_loop(
-    system: CompiledSystem, loop: Loop, touched: dict[int, Touched], *, weighted: bool
+    system: CompiledSystem, loop: Loop, touched: dict[int, Touched], *, weighted: bool, option: str
 ) -> PortLoop:
     """Return the map of a loop whose devices are moved from outside."""
     sites = [touched[id(group.schedule)] for group in loop.sites]
@@ -286,7 +280,7 @@ def _port_loop(
     if (intervals := sum(len(one.seconds) for one in sites)) > MOST_INTERVALS:
         what = f"devices that differ are sampled and pushed over {intervals:,} intervals of a frame"
         hint = f"fewer peers that differ: {MOST_INTERVALS:,} intervals at most"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
     closed = close_loop(loop)
     at = _wires(closed.offsets, len(closed.matrix), sites)
     whole, exact = with_radius(closed.matrix, closed.error), RADII.exact
@@ -301,7 +295,7 @@ def _port_loop(
     if aside is None:
         what = "with its devices clamped the scene has a motion that nothing holds back"
         hint = "couplers that hold each object to a device"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"--hands passive: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
     # A device is where it was as the frame began, and the intervals before have moved it since.
     at_once = whole[:, at.out[:, None], at.into]
     forces = RADII.add(RADII.multiply(felt, aside), RADII.multiply(at_once, of))
@@ -375,10 +369,8 @@ def _moving(whole: Matrix, at: _Wires, rigid: Floats) -> tuple[Matrix, Matrix, M
     a, placed, felt = (whole[:, rows[:, None], of] for rows, of in ((rest, rest), (rest, into), (out, rest)))
     if not rigid.size:
         return a, placed, felt
-    to = relative_coordinates(rigid)
-    weights = with_radius(to.weights, to.doubt)
-    both = np.concatenate([a, placed], axis=-1)
-    less = RADII.subtract(both[:, to.rest], RADII.multiply(weights, both[:, to.held]))
+    to = with_doubt(relative_coordinates(rigid))
+    less = relative_rows(np.concatenate([a, placed], axis=-1), to, RADII)
     return less[..., to.rest], less[..., len(rest) :], felt[..., to.rest]
 
 

@@ -1,7 +1,7 @@
 """What moves when a hand pushes: the steady motion under a force e^{st}, of each mode of a scene.
 
 Takes: peers with a device each, as loops.
-Gives: `Pushed`, `pushed_loops`; `Spectra`, `spectra`.
+Gives: `Site`, `open_site`; `Pushed`, `pushed_loop`; `spectra`; `Carried`, `add`; `force_lanes`.
 Guarantees: no sampling of the force or of the motion: every tick, hold and packet acts when it does, and what
 comes back at s and at s + 2πjk/T, T a frame, is exact but for rounding, which is bounded.
 Does not: put modes together to peers (see `feel`).
@@ -18,7 +18,7 @@ s' = s + 2πjk/T, the ends cancel, and the motion at s' is (s' − A)⁻¹ (B û
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -114,14 +114,7 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     found = discretize(group.exact.a, group.exact.b, [one * full.quantum for one in durations])
     kicked = [_with_kicks(step, n_x) for step in found]
     lifted = named(site.kind, full, *bounded(site, full, dict(zip(durations, kicked, strict=True))))
-    own = replace(
-        group,
-        jacobians=replace(group.jacobians, kind=site.kind),
-        site=site,
-        exact=exact,
-        schedule=full,
-        lifted=lifted,
-    )
+    own = group.with_site(site, exact, full, lifted)
     charge = COEFFICIENT_ROUNDINGS * UNIT
     push = np.zeros((2, n_x))
     if device is not None:
@@ -226,7 +219,7 @@ def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s
         places = loop.kicks[pushed][place, :-1]
         kicks[:, places], doubt[:, places] = _times(of_length[seconds], _exponential(s, start))
     state = _steady(loop.m, _exponential(s, loop.frame), _product((kicks, doubt), loop.k))
-    read = _add(_product(state, loop.c), _product((kicks, doubt), loop.d))
+    read = add(_product(state, loop.c), _product((kicks, doubt), loop.d))
     motions = {
         (of, alias): _motion(loop, of, read, s, alias, pushed=of == pushed)
         for of, alias in {(of, alias) for of, _, alias in wanted}
@@ -284,20 +277,36 @@ def _kick(site: Site, seconds: Fraction, s: Complex) -> Carried:
     while term > SERIES or terms < size:
         term *= size / terms
         terms += 1
-    n = len(value_of(site.a))
-    # A lane that starts at σ^i/i! feeds the push: x' = A x + b ω₀, ω_i' = ω_{i+1}, all in units of τ.
-    generator = np.zeros((1, n + terms, n + terms))
-    generator[0, :n, :n] = value_of(site.a) * time
-    generator[0, :n, n] = site.push[0] * time
-    generator[0, range(n, n + terms - 1), range(n + 1, n + terms)] = 1.0
-    step = exponential_rows(generator, np.zeros((1, n + terms, 0)), 1.0)
+    n, step = len(site.states), force_lanes(site, time, terms)
     lanes, off = step.matrix[0, :n, n:], step.roundings * UNIT * step.size[0, :n, n:]
     powers = (s * time)[:, None] ** np.arange(terms)
     magnitudes = np.abs(powers)
     value = powers @ lanes.T
     bound = magnitudes @ (off + (3 * np.arange(terms) + terms + 4) * UNIT * np.abs(lanes)).T
-    left = term * np.exp(size) * np.abs(lanes[:, 0]) * (1 + np.abs(generator[0, :n, :n]).sum())
+    left = term * np.exp(size) * np.abs(lanes[:, 0]) * (1 + np.abs(value_of(site.a) * time).sum())
     return value, bound + left
+
+
+def force_lanes(site: Site, seconds: float, count: int) -> Step:
+    """Return what forces σ^i/i!, σ from 0 to 1 over an interval, make of the states as it ends.
+
+    Parameters
+    ----------
+    site, seconds
+        The peer, and how long the interval is.
+    count
+        How many: γ_i is column n_x + i of the first n_x rows, i < count.
+
+    Notes
+    -----
+    A lane that starts at σ^i/i! feeds the push: x' = A x + b ω₀, ω_i' = ω_{i+1}, the interval being 1.
+    """
+    n = len(site.states)
+    generator = np.zeros((1, n + count, n + count))
+    generator[0, :n, :n] = value_of(site.a) * seconds
+    generator[0, :n, n] = site.push[0] * seconds
+    generator[0, range(n, n + count - 1), range(n + 1, n + count)] = 1.0
+    return exponential_rows(generator, np.zeros((1, n + count, 0)), 1.0)
 
 
 def _times(one: Carried, other: Carried) -> Carried:
@@ -310,7 +319,8 @@ def _times(one: Carried, other: Carried) -> Carried:
     return value, off_a * (np.abs(b) + off_b) + np.abs(a) * off_b + 4 * UNIT * np.abs(value)
 
 
-def _add(one: Carried, other: Carried) -> Carried:
+def add(one: Carried, other: Carried) -> Carried:
+    """Return a sum, entry by entry."""
     value = one[0] + other[0]
     return value, one[1] + other[1] + 2 * UNIT * np.abs(value)
 

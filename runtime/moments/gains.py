@@ -56,7 +56,6 @@ CLOSE, ROUGH = 1e-14, 1e-6
 # How near it is enclosed at first, relatively, and how much farther at last.
 FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
 
-
 # Covariances of luck times cubes of the means' states: as much takes some ten seconds.
 MOST_WORK = 20_000_000
 

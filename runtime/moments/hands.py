@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.devices import Device, find_device
-from apc.frame.lift import lift
 from apc.frame.ports import with_holds, with_ports
 from apc.frame.site import LinearSite
 from apc.moments.crowd import Hearing, instants
@@ -134,14 +133,7 @@ def _pushed(
     at = [int(time / schedule.quantum) for time in ticks] if device is not None else []
     taken = int(start / schedule.quantum)
     (site, exact), full, ports = with_ports(sites, schedule, 1, at, readings, [taken])
-    own = replace(
-        group,
-        jacobians=replace(group.jacobians, kind=site.kind),
-        site=site,
-        exact=exact,
-        schedule=full,
-        lifted=lift(site, full, exact=exact),
-    )
+    own = group.with_site(site, exact, full)
     drawn = ports.drawn.ravel().tolist()
     return own, Peer(
         drawn=range(drawn[0], drawn[-1] + 1) if drawn else range(0),

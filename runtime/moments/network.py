@@ -138,7 +138,7 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
         Whether bounds are asked for; without them, they may be the radius itself.
     """
     lossy = unreliable(system)
-    why = _unserved(system, prepared, lossy)
+    why = _unserved(system, lossy)
     if why:
         return Growth(np.nan, 0.0, np.inf, False, why)
     if any(law.trace is not None for _, law in lossy):
@@ -228,7 +228,7 @@ def _channels(link: Link, peers: int) -> int:
     return peers * (peers - 1) if link.graph.shape == "complete" else len(arcs(link.graph, peers)[0])
 
 
-def _unserved(system: CompiledSystem, prepared: Prepared, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
+def _unserved(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
     """Return what of the scene can't be judged, "" if all can."""
     if any(law.trace is not None for _, law in lossy):
         if not all(law.trace is not None for _, law in lossy):

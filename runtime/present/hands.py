@@ -245,7 +245,8 @@ def feel_picture(found: Feel, kind: str = "bode") -> Any:
     phase.semilogx(found.frequency_hz, np.degrees(np.angle(found.impedance)), color="#000000")
     phase.set_ylabel("phase of the impedance (°)")
     phase.set_xlabel("frequency (Hz)")
-    phase.set_yticks(range(-90, 91, 45)) if np.abs(np.angle(found.impedance)).max() <= np.pi / 2 else None
+    if np.abs(np.angle(found.impedance)).max() <= np.pi / 2:
+        phase.set_yticks(range(-90, 91, 45))
     size.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
     return figure
 

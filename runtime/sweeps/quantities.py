@@ -1,7 +1,7 @@
 """What a sweep can compute at each of its points.
 
 Takes: a `CompiledSystem` and a name such as `analyze` or `critical:coordination.stiffness`.
-Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`; `by_criterion`.
+Gives: `Quantity`, `QUANTITIES`, `find_quantity`, `faulty`; `BEGINNINGS`, `by_criterion`.
 Guarantees: what all points share is prepared once; a row does not depend on the parts computed before; a
 point that can't be computed is a row that says why; a number that isn't finite is left out of a row.
 Does not: choose points, or hold results.

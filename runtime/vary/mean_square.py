@@ -1,8 +1,8 @@
 """The values of one parameter at which one number passes 1: in mean square, or with passive hands.
 
 Takes: a `CompiledSystem` and the name of a parameter, or of what its links lose.
-Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`; `search_mean_square`; `first_lost`,
-`FirstLost`; `growth_at`, `allowed`; `MeanSquareEvaluator`.
+Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `search_mean_square`;
+`first_lost`, `FirstLost`, `BOUNDED`; `growth_at`, `allowed`; `MeanSquareEvaluator`.
 Guarantees: on either side of a crossing, by its error, bounds on the growth of second moments decide, or on
 what hands can draw, which counts as a growth (see `passivity.passive_growth`).
 Does not: find two crossings between neighbouring samples; follow a delay, whose pieces are the nominal
@@ -40,6 +40,15 @@ MEAN_SQUARE, NOMINAL, PASSIVE = "mean-square", "nominal", "passive"
 
 # The criteria of one number, and how a verdict is by each.
 BY_GROWTH = {MEAN_SQUARE: "in mean square", PASSIVE: "with passive hands"}
+
+# What a crossing rests on.
+BOUNDED = {
+    MEAN_SQUARE: "second moments bounded on either side",
+    PASSIVE: "what hands can draw bounded on either side",
+}
+ESTIMATED = "an estimate: bounds leave either side open"
+ITERATED = "second moments by iteration in floats, not proved"
+TAGGED = "an estimate, not proved: of second moments that are themselves estimates"
 
 # Values looked at between 0 and 1 of a probability.
 SHARES = 33
@@ -394,12 +403,3 @@ def _samples(
         count = max(math.ceil(SAMPLES * math.log10(top / bottom)), SAMPLES)
         return [float(one) for one in np.geomspace(bottom, top, count + 1)]
     return [float(one) for one in np.linspace(bottom, top, 6 * SAMPLES + 1)]
-
-
-BOUNDED = {
-    MEAN_SQUARE: "second moments bounded on either side",
-    PASSIVE: "what hands can draw bounded on either side",
-}
-ESTIMATED = "an estimate: bounds leave either side open"
-ITERATED = "second moments by iteration in floats, not proved"
-TAGGED = "an estimate, not proved: of second moments that are themselves estimates"
