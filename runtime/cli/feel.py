@@ -68,7 +68,7 @@ def feel_command(
     """Say what a hand feels at its device, and what of it arrives at another.
 
     The impedance (force by velocity, in N*s/m) at each frequency, all other
-    hands free; mass, damping and stiffness of slow motions; the velocity at
+    hands as the scene has them; mass, damping and stiffness of slow motions; the velocity at
     another device and how far the copies of the object are apart, a newton;
     the largest gains at any frequency; what noise does. FILE is a topology
     or a compiled model.

@@ -103,7 +103,7 @@ class Noise:
 
     `error_m` of a copy less the mean of the others', `velocity_m_s` of a device: for forces of 1 N rms at
     hands, or samples of positions off by 1 m rms (a sensor of steps q is off by q/√12). None in a scene that
-    drifts for it.
+    drifts for it. By a Lyapunov equation in floats, without a bound.
     """
 
     source: str

@@ -183,8 +183,11 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
                 for loop in loops
             ]
             scale = max(float(one) for loop in loops for one in loop.dampings) or 1.0
-    needed = [scale - min(one[place] for one in found) for place in range(3)]
-    logs = [1.0 if np.isinf(one) else (one - scale) / (abs(one) + scale) for one in needed]
+    spare, least, most = (min(one[place] for one in found) for place in range(3))
+    if bounded and np.isposinf(most) and analyze(clamped(system, option=OPTION)).stable is False:
+        most = -np.inf  # floats alone said so
+    needed = [scale - one for one in (spare, least, most)]
+    logs = [np.sign(one) if np.isinf(one) else (one - scale) / (abs(one) + scale) for one in needed]
     radius, high, low = (float(np.exp(2 * one)) for one in logs)
     return Growth(radius, low, high, exact=True, proved=True)
 
@@ -270,9 +273,9 @@ def _draws(loop: PortLoop, angle: float) -> float:
     response = c @ np.linalg.solve(z * np.eye(n) - a, b + 0j) + d
     direction = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0]
     turned = np.zeros((2, 2 * n, 2 * n))
-    near = 8 * UNIT
     turned[0] = np.block([[cosine * np.eye(n), -sine * np.eye(n)], [sine * np.eye(n), cosine * np.eye(n)]])
-    turned[1] = near * np.abs(turned[0])
+    # Sine and cosine are quotients of sums about 1: off by roundings of 1, however small they are themselves.
+    turned[1] = 8 * UNIT * np.kron(np.ones((2, 2)), np.eye(n))
     twice = np.zeros((2, 2 * n, 2 * n))
     twice[:, :n, :n] = twice[:, n:, n:] = loop.a
     v = RADII.exact(np.concatenate([direction.real, direction.imag])[:, None])

@@ -102,8 +102,10 @@ def _mode(one: PassiveMode) -> tuple[str, ...]:
         needed = "none is enough"
     elif one.needed is None:
         needed = f"{one.more:+.6g} N*s/m"
+    elif one.error is None or not np.isfinite(one.error):
+        needed = f"about {one.needed:.2g} N*s/m"
     else:
-        needed = f"{known_digits(one.needed, one.error or 0.0, DIGITS)} N*s/m"
+        needed = f"{known_digits(one.needed, one.error, DIGITS)} N*s/m"
     at = "" if one.frequency_hz is None else f"{one.frequency_hz:.5g} Hz"
     stiffness = (
         "" if one.stiffness is None else f"{abs(one.stiffness) if abs(one.stiffness) > 1e-6 else 0:.5g} N/m"
@@ -129,7 +131,7 @@ def feel_text(found: Feel) -> str:
     slow = found.low_frequency
     if slow is not None:
         lines += [
-            "  Of slow motions, the other hands free:",
+            "  Of slow motions, the other hands as the scene has them:",
             f"  mass             {measured(slow.mass, slow.errors[0], 'kg')}",
             f"  damping          {measured(slow.damping, slow.errors[1], 'N*s/m')}",
             f"  stiffness        {measured(slow.stiffness, slow.errors[2], 'N/m')}",

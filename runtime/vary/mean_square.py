@@ -83,7 +83,7 @@ def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied
         E898 no such criterion.
     """
     if asked not in (None, MEAN_SQUARE, NOMINAL, PASSIVE):
-        what = f"{str(asked)[:40]} is no criterion ({MEAN_SQUARE}, {NOMINAL})"
+        what = f"{str(asked)[:40]} is no criterion ({MEAN_SQUARE}, {NOMINAL}, {PASSIVE})"
         raise ApcError(Mistake("E898", place, what, hint=f"--in {MEAN_SQUARE}"))
     by_chance = unreliable(system) or any(one.name in channel_numbers(system) for one in varied)
     return asked or (MEAN_SQUARE if by_chance else NOMINAL)
