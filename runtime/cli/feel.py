@@ -42,7 +42,7 @@ from apc.threads import start_single_threaded
 )
 @click.option("--to", "high", metavar='"F Hz"', help="The highest; 60 Hz, or half the fastest clock.")
 @click.option(
-    "--points", type=WholeNumber(2, 1_000_000), default=200, show_default=True, help="How many between."
+    "--points", type=WholeNumber(2, 1_000_000), default=1000, show_default=True, help="How many between."
 )
 @click.option("--frequencies", metavar='"F Hz, …"', help='These instead: "1 Hz, 5 Hz".')
 @click.option(

@@ -218,11 +218,18 @@ def feel_picture(found: Feel, kind: str = "bode") -> Any:
         ax.plot(found.impedance.real, found.impedance.imag, color="#000000")
         ax.axvline(0.0, color="#999999", linewidth=0.6)
         ax.axhline(0.0, color="#999999", linewidth=0.6)
+        ax.set_aspect("equal", adjustable="datalim")
         ax.set_xlabel("real part of the impedance (N·s/m)")
         ax.set_ylabel("imaginary part (N·s/m)")
         for place in (0, len(found.frequency_hz) - 1):
             at = found.impedance[place]
-            ax.annotate(f"{found.frequency_hz[place]:.3g} Hz", (at.real, at.imag), fontsize=8)
+            ax.annotate(
+                f"{found.frequency_hz[place]:.3g} Hz",
+                (at.real, at.imag),
+                (5, 5),
+                textcoords="offset points",
+                fontsize=8,
+            )
         ax.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
         return figure
     figure = figures.Figure(figsize=(5.2, 5.2), layout="constrained")
