@@ -184,7 +184,12 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
             ]
             scale = max(float(one) for loop in loops for one in loop.dampings) or 1.0
     spare, least, most = (min(one[place] for one in found) for place in range(3))
-    if bounded and np.isposinf(most) and analyze(clamped(system, option=OPTION)).stable is False:
+    if (
+        bounded
+        and np.isneginf(spare)
+        and not np.isneginf(most)
+        and analyze(clamped(system, option=OPTION)).stable is False
+    ):
         most = -np.inf  # floats alone said so
     needed = [scale - one for one in (spare, least, most)]
     logs = [np.sign(one) if np.isinf(one) else (one - scale) / (abs(one) + scale) for one in needed]
