@@ -20,6 +20,7 @@ equations                   connections: where connectors meet; flatten
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
 compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others
+crowd                       how many peers there are, and how many each hears
 store                       the compiled model on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another

@@ -1,7 +1,7 @@
 """The compiled model: CasADi functions of one site per kind, and the exchange between sites as structure.
 
 Takes: nothing (these are the data types the stage `functions` fills and the runtime reads).
-Gives: `CompiledSystem` and its parts; `PEERS`, `count_of`, `counts_peers`.
+Gives: `CompiledSystem` and its parts; `PEERS`, `count_of`, `group_count`, `counts_peers`.
 Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
 Does not: evaluate anything, or read or write files (see `store`).
 
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 PEERS = "peers"  # the parameter that holds the number of peers
 LARGEST_COUNT = 10**9  # of peers in one group
 MOST_GROUPS = 1000  # of a scene: who hears whom is worked out for each two of them
+MOST_PLACED = 10**6  # peers of a scene on a graph that isn't complete: each has a place in several arrays
 COUNT = "count("  # how those begin that hold how many peers are heard over a link, see `count_of`
 
 
@@ -35,9 +36,14 @@ def count_of(link: str) -> str:
     return f"{COUNT}{link})"
 
 
+def group_count(group: str) -> str:
+    """Return the name of the parameter that holds how many peers a group has; no part can have it."""
+    return f"{group}.count"
+
+
 def counts_peers(parameter: str) -> bool:
-    """Say whether a parameter is a number of peers: it follows from who is there and can't be set."""
-    return parameter == PEERS or parameter.startswith(COUNT)
+    """Say whether a parameter is a number of peers: of a group, or what follows from those of groups."""
+    return parameter == PEERS or parameter.startswith(COUNT) or parameter.endswith(".count")
 
 
 @dataclass(frozen=True, slots=True)

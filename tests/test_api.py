@@ -91,7 +91,8 @@ def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
         ),
         (
             {"peers": "4"},
-            "override: E623 peers is the number of peers: change a count and compile again.",
+            "override: E623 peers is the number of all peers, which follows from the groups'. "
+            "Write: user.count",
         ),
         ({"haptic.period": "0 s"}, "override: E625 haptic.period wants a time above 0 s, got 0.0 s."),
     ],

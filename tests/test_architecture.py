@@ -16,7 +16,7 @@ from tests.topologies import AVERAGE, ROOT
 
 # Folder by folder, and in each its modules, earliest first: each may import only those before it.
 HOUSE = (
-    ("apc.compiler", "errors digits timings files words multiples weights plain compiled formula seal cache"),
+    ("apc.compiler", "errors digits timings files words multiples weights plain compiled crowd formula seal cache"),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
         "apc.compiler.language",
@@ -89,7 +89,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator leading many bends marginal
-        delays lags search mean_square critical margins sensitivity over_network
+        delays lags search counts mean_square critical margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),

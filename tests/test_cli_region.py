@@ -142,7 +142,7 @@ def test_the_drawn_outline_encloses_the_stable_area() -> None:
         ),
         (["--x", "contact.stiffness=5 N/m:1 N/m"], "wants its lower end first"),
         (["--x", "contact.stiffness=1 kg:5 kg"], "E204 contact.stiffness wants N/m"),
-        (["--x", "peers=2:5"], "E882 peers is a number of peers, which can't vary"),
+        (["--x", "peers=2:5"], "E623 peers is the number of all peers"),
         (["--x", Y, "--y", Y], "E902 coordination.stiffness is on both axes"),
         (
             ["--out", "region.bmp"],

@@ -98,9 +98,10 @@ E616 runtime: a file to write is one that is read, or written already
 E617 runtime: two topologies would be compiled to one file
 E621 runtime/frame: a setting is not NAME=VALUE
 E622 runtime/frame: a scene has no such parameter
-E623 runtime/frame: the number of peers can't be set
+E623 runtime/frame: the number of all peers follows from those of the groups; there it doesn't vary
 E624 runtime/frame runtime/sweeps: a set value is out of its parameter's bounds
 E625 runtime/frame runtime/sweeps: a set time is out of its bounds
+E626 compiler: a number of peers can't be
 E701 compiler/language: a table can't be read
 E702 compiler/language compiler/scene: a table's headings or columns are not those due
 E703 compiler/language: a cell or row of a table is wrong
@@ -143,7 +144,6 @@ E878 runtime: a file's suffix is none of a command's formats
 E879 runtime/present: the file of a run can't be written, or not to its end
 E880 runtime/cli: --over is not PATH=VALUES
 E881 runtime/sweeps runtime/vary: values to sweep are written wrong
-E882 runtime/sweeps: the number of peers can't be swept
 E883 runtime/cli runtime/sweeps runtime/vary: a sweep has nothing, too much or the same thing twice
 E884 runtime/sweeps: a sweep can't compute what is asked of it
 E885 runtime/sweeps: other work stands where a sweep keeps its parts

@@ -231,7 +231,7 @@ def test_no_crossing_is_an_answer_in_words() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["peers"], "E623 peers is the number of peers"),
+        (["peers"], "E623 peers is the number of all peers"),
         (["contact.stifness"], "E622 contact.stifness is no parameter"),
         (["haptic.period"], "E844 haptic.period sets the rhythm of a clock"),
         (["haptic.phase"], "E844 haptic.phase sets the rhythm of a clock"),

@@ -134,14 +134,12 @@ FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
         (
             "peers",
             "2:10",
-            "sweep: E882 peers is a number of peers, which can't vary: it is compiled in. "
-            "Write: one topology a number of peers",
+            "sweep: E623 peers is the number of all peers, which follows from the groups'. Write: user.count",
         ),
         (
             "user.count",
-            "2:10",
-            "sweep: E882 user.count is a number of peers, which can't vary: it is compiled in. "
-            "Write: one topology a number of peers",
+            "2.5:10",
+            "sweep: E881 the range of user.count wants whole numbers, got 2.5 to 10.",
         ),
         (
             "device.mass",

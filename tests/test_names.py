@@ -37,7 +37,7 @@ def test_a_misspelt_name_gets_the_nearest_real_one_and_the_number_of_peers_is_no
         ApcError, match=r"E622 contact.stifness is no parameter of paper. Write: contact.stiff"
     ):
         find(paper(), "contact.stifness")
-    with pytest.raises(ApcError, match="E623 peers is the number of peers"):
+    with pytest.raises(ApcError, match="E623 peers is a number of peers"):
         find(paper(), "peers")
 
 

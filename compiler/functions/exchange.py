@@ -12,9 +12,6 @@ from dataclasses import replace
 from fractions import Fraction
 from graphlib import TopologicalSorter
 
-import numpy as np
-from numpy.typing import NDArray
-
 from apc.compiler.compiled import (
     PEERS,
     Channel,
@@ -29,8 +26,10 @@ from apc.compiler.compiled import (
     Parameter,
     Timing,
     count_of,
+    group_count,
 )
 from apc.compiler.components.component import Number as NumberParameter
+from apc.compiler.crowd import COUNT_ABOUT, heard_sums, with_heard
 from apc.compiler.equations.clocks import HoldCrossing
 from apc.compiler.equations.flatten import FlatKind
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
@@ -40,11 +39,9 @@ from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
 from apc.compiler.scene.channels import SceneChannel
 from apc.compiler.scene.links import SceneLink
-from apc.compiler.scene.scene import Scene, SceneGroup
-from apc.compiler.weights import Sums, sum_weights
+from apc.compiler.scene.scene import Scene
 
 NO_DELAY = "no delay"
-COUNT_ABOUT = "peers heard over the link, counted with their weights"
 LOSS_ABOUT = (
     "probability that a good link turns bad after a packet",
     "probability that a bad link turns good after a packet",
@@ -210,10 +207,7 @@ def used_clocks(
 def compiled_groups(
     scene: Scene, kinds: Sequence[Kind], kind_of: Mapping[str, int], links: Sequence[Link], timings: Timings
 ) -> tuple[Group, ...]:
-    """Return the groups: a setting that is a timing follows that timing.
-
-    How many peers each peer hears over a link, `count(LINK)`, is a parameter of its group, or a column where
-    it differs from peer to peer.
+    """Return the groups, with how many peers each hears: a setting that is a timing follows that timing.
 
     Parameters
     ----------
@@ -232,69 +226,27 @@ def compiled_groups(
         E215 a graph some of whose peers send nothing.
     """
     exact = {timing.name for timing in timings.found}
-    sums = {link.name: _heard(scene, link) for link in links if link.graph.shape == "arcs"}
     found = []
-    start = 0
     for group in scene.groups:
         values = []
         for name, value in group.values:
             timing = (group.name, *name.split("."))
             own = replace(value, expression=Name(timing)) if ".".join(timing) in exact else value
             values.append(compiled_parameter(scene, name, own))
-        columns = [Column(name, numbers) for name, numbers in group.columns]
-        kind = kinds[kind_of[group.name]]
-        for link in links:
-            name = count_of(link.name)
-            if name not in kind.parameters:
-                continue
-            counts = _counts(scene, kinds, kind_of, link, group, start, sums.get(link.name))
-            if isinstance(counts, Fraction):
-                values.append(Parameter(name, "1", float(counts), about=COUNT_ABOUT, exact=counts))
-            else:
-                columns.append(Column(name, counts))
-        found.append(Group(group.name, group.count, kind_of[group.name], tuple(values), tuple(columns)))
-        start += group.count
-    return tuple(found)
-
-
-def _counts(
-    scene: Scene,
-    kinds: Sequence[Kind],
-    kind_of: Mapping[str, int],
-    link: Link,
-    group: SceneGroup,
-    start: int,
-    sums: Sums | None,
-) -> Fraction | NDArray[np.float64]:
-    """Return the summed weights of what each peer of a group hears: one number if they are all alike."""
-    sends = {
-        one.name: any(sending.link == link.name for sending in kinds[kind_of[one.name]].sends)
-        for one in scene.groups
-    }
-    if link.graph.shape == "complete":
-        total = sum(one.count for one in scene.groups if sends[one.name])
-        return Fraction(total - sends[group.name])
-    silent = [name for name, does in sends.items() if not does]
-    if silent:
-        place = next(part.place for part in scene.links if part.name == link.name)
-        what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
-        raise ApcError(Mistake("E215", place, what))
-    if link.graph.shape == "ring":
-        return Fraction(min(2, scene.peers - 1))
-    if link.graph.shape == "star":
-        if start or scene.peers == 2:
-            return Fraction(1)
-        counts = np.ones(group.count)
-        counts[0] = scene.peers - 1
-        return counts if group.count > 1 else Fraction(scene.peers - 1)
-    end = start + group.count
-    assert sums is not None, link.graph.shape
-    return sums.of(start) if sums.alike(start, end) else sums.floats[start:end]
-
-
-def _heard(scene: Scene, link: Link) -> Sums:
-    """Return what every peer of the scene hears in all over a link of arcs."""
-    return sum_weights(link.graph.arcs[:, 1], link.graph.weights, scene.peers)
+        columns = tuple(Column(name, numbers) for name, numbers in group.columns)
+        found.append(Group(group.name, group.count, kind_of[group.name], tuple(values), columns))
+    for link in links:
+        silent = [
+            group.name
+            for group in found
+            if not any(sending.link == link.name for sending in kinds[group.kind].sends)
+        ]
+        counted = any(count_of(link.name) in kind.parameters for kind in kinds)
+        if silent and counted and link.graph.shape != "complete":
+            place = next(part.place for part in scene.links if part.name == link.name)
+            what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
+            raise ApcError(Mistake("E215", place, what))
+    return with_heard(found, kinds, links)
 
 
 def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
@@ -308,7 +260,7 @@ def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
     rounded = []
     for link in links:
         if count_of(link.name) in kind.parameters and link.graph.shape == "arcs":
-            sums = _heard(scene, link)
+            sums = heard_sums(link, scene.peers)
             values = {sums.of(peer) for peer in range(scene.peers)} if sums.rounded else set()
             if len(set(map(float, values))) < len(values):
                 place = next(part.place for part in scene.links if part.name == link.name)
@@ -396,6 +348,12 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
                 )
                 for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
             }
+    for group in scene.groups:
+        name = group_count(group.name)
+        formula = _formula(None if group.counted is None else group.counted.expression)
+        exact = Fraction(group.count)
+        about = f"number of peers of group {group.name}"
+        found[name] = Parameter(name, "1", float(exact), formula, minimum=1.0, about=about, exact=exact)
     found[PEERS] = Parameter(PEERS, "1", float(scene.peers), about="number of peers")
     return tuple(found.values())
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apc.compiler.compiled import Graph
+from apc.compiler.compiled import MOST_PLACED, Graph
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.tables import NamedFiles, Table, read_table
 from apc.compiler.language.values import Value
@@ -30,8 +30,6 @@ from apc.compiler.source.reading import (
     whole_number,
 )
 
-# On a graph that isn't complete each peer has a place of its own in several arrays: gigabytes for more.
-MOST_PLACED = 1_000_000
 SHAPES = ("complete", "ring", "star")
 _PEER = re.compile(r"(?P<group>[A-Za-z]\w*)\[(?P<number>\d{1,10})\]\Z", re.ASCII)
 

@@ -11,6 +11,7 @@ columns computes what depends on them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass, replace
@@ -29,7 +30,7 @@ from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import PEERS, Value
 from apc.compiler.scene.instances import Part
 from apc.compiler.source.nodes import Mapping as MappingNode
-from apc.compiler.source.nodes import Node, Sequence
+from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import (
     add_unknown,
     brief,
@@ -42,18 +43,24 @@ from apc.compiler.source.reading import (
     whole_number,
 )
 
+# How a count begins that is no number, word of YAML or quantity: with a name, or a parenthesis before one.
+_IN_NAMES = re.compile(
+    r"\(*\s*(?!(true|false|null)\Z)[A-Za-z]\w*|[0-9]+\s*[-+*/]\s*\(*\s*[A-Za-z]\w*", re.ASCII
+)
+
 # By whole name, one number a peer, in SI.
 Columns = tuple[tuple[str, NDArray[np.float64]], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class GroupBody:
-    """A group before its settings are read."""
+    """A group before its settings are read; `counted` is its count where that follows from named numbers."""
 
     name: str
     count: int
     body: MappingNode
     table: Table | None
+    counted: Value | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +72,9 @@ class Settings:
     columns: Columns
 
 
-def read_counts(node: Node | None, files: NamedFiles) -> dict[str, GroupBody]:
+def read_counts(
+    node: Node | None, files: NamedFiles, read_named: Callable[[Node], Value | None]
+) -> dict[str, GroupBody]:
     """Read how many peers each group has.
 
     A group says `count`, or has a `table` with a row a peer, or lists in `set` with a value a peer.
@@ -76,6 +85,8 @@ def read_counts(node: Node | None, files: NamedFiles) -> dict[str, GroupBody]:
         The section `peers`.
     files
         Reads its tables, and takes what is at fault.
+    read_named
+        Reads a count that names numbers; None if it is at fault, which was reported.
     """
     mistakes = files.mistakes
     found: dict[str, GroupBody] = {}
@@ -95,9 +106,14 @@ def read_counts(node: Node | None, files: NamedFiles) -> dict[str, GroupBody]:
             continue
         body = check_keys(body, ("count", "set", "table"), f"group {name}", mistakes)
         table = _read_table(body.get("table"), files)
-        count = _read_count(body, name, table, mistakes)
+        node = body.get("count")
+        if isinstance(node, Scalar) and node.plain and _IN_NAMES.match(node.text):
+            counted = read_named(node)
+            count = None if counted is None else _counted(counted, node, name, table, mistakes)
+        else:
+            counted, count = None, _read_count(body, name, table, mistakes)
         if count is not None:
-            found[name] = GroupBody(name, count, body, table)
+            found[name] = GroupBody(name, count, body, table, counted)
     return found
 
 
@@ -124,7 +140,20 @@ def _read_count(body: MappingNode, name: str, table: Table | None, mistakes: Mis
         if body.get("table") is None:
             mistakes.add("E201", body.place, f"group {name} has no count", hint="count: 3")
         return None
-    count = whole_number(node)
+    return _allowed_count(whole_number(node), node, form(node), name, table, mistakes)
+
+
+def _counted(counted: Value, node: Node, name: str, table: Table | None, mistakes: Mistakes) -> int | None:
+    """Return the count that an expression over named numbers comes to."""
+    number = counted.number
+    got = f"{form(node)}, which is {float(number):.12g}"
+    whole = int(number) if number.denominator == 1 else None
+    return _allowed_count(whole, node, got, name, table, mistakes)
+
+
+def _allowed_count(
+    count: int | None, node: Node, got: str, name: str, table: Table | None, mistakes: Mistakes
+) -> int | None:
     if count is not None and 1 <= count <= LARGEST_COUNT:
         if table is not None and table.rows != count:
             what = f"group {name} has a count of {count} and a table of {table.rows} rows"
@@ -132,7 +161,7 @@ def _read_count(body: MappingNode, name: str, table: Table | None, mistakes: Mis
             return None
         return count
     expected = f"a whole number from 1 to {LARGEST_COUNT}"
-    mistakes.add("E208", node.place, "count", expected=expected, got=form(node), hint="count: 3")
+    mistakes.add("E208", node.place, "count", expected=expected, got=got, hint="count: 3")
     return None
 
 

@@ -1,7 +1,7 @@
 """The named numbers of a topology, and reading numbers that may be expressions over them.
 
 Takes: the section `parameters` and the number of peers.
-Gives: `NamedNumbers`, `read_named_numbers`; `read_new_name`.
+Gives: `NamedNumbers`, `read_named_numbers`, `read_count_by_names`; `read_new_name`.
 Guarantees: a number read has the dimension it must have; what depends on a name whose fault was reported adds
 no message of its own.
 Does not: know what a number is for, but for the bounds of a component's parameter.
@@ -10,12 +10,13 @@ Does not: know what a number is for, but for the bounds of a component's paramet
 from __future__ import annotations
 
 from collections.abc import Collection, Container, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.components.component import RESERVED, Component, Number, Option, Settable
 from apc.compiler.errors import ApcError, Mistakes
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
+from apc.compiler.language.expression import names
 from apc.compiler.language.values import (
     PEERS,
     AlreadyReportedError,
@@ -56,6 +57,36 @@ def read_named_numbers(node: Node | None, peers: int, mistakes: Mistakes) -> Nam
             faulty.add(key.text)
     values, unresolved = resolve_in_order(waiting, peers, mistakes)
     return NamedNumbers(values, frozenset(faulty | unresolved), peers, mistakes)
+
+
+def read_count_by_names(node: Node, parameters: Node | None, mistakes: Mistakes) -> Value | None:
+    """Read how many peers a group has from named numbers, before it is known how many there are in all.
+
+    Parameters
+    ----------
+    node
+        The count, an expression.
+    parameters
+        The section `parameters`, whose own mistakes are told when it is read for good.
+    mistakes
+        Takes E206 what the count names that isn't there, E208 what follows from the number of peers.
+    """
+    numbers = read_named_numbers(parameters, 1, Mistakes())
+    found = replace(numbers, mistakes=mistakes).read(node, "count", DIMENSIONLESS, "1")
+    waiting = [] if found is None or found.expression is None else list(names(found.expression))
+    seen = set()
+    while waiting:
+        name = waiting.pop()
+        if name.parts == PEERS:
+            shown = brief(node.text) if isinstance(node, Scalar) else "count"
+            what = f"{shown} depends on peers, which it is a part of"
+            mistakes.add("E208", node.place, what, hint="count: 3")
+            return None
+        own = numbers.values[".".join(name.parts)].expression
+        if own is not None and name.parts not in seen:
+            seen.add(name.parts)
+            waiting += names(own)
+    return found
 
 
 @dataclass(frozen=True, slots=True)

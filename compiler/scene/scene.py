@@ -27,7 +27,7 @@ from apc.compiler.scene.channels import PROBABILITY
 from apc.compiler.scene.groups import Columns, GroupBody, read_counts, read_settings, with_followers
 from apc.compiler.scene.instances import Part, PartReader, settable_names
 from apc.compiler.scene.links import SceneLink, read_link
-from apc.compiler.scene.named_numbers import NamedNumbers, read_named_numbers
+from apc.compiler.scene.named_numbers import NamedNumbers, read_count_by_names, read_named_numbers
 from apc.compiler.scene.sections import SECTIONS, PartSections
 from apc.compiler.scene.studies import read_experiment, read_region
 from apc.compiler.scene.timebase import SceneClock, read_clocks
@@ -58,7 +58,8 @@ class SceneGroup:
     """`count` peers.
 
     `values` are the group's own settings by whole name (`contact.stiffness`) and what follows from them
-    inside parts, `words` its own options and clocks, `columns` settings that differ from peer to peer.
+    inside parts, `words` its own options and clocks, `columns` settings that differ from peer to peer,
+    `counted` its count where that follows from named numbers.
     """
 
     name: str
@@ -67,6 +68,7 @@ class SceneGroup:
     words: tuple[tuple[str, str], ...]
     columns: Columns
     place: Place
+    counted: Value | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,9 +158,10 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     about = visible(read_text(root.get("about"), "about", mistakes) or "")
     peers = _required(root, "peers", "{user: {count: 3}}", mistakes)
     _required(root, "masses", "{device: {mass: 0.1 kg}}", mistakes)
-    bodies = read_counts(peers, files)
+    named = root.get("parameters")
+    bodies = read_counts(peers, files, lambda node: read_count_by_names(node, named, mistakes))
     counts = {name: group.count for name, group in bodies.items()}
-    numbers = read_named_numbers(root.get("parameters"), sum(counts.values()), mistakes)
+    numbers = read_named_numbers(named, sum(counts.values()), mistakes)
     clocks = read_clocks(root.get("clocks"), numbers, {*numbers.values, *counts}, mistakes)
     sections = PartSections(root, library, {*numbers.values, *counts, *clocks}, mistakes)
     reader = PartReader(sections.entries, sections.scope(numbers, clocks), numbers, counts, files)
@@ -234,6 +237,9 @@ def _read_groups(
         settings = read_settings(group, own, clocks, numbers.read_for, explained, numbers.mistakes)
         settings = with_followers(settings, parts, numbers.values, numbers.peers, place, numbers.mistakes)
         found.append(
-            SceneGroup(group.name, group.count, settings.values, settings.words, settings.columns, place)
+            SceneGroup(
+                *(group.name, group.count, settings.values, settings.words, settings.columns, place),
+                counted=group.counted,
+            )
         )
     return tuple(found)

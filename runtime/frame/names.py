@@ -11,7 +11,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.compiled import PEERS, CompiledSystem, Parameter, Timing, counts_peers
+from apc.compiler.compiled import (
+    COUNT,
+    PEERS,
+    CompiledSystem,
+    Parameter,
+    Timing,
+    counts_peers,
+    group_count,
+)
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 
 # The sections of a topology, which a name may start with.
@@ -48,8 +56,15 @@ class Range:
     high: Fraction
 
 
-def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> Free:
+def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: bool = False) -> Free:
     """Return the parameter or timing a person's name means, of the group it names, if any.
+
+    Parameters
+    ----------
+    system, name, place
+        The compiled scene, the name, and where it was given.
+    counts
+        Whether it may be the number of peers of a group, `user.count`.
 
     Raises
     ------
@@ -58,6 +73,9 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> Free:
     """
     times = {timing.name for timing in named_times(system)}
     known = {parameter.name for parameter in system.parameters if is_named(parameter.name)} | times
+    sizes = [group_count(group.name) for group in system.groups]
+    if counts:
+        known |= set(sizes)
     groups = {group.name for group in system.groups}
     written = name[:80].strip() or "an empty name"
     first, _, rest = name.partition(".")
@@ -70,12 +88,15 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE) -> Free:
     if group is not None and name in times:
         what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
         raise ApcError(Mistake("E622", place, what, hint=name))
-    if counts_peers(name):
-        what = "the number of peers: change a count"
-        if name != PEERS:
-            what = "how many peers are heard, by their weights: change a count or the link's graph"
-        message = f"{written} is {what} and compile again"
-        raise ApcError(Mistake("E623", place, message))
+    if name == PEERS or (name in sizes and not counts):
+        hint = f"apc critical {sizes[0]}"
+        what = f"{written} is a number of peers, which doesn't vary here"
+        if counts:
+            what, hint = f"{written} is the number of all peers, which follows from the groups'", sizes[0]
+        raise ApcError(Mistake("E623", place, what, hint=hint))
+    if name.startswith(COUNT):
+        what = f"{written} is how many peers are heard: it follows from {sizes[0]} and the graph"
+        raise ApcError(Mistake("E623", place, what))
     if name not in known:
         near = nearest(name, sorted(known))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))

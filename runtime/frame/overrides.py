@@ -5,7 +5,7 @@ Gives: `Override`, `parse_override`, `apply`.
 Guarantees: what depends on a changed parameter by a formula changes with it, in exact rationals; the rest
 keeps the very numbers it was compiled with. Every value out of what its component allows is told, all
 together; of a parameter that differs from peer to peer, the first peer's.
-Does not: change what was compiled as structure (which parts there are, how many peers).
+Does not: change what was compiled as structure (which parts there are).
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from apc.compiler.compiled import CompiledSystem, Group, Parameter, Timing
+from apc.compiler.compiled import CompiledSystem, Group, Parameter, Timing, group_count
+from apc.compiler.crowd import peers_of, recounted
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.formula import exact_value
 from apc.compiler.words import with_unit
@@ -41,8 +42,8 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
     Raises
     ------
     ApcError
-        E621 not of that form, E622 no such parameter, E623 the number of peers is not a parameter to set;
-        and those of `units.quantity`: the unit has to fit.
+        E621 not of that form, E622 no such parameter, E623 the number of all peers, which follows from those
+        of groups; and those of `units.quantity`: the unit has to fit.
     """
     # Imported here: the language of quantities, which an analysis without overrides never needs.
     from apc.compiler.language.units import quantity
@@ -52,7 +53,7 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
     if not (equals and name and value):
         form = "contact.stiffness=800 N/m"
         raise ApcError(Mistake("E621", place, "an override", "NAME=VALUE", text[:80], form))
-    free = find(system, name, place)
+    free = find(system, name, place, counts=True)
     unit = unit_of(system, free.name)
     found = quantity(
         value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
@@ -66,12 +67,15 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
     Raises
     ------
     ApcError
-        E622 a group's own value for what a time of all groups depends on, E624 a value beyond the
-        parameter's bounds, E625 a time that can't be.
+        E622 a group's own value for what a time of all groups or a count depends on, E624 a value beyond the
+        parameter's bounds, E625 a time that can't be, E626 a number of peers that can't be.
     """
     if not overrides:
         return system
     everywhere = {one.free.name: one.value for one in overrides if one.free.group is None}
+    counts = _counts(system, everywhere)
+    if counts:
+        everywhere |= peers_of(counts)
     timings = {timing.name for timing in system.timings}
     parameters = {parameter.name: parameter for parameter in system.parameters}
     common = _changed(scope_of(system), everywhere)
@@ -109,8 +113,22 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         timings=tuple(_renewed(one, common, everywhere) for one in system.timings),
         groups=tuple(groups),
     )
+    if counts:
+        found = recounted(found, counts, OVERRIDE)
     _check_bounds(found)
     return found
+
+
+def _counts(system: CompiledSystem, everywhere: Mapping[str, Fraction]) -> dict[str, Fraction]:
+    """Return how many peers each group has with what is given, nothing if that changes none of them."""
+    now = {group.name: Fraction(group.count) for group in system.groups}
+    wanted = {group_count(name) for name in now}
+    scope = scope_of(system)
+    if scope.needed(wanted).isdisjoint(everywhere):
+        return {}
+    changed = scope.follow(everywhere, exact_value, lambda name: scope.holder[name].number, wanted)
+    found = {name: changed.get(group_count(name), count) for name, count in now.items()}
+    return found if found != now else {}
 
 
 def _changed(scope: Scope, given: Mapping[str, Fraction]) -> dict[str, Fraction]:
@@ -141,9 +159,11 @@ def _check_times(
         The group, its own numbers, and what it sets.
     """
     changed = _changed(scope_of(system, [*values, *system.timings]), own)
-    for timing in system.timings:
-        if timing.name in changed:
-            what = f"{timing.name} is one time for all groups, and depends on what is set for {group}"
+    shared = {timing.name: "one time for all groups" for timing in system.timings}
+    shared |= {group_count(one.name): "one number of the scene" for one in system.groups}
+    for name, meant in shared.items():
+        if name in changed:
+            what = f"{name} is {meant}, and depends on what is set for {group}"
             hint = "the same without the group, or a group with a set of its own"
             raise ApcError(Mistake("E622", OVERRIDE, what, hint=hint))
 

@@ -51,9 +51,14 @@ def critical_text(found: Critical) -> str:
         lines += note(text)
     lines.append("")
     if found.value is None:
-        lines += wrapped(found.verdict, "  ", "  ")
+        verdict = (
+            found.verdict.replace("value scanned", "number looked at") if found.counted else found.verdict
+        )
+        lines += wrapped(verdict, "  ", "  ")
     if not found.enters:
         return "\n".join(lines)
+    if found.counted:
+        return "\n".join([*lines, *_count_lines(found)])
     for one in found.crossings:
         mark = "→" if one.value == found.value else " "
         exact = f"{with_unit(f'{one.value:.15g}', found.unit)}, exact"
@@ -76,6 +81,31 @@ def critical_text(found: Critical) -> str:
     if not found.whole:
         lines.append("  an eigenvalue keeps near to the boundary: more crossings could hide")
     return "\n".join(lines)
+
+
+def _count_lines(found: Critical) -> list[str]:
+    """Return which numbers of peers are stable, and how many were looked at."""
+    first, last = (int(one) for one in found.scanned)
+    ends = [math.floor(one.boundary) for one in found.crossings]
+    stretches = list(zip([first, *(one + 1 for one in ends)], [*ends, last], strict=True))
+    stable = found.crossings[0].stable_side == "below" if found.crossings else False
+    names = [f"{one:,d}" if one == other else f"{one:,d} to {other:,d}" for one, other in stretches]
+    width = max(map(len, names))
+    lines = []
+    if not found.crossings:
+        names, stretches = [], []
+    for name, stretch in zip(names, stretches, strict=True):
+        mark = "→" if stable and found.value in stretch else " "
+        lines.append(f"{mark} {name:<{width}}  {'stable' if stable else 'unstable'}")
+        stable = not stable
+    lines.append("")
+    if found.known:
+        return [*lines, f"  every number from {first:,d} to {last:,d} was looked at"]
+    looked = f"{found.looked} numbers from {first:,d} to {last:,d} were looked at, those on either side of a "
+    return [
+        *lines,
+        *wrapped(f"{looked}change among them; a change and back between two could hide", "  ", "  "),
+    ]
 
 
 def critical_document(found: Critical) -> dict[str, Any]:

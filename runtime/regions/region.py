@@ -11,7 +11,6 @@ Does not: draw, or write files (see `present`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +24,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.finite_equations import finite_equations
 from apc.frame.names import Range
-from apc.frame.overrides import Override, apply
+from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace, trace_steps
@@ -37,7 +36,13 @@ from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator, matrix_errors
-from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_time
+from apc.vary.evaluator import (
+    PointEvaluator,
+    evaluator_of_many,
+    overrides_at,
+    reaches_count,
+    reaches_time,
+)
 from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.mean_square import (
     BY_GROWTH,
@@ -259,6 +264,12 @@ def region(
         used = [prepared.jacobians[group.kind] for group in system.groups]
         affine = all(site.affine for site in used)
         times = [place for place, one in enumerate(free) if reaches_time(system, one)]
+        counts = [place for place, one in enumerate(free) if reaches_count(system, one)]
+        if counts and (len(counts) == 2 or times or not affine or meant in BY_GROWTH):
+            label = axes[counts[0]].free.label
+            what = f"{label} is a number of peers, which beside this axis, or by this criterion, has no steps"
+            raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {label}"))
+        times += counts
         source: Source
         if meant in BY_GROWTH:
             times = []
@@ -346,9 +357,7 @@ def _samples(family: Family, source: Source, rectangle: Rectangle, points: Float
         wrong = np.flatnonzero(~np.isfinite(one).all(axis=(1, 2)))
         if len(wrong):
             value = rectangle.values(points[wrong[:1]])[0].tolist()
-            overrides = [
-                Override(free, Fraction(number)) for free, number in zip(source.free, value, strict=True)
-            ]
+            overrides = overrides_at(source.system, source.free, value)
             apply(source.system, overrides)  # says so itself if the value can't be
             if not isinstance(source, MeanSquareEvaluator):
                 source.closed_at(value)
@@ -407,7 +416,9 @@ def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], ND
         ends = [knots[0], knots[-1]] if not curve.closed else []
         for start in range(0, len(points), CHUNK):
             some = slice(start, start + CHUNK)
-            x, y = points[some, 0, None], points[some, 1, None]
+            # A chord that ends at the right-hand edge is crossed by what comes from below there, too.
+            x = np.minimum(points[some, 0, None], np.nextafter(1.0, 0.0))
+            y = points[some, 1, None]
             chord = b - a
             over = (a[:, 0] <= x) != (b[:, 0] <= x)
             height = a[:, 1] + (x - a[:, 0]) * chord[:, 1] / np.where(chord[:, 0] == 0, 1.0, chord[:, 0])
@@ -426,11 +437,7 @@ def _decide(found: Region, values: Floats) -> NDArray[np.bool_]:
     prepared = prepare(found.system)
     decided = []
     for value in values.tolist():
-        overrides = [
-            Override(axis.free, Fraction(number))
-            for axis, number in zip((found.x, found.y), value, strict=True)
-        ]
-        changed = apply(found.system, overrides)
+        changed = apply(found.system, overrides_at(found.system, (found.x.free, found.y.free), value))
         if found.criterion in BY_GROWTH:
             judged = growth_at(changed, prepared, [], PLACE, criterion=found.criterion)
             decided.append(bool(judged.stable))

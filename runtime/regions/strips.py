@@ -4,6 +4,7 @@ Takes: a `CompiledSystem`, a delay's range and another parameter's.
 Gives: `Striped`, `trace_strips`.
 Guarantees: within a strip the order of events stays: curves there are as right as those of two parameters
 that reach no time; between strips, where events coincide, the boundary goes straight along the delay's value.
+A number of peers goes by strips too, one each from halfway to the one before to halfway to the next.
 Does not: take two times, or scenes linearized at their start (None: see `boundary.trace_steps`).
 
 Where no event moves within a strip, as over a link, whose packets are read at ticks only, nothing changes
@@ -27,8 +28,9 @@ from apc.regions.cells import HALVINGS, survey
 from apc.regions.curves import between, refined
 from apc.regions.eigenpairs import largest, log_magnitudes
 from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
+from apc.vary.counts import count_pieces
 from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
-from apc.vary.evaluator import PointEvaluator, evaluator_of_many
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_count
 from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.search import SPAN, Line, proved_crossing
 
@@ -152,6 +154,11 @@ def _strips(
     told: Callable[[str], None] | None,
 ) -> Iterator[_Strip | None]:
     """Yield the strips in order; None for one that can't be had in closed form."""
+    if reaches_count(system, delay.free):
+        for piece in count_pieces(system, delay, PLACE):
+            ends = [float((one - delay.low) / (delay.high - delay.low)) for one in (piece.low, piece.high)]
+            yield _standing(piece, other, ends, prepared)
+        return
     # What is too much is so before any strip is looked at.
     longest = system_with_delay(system, delay.free, delay.high)
     evaluator_of_many(longest, [other.free], PLACE, prepared=prepared)

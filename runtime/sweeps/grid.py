@@ -18,10 +18,11 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import PEERS, CompiledSystem
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.names import Free, find, unit_of
 from apc.frame.overrides import Override, apply
+from apc.vary.evaluator import reaches_count
 
 PLACE = Place("sweep")
 
@@ -129,26 +130,31 @@ def parse_axis(system: CompiledSystem, name: str, text: str) -> GridAxis:
     Raises
     ------
     ApcError
-        E881 a range or list at fault; E882 a number of peers; E622 no such parameter; E204 and others of a
+        E881 a range or list at fault; E622, E623 no such parameter; E204 and others of a
         quantity; E624 or E625 a value out of the parameter's bounds.
     """
-    free = _find(system, name.strip())
+    free = find(system, name.strip(), PLACE, counts=True)
     unit = unit_of(system, free.name)
+    whole = reaches_count(system, free)
     values = (_range if ":" in text else _list)(free.label, unit, text)
+    if whole and ":" in text:
+        values = _whole_numbers(free.label, values, every=text.count(":") == 1)
     axis = GridAxis(free, unit, values)
     for value in (min(values), max(values)):
         _check_bounds(system, axis, value)
     return axis
 
 
-def _find(system: CompiledSystem, name: str) -> Free:
-    """Return the parameter a name means; a number of peers has its own message."""
-    last = name.rpartition(".")[2]
-    known = {parameter.name for parameter in system.parameters}
-    if name == PEERS or (last in (PEERS, "count") and name not in known):
-        what = f"{name} is a number of peers, which can't vary: it is compiled in"
-        raise ApcError(Mistake("E882", PLACE, what, hint="one topology a number of peers"))
-    return find(system, name, PLACE)
+def _whole_numbers(label: str, values: Sequence[Fraction], *, every: bool) -> tuple[Fraction, ...]:
+    """Return the whole numbers of a range of counts: every one, or those nearest to the values asked for."""
+    low, high = values[0], values[-1]
+    if low.denominator != 1 or high.denominator != 1:
+        got = f"{float(low):g} to {float(high):g}"
+        raise ApcError(Mistake("E881", PLACE, f"the range of {label}", "whole numbers", got))
+    if every:
+        _refuse_many([int(high - low) + 1])
+        return tuple(Fraction(count) for count in range(int(low), int(high) + 1))
+    return tuple(dict.fromkeys(Fraction(round(value)) for value in values))
 
 
 def _list(label: str, unit: str, text: str) -> tuple[Fraction, ...]:

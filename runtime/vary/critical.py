@@ -27,9 +27,10 @@ from apc.network.nominal import left_out, refuse_channel_number
 from apc.option_value import option_value
 from apc.result import Result
 from apc.threads import single_threaded
+from apc.vary.counts import search_counts
 from apc.vary.crossings import CELL
 from apc.vary.delays import delay_now
-from apc.vary.evaluator import reaches_time
+from apc.vary.evaluator import reaches_count, reaches_time
 from apc.vary.mean_square import (
     BY_GROWTH,
     MEAN_SQUARE,
@@ -55,7 +56,8 @@ class Critical(Result):
     whether the equations are enclosed between the `looked` values that were looked at: what could hide then
     are crossings nearer than `cell` to one another. `enters` says whether
     anything that decides depends on the parameter: on a start value of a linear scene nothing does.
-    `stretches` are those of `search.Search`.
+    `stretches` are those of `search.Search`. `counted` says that it is a number of peers: a crossing's value
+    is then the number on its stable side.
     `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
     (None where their peers differ) of a parameter that is set for all groups though they have not all the
     same.
@@ -82,6 +84,7 @@ class Critical(Result):
     criterion: str = NOMINAL
     groups: tuple[tuple[str, float | None], ...] = ()
     stretches: int = 0
+    counted: bool = False
 
 
 @part("critical")
@@ -120,20 +123,28 @@ def critical(
         parameter's bounds, E844 a period or phase, E845 a delay of a scene that isn't linear, E896 a number
         of an unreliable link; and those of `units.quantity`.
     """
-    free = find(system, name.strip(), _PLACE)
+    free = find(system, name.strip(), _PLACE, counts=True)
     chosen_criterion = criterion_of(system, criterion, _PLACE, [free])
     by_growth = chosen_criterion in BY_GROWTH
     if not by_growth:
         refuse_channel_number(system, free, _PLACE, instead=f"--in {MEAN_SQUARE}")
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        timed = reaches_time(system, free)
+        timed, counted = reaches_time(system, free), reaches_count(system, free)
         unit = unit_of(system, free.name)
         present = float(delay_now(system, free)) if timed else parameter_of(system, free).value
         limits = [_limit(*one, free, unit) for one in (("--lower", lower), ("--upper", upper))]
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
-        if by_growth:
+
+        def stable_of(changed: CompiledSystem) -> bool | None:
+            if by_growth:
+                return growth_at(changed, prepared, [], _PLACE, criterion=chosen_criterion).stable
+            return analyze(changed, prepared=prepared).stable
+
+        if counted:
+            found = search_counts(system, free, limits, present, stable_of, _PLACE, told=told)
+        elif by_growth:
             low, high = (None if one is None else float(one) for one in limits)
             found = search_mean_square(
                 *(system, free, low, high, present, prepared, _PLACE), told=told, criterion=chosen_criterion
@@ -146,9 +157,7 @@ def critical(
             found = search(system, free, low, high, prepared, told=told)
 
         def stable_now() -> bool | None:
-            if by_growth:
-                return growth_at(system, prepared, [], _PLACE, criterion=chosen_criterion).stable
-            return analyze(system, prepared=prepared).stable
+            return stable_of(system)
 
         chosen = _chosen(found, present, stable_now)
         side = found.stable[0] if found.stable else None
@@ -181,6 +190,7 @@ def critical(
         criterion=chosen_criterion,
         groups=_by_group(system, free),
         stretches=found.stretches,
+        counted=counted,
     )
 
 
@@ -239,8 +249,8 @@ def _chosen(found: Search, present: float, stable_now: Callable[[], bool | None]
     """Return the crossing that matters, see `Critical`; on a jump, the scene itself tells its side."""
     if not found.edges:
         return None
-    below = sum(one.value < present for one in found.edges)
-    upto = sum(one.value <= present for one in found.edges)
+    below = sum(one.boundary < present for one in found.edges)
+    upto = sum(one.boundary <= present for one in found.edges)
     if upto > below and found.stable[below] != stable_now():
         below = upto
     if found.stable[below]:

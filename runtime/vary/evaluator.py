@@ -1,7 +1,8 @@
 """The evaluator of a system's matrices over some of its parameters, whatever kind of scene it is.
 
 Takes: a `CompiledSystem` and the parameters that vary.
-Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `free_parameters`, `reaches_time`.
+Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `free_parameters`, `reaches_time`,
+`reaches_count`, `overrides_at`.
 Guarantees: peers that are alike at some values only are kept apart.
 Does not: vary times (see `delays`).
 """
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups, prepare
-from apc.compiler.compiled import CompiledSystem, Group, Parameter
+from apc.compiler.compiled import CompiledSystem, Group, Parameter, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import arrange, split
@@ -120,9 +121,7 @@ class PointEvaluator:
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them."""
-        overrides = [
-            Override(one, Fraction(float(number))) for one, number in zip(self.free, value, strict=True)
-        ]
+        overrides = overrides_at(self.system, self.free, value)
         return split(*lifted_groups(apply(self.system, overrides), prepared=self.prepared)).systems
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
@@ -360,7 +359,9 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
     """
     listed = []
     for one in system.parameters:
-        if one.formula is not None or not is_named(one.name) or reaches_time(system, Free(one.name)):
+        free = Free(one.name)
+        shapes = reaches_time(system, free) or reaches_count(system, free)
+        if one.formula is not None or not is_named(one.name) or shapes:
             continue
         several = {
             group.name: any(column.name == one.name for column in group.columns)
@@ -384,6 +385,19 @@ def _reaches(system: CompiledSystem, group: Group, name: str) -> bool:
     values = {Free(name, group.name): np.array([float(GENERIC), float(2 * GENERIC)])}
     with np.errstate(all="ignore"):
         return len(free_rows(system, group, 0, values)) > 1
+
+
+def overrides_at(system: CompiledSystem, free: Sequence[Free], value: Sequence[float]) -> list[Override]:
+    """Return what sets parameters to a point (m,); of a number of peers, to the nearest whole number."""
+    return [
+        Override(one, Fraction(round(number) if reaches_count(system, one) else float(number)))
+        for one, number in zip(free, value, strict=True)
+    ]
+
+
+def reaches_count(system: CompiledSystem, free: Free) -> bool:
+    """Say whether the number of peers of some group is, or depends on, this parameter."""
+    return free.name in scope_of(system).needed([group_count(group.name) for group in system.groups])
 
 
 def reaches_time(system: CompiledSystem, free: Free) -> bool:

@@ -6,9 +6,9 @@ Guarantees: what `analysis.analyze` gives at each point, to the bounds: what the
 leave open, or say of it less than an analysis would, has an analysis of its own.
 Does not: give all modes, or share out work among processes (see `sweeps`).
 
-Points whose times are the same have the same schedules, and one `BatchEvaluator`; the matrices come with
-their bounds (`BatchEvaluator.bounded`), the largest eigenvalue with its own (`eigen.dominant`), and the turns
-of its mode are counted along its own motion (`frame.course`).
+Points whose times and numbers of peers are the same have the same schedules, and one `BatchEvaluator`; the
+matrices come with their bounds (`BatchEvaluator.bounded`), the largest eigenvalue with its own
+(`eigen.dominant`), and the turns of its mode are counted along its own motion (`frame.course`).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from apc.network.nominal import left_out, refuse_channel_number
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator, batch_evaluator
-from apc.vary.evaluator import generic, reaches_time
+from apc.vary.evaluator import generic, reaches_count, reaches_time
 from apc.vary.leading import Part, leading, parts_of
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
         raise ApcError(Mistake("E883", PLACE, what, hint='{"contact.stiffness": [500.0, 1000.0]}'))
     frees, listed = [], []
     for name, given in values.items():
-        free = find(system, name.strip(), PLACE)
+        free = find(system, name.strip(), PLACE, counts=True)
         if free in frees:
             raise ApcError(Mistake("E883", PLACE, f"{free.label} is given twice"))
         refuse_channel_number(system, free, PLACE)
@@ -298,7 +298,11 @@ def many_analyses(system: CompiledSystem, varied: Sequence[Varied]) -> ManyAnaly
     varied
         What varies.
     """
-    times = tuple(column for column, one in enumerate(varied) if reaches_time(system, one.free))
+    times = tuple(
+        column
+        for column, one in enumerate(varied)
+        if reaches_time(system, one.free) or reaches_count(system, one.free)
+    )
     return ManyAnalyses(system, tuple(varied), prepare(system), times)
 
 

@@ -59,6 +59,9 @@ Told = Callable[[str], None]
 # Without limits given, values from SPAN times smaller to SPAN times larger than the scale are scanned: the
 # present value or, where that is 0, the change that would move an eigenvalue by 1 if it went on as it starts.
 SPAN = 1e3
+# The kind of a crossing between two numbers of peers.
+COUNT = "count"
+
 # Samples in each factor of 10 to begin with: neighbours differ by half.
 SAMPLES = 6
 
@@ -85,7 +88,8 @@ class Crossing:
     """A value at which the spectral radius crosses 1, right to `error`, both in SI.
 
     `stable_side` is "below" or "above"; `frequency_hz` is that of the motion that neither grows nor dies out
-    there; `kind` is "crossing", or "jump" where a packet comes a tick later or events change places;
+    there; `kind` is "crossing", or "jump" where a packet comes a tick later or events change places, or
+    "count" where it is the number of peers on the stable side of a change from one number to the next;
     `proof` says how the value is known.
     """
 
@@ -95,6 +99,13 @@ class Crossing:
     frequency_hz: float
     kind: str
     proof: str
+
+    @property
+    def boundary(self) -> float:
+        """Where the verdict changes: of a number of peers, between it and the next."""
+        if self.kind != COUNT:
+            return self.value
+        return self.value + (0.5 if self.stable_side == "below" else -0.5)
 
 
 @dataclass(frozen=True, slots=True)

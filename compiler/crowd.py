@@ -1,0 +1,171 @@
+"""How many peers there are, and how many of them each peer hears: what follows from the counts of groups.
+
+Takes: groups, kinds and links of a compiled model.
+Gives: `with_heard`, `heard_sums`; `recounted`, `least_peers`, `peers_of`.
+Guarantees: a model with other counts is the one that its topology with these counts compiles to.
+Does not: change who is in a group of peers that differ, or a graph that names its peers: that is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import (
+    LARGEST_COUNT,
+    MOST_PLACED,
+    PEERS,
+    Column,
+    CompiledSystem,
+    Group,
+    Kind,
+    Link,
+    Parameter,
+    count_of,
+    group_count,
+)
+from apc.compiler.errors import Mistakes, Place
+from apc.compiler.weights import Sums, sum_weights
+
+COUNT_ABOUT = "peers heard over the link, counted with their weights"
+
+
+def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Group, ...]:
+    """Return the groups with how many peers each of them hears over a link, `count(LINK)`.
+
+    It is a parameter of the group, or a column where it differs from peer to peer.
+
+    Parameters
+    ----------
+    groups, kinds, links
+        Of the model; on a graph that isn't complete, every peer sends.
+    """
+    peers = sum(group.count for group in groups)
+    sums = {link.name: heard_sums(link, peers) for link in links if link.graph.shape == "arcs"}
+    senders = {
+        link.name: [any(one.link == link.name for one in kinds[group.kind].sends) for group in groups]
+        for link in links
+    }
+    totals = {
+        name: sum(group.count for group, does in zip(groups, sends, strict=True) if does)
+        for name, sends in senders.items()
+    }
+    found, start = [], 0
+    for place, group in enumerate(groups):
+        counted = {count_of(link.name) for link in links}
+        values = [one for one in group.values if one.name not in counted]
+        columns = [one for one in group.columns if one.name not in counted]
+        for link in links:
+            name = count_of(link.name)
+            if name not in kinds[group.kind].parameters:
+                continue
+            if link.graph.shape == "complete":
+                heard: Fraction | NDArray[np.float64] = Fraction(
+                    totals[link.name] - senders[link.name][place]
+                )
+            else:
+                heard = _on_graph(link, group.count, start, peers, sums.get(link.name))
+            if isinstance(heard, Fraction):
+                values.append(Parameter(name, "1", float(heard), about=COUNT_ABOUT, exact=heard))
+            else:
+                columns.append(Column(name, heard))
+        found.append(replace(group, values=tuple(values), columns=tuple(columns)))
+        start += group.count
+    return tuple(found)
+
+
+def heard_sums(link: Link, peers: int) -> Sums:
+    """Return what every peer of a scene hears in all over a link of arcs."""
+    return sum_weights(link.graph.arcs[:, 1], link.graph.weights, peers)
+
+
+def _on_graph(
+    link: Link, count: int, start: int, peers: int, sums: Sums | None
+) -> Fraction | NDArray[np.float64]:
+    """Return the summed weights of what each of `count` peers from `start` on hears: one number if alike."""
+    if link.graph.shape == "ring":
+        return Fraction(min(2, peers - 1))
+    if link.graph.shape == "star":
+        if start or peers == 2:
+            return Fraction(1)
+        counts = np.ones(count)
+        counts[0] = peers - 1
+        return counts if count > 1 else Fraction(peers - 1)
+    end = start + count
+    assert sums is not None, link.graph.shape
+    return sums.of(start) if sums.alike(start, end) else sums.floats[start:end]
+
+
+def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Place) -> CompiledSystem:
+    """Return a model with other numbers of peers.
+
+    Parameters
+    ----------
+    system
+        The model, in which `peers` and what follows from it have their new values already.
+    counts
+        The new count of each group.
+    place
+        Where they were given.
+
+    Raises
+    ------
+    ApcError
+        E626 a count that can't be: no whole number, or of peers that differ or are named by a graph.
+    """
+    mistakes = Mistakes()
+    total = sum(counts.values())
+    groups = []
+    for group in system.groups:
+        count, name = counts[group.name], group_count(group.name)
+        if count == group.count:
+            groups.append(group)
+            continue
+        own = [one.name for one in group.columns if one.name not in map(count_of, _names(system.links))]
+        arcs = [link.name for link in system.links if link.graph.shape == "arcs"]
+        shaped = [link.name for link in system.links if link.graph.shape != "complete"]
+        if count.denominator != 1 or not 1 <= count <= LARGEST_COUNT:
+            expected = f"a whole number from 1 to {LARGEST_COUNT:,}"
+            mistakes.add("E626", place, name, expected=expected, got=f"{float(count):.12g}")
+        elif own:
+            what = f"{own[0]} has one value for each of the {group.count} peers of {group.name}"
+            mistakes.add("E626", place, f"{what}: their count follows from them")
+        elif arcs:
+            what = f"the graph of {arcs[0]} names its peers: {name} is what it is in the topology"
+            mistakes.add("E626", place, what)
+        elif shaped and total > MOST_PLACED:
+            expected = f"at most {MOST_PLACED:,} peers where {shaped[0]} isn't complete"
+            mistakes.add("E626", place, name, expected=expected, got=f"{int(total):,}")
+        groups.append(replace(group, count=int(count)))
+    if not mistakes and total < least_peers(system.kinds):
+        what, got = "the number of all peers", f"{int(total)}"
+        mistakes.add("E626", place, what, expected="at least 2: parts follow the others", got=got)
+    mistakes.raise_if_any()
+    others = {count_of(link.name): total - 1 for link in system.links}
+    return replace(
+        system,
+        groups=with_heard(groups, system.kinds, system.links),
+        parameters=tuple(
+            replace(one, value=float(others[one.name])) if one.name in others else one
+            for one in system.parameters
+        ),
+    )
+
+
+def least_peers(kinds: Sequence[Kind]) -> int:
+    """Return how many peers a scene must have: two where some part follows the others."""
+    hears = any(partition.receives for kind in kinds for partition in kind.clocks)
+    return 2 if hears else 1
+
+
+def _names(links: Sequence[Link]) -> list[str]:
+    return [link.name for link in links]
+
+
+def peers_of(counts: Mapping[str, Fraction]) -> dict[str, Fraction]:
+    """Return what the name `peers` stands for with these counts of groups."""
+    return {PEERS: sum(counts.values(), Fraction(0))}
