@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,6 +125,7 @@ def open_scene(
     outputs: Mapping[str, Path | None] | None = None,
     *,
     hands: str = "free",
+    told: Callable[[str], None] | None = None,
 ) -> CompiledSystem:
     """Return the compiled model that a command means.
 
@@ -138,6 +139,8 @@ def open_scene(
         What the command will write, by the option that says so: see `check_outputs`.
     hands
         How hands are to be taken, see `devices.with_hands`.
+    told
+        Is told what a setting for all groups takes the place of.
 
     Raises
     ------
@@ -153,9 +156,14 @@ def open_scene(
         system = with_hands(system, hands)
     if not settings:
         return system
+    from apc.frame.names import notes_for_all_groups
     from apc.frame.overrides import apply, parse_override
 
-    return apply(system, [parse_override(system, text) for text in settings])
+    overrides = [parse_override(system, text) for text in settings]
+    if told is not None:
+        for note in notes_for_all_groups(system, [one.free for one in overrides]):
+            told(note)
+    return apply(system, overrides)
 
 
 def check_model_name(topology: Path) -> None:

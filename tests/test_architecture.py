@@ -16,7 +16,10 @@ from tests.topologies import AVERAGE, ROOT
 
 # Folder by folder, and in each its modules, earliest first: each may import only those before it.
 HOUSE = (
-    ("apc.compiler", "errors digits timings files words multiples weights plain compiled crowd formula seal cache"),
+    (
+        "apc.compiler",
+        "errors digits timings files words multiples weights plain compiled crowd formula seal cache",
+    ),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
         "apc.compiler.language",

@@ -6,16 +6,29 @@ from fractions import Fraction
 
 import pytest
 
+from apc.__main__ import run
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import counts_peers
 from apc.compiler.errors import ApcError
-from apc.frame.names import Free, find, is_named, named_times, parameter_of, unit_of
+from apc.compiler.pipeline import compile_topology
+from apc.frame.names import (
+    Free,
+    find,
+    is_named,
+    named_times,
+    notes_for_all_groups,
+    parameter_of,
+    unit_of,
+)
 from apc.frame.overrides import Override, apply
+from apc.regions.axes import parse_axes
+from apc.regions.region import region
 from apc.vary.evaluator import free_parameters
+from apc.vary.many import analyze_many
 from apc.vary.margins import margins
 from apc.vary.sensitivity import sensitivities
 from tests.sites import grouped, paper
-from tests.topologies import AVERAGE, MESH, compiled, replaced
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 
 @pytest.mark.parametrize(
@@ -87,3 +100,18 @@ def test_how_many_peers_are_heard_is_no_parameter_to_set(written: str) -> None:
         match=r"E623 .* how many peers are heard, by their weights",
     ):
         find(compiled(MESH), written)
+
+
+def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:
+    """The star's teacher holds on with 400 N/m of its own, its students with the part's 100 N/m."""
+    told = (
+        "arm.stiffness is one value for all groups here; the scene has 400 N/m at teacher, 100 N/m at student"
+    )
+    star = compile_topology(SCENES / "star-lecture.yaml")
+    assert notes_for_all_groups(star, [Free("arm.stiffness"), Free("arm.damping")]) == [told]
+    assert not notes_for_all_groups(star, [Free("arm.stiffness", "student")])
+    assert told in analyze_many(star, {"arm.stiffness": [100.0, 400.0]}).left_out
+    axes = parse_axes(star, "arm.stiffness=90 N/m:110 N/m", "student.contact.stiffness=700 N/m:900 N/m")
+    assert told in region(star, axes, cells=2).left_out
+    assert run(["analyze", str(SCENES / "star-lecture.yaml"), "--set", "arm.stiffness=100 N/m"]) == 0
+    assert capsys.readouterr().err == f"note: {told}\n"

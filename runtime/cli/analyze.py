@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 import click
 
 from apc.analysis.methods import AUTO, METHODS
-from apc.cli.options import Command, file_argument, hands_option, json_option, print_result, set_option
+from apc.cli.options import (
+    Command,
+    file_argument,
+    hands_option,
+    json_option,
+    note_aside,
+    print_result,
+    set_option,
+)
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
@@ -89,7 +97,7 @@ def analyze_command(
     from apc.frame.devices import HANDS, PASSIVE, published
     from apc.inputs import open_scene
 
-    system = open_scene(file, settings, hands=hands)
+    system = open_scene(file, settings, hands=hands, told=note_aside)
     if hands == PASSIVE:
         asked = {"--method": method != AUTO, "--box": bool(box), "--conventions": every_convention}
         asked["--buzz"] = with_buzz

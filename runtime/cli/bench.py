@@ -11,7 +11,16 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import Command, file_argument, file_option, json_option, print_result, set_option, tell
+from apc.cli.options import (
+    Command,
+    file_argument,
+    file_option,
+    json_option,
+    note_aside,
+    print_result,
+    set_option,
+    tell,
+)
 from apc.cli.progress import at_work
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -85,7 +94,7 @@ def bench_command(
 
         check_target(plot)
         check_format(plot)
-    system = open_scene(file, settings, {"--plot": plot})
+    system = open_scene(file, settings, {"--plot": plot}, told=note_aside)
     with at_work("measuring"):
         found = bench(system)
     print_result(found, as_json=as_json)

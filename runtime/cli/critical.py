@@ -19,6 +19,7 @@ from apc.cli.options import (
     hands_option,
     in_option,
     json_option,
+    note_aside,
     print_result,
     set_option,
 )
@@ -63,7 +64,7 @@ def critical_command(
 
     _check_order(path, file)
     asked = criterion_with(hands, criterion)
-    system = open_scene(file, settings, hands=hands)
+    system = open_scene(file, settings, hands=hands, told=note_aside)
     with status_line() as told:
         found = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
     print_result(found, as_json=as_json)

@@ -18,6 +18,7 @@ from apc.cli.options import (
     file_argument,
     file_option,
     json_option,
+    note_aside,
     print_result,
     set_option,
     tell,
@@ -90,7 +91,7 @@ def feel_command(
         raise click.UsageError(f"--nyquist is for a picture: --out with {', '.join(FORMATS)}")
     if out is not None:
         check_feel_path(out)
-    system = open_scene(file, settings, {"--out": out})
+    system = open_scene(file, settings, {"--out": out}, told=note_aside)
     found = feel(
         system,
         read_frequencies(system, frequencies, low, high, points),

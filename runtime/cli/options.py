@@ -118,6 +118,11 @@ def beside(*outputs: Path | None) -> bool:
     return any(output is not None and is_stdout(output) for output in outputs)
 
 
+def note_aside(text: str) -> None:
+    """Print a note on what was asked, beside the answer."""
+    tell(f"note: {text}", err=True)
+
+
 def tell(text: str, *, err: bool = False) -> None:
     """Print a text, with characters that would act on the terminal written out."""
     click.echo(visible(text), err=err)

@@ -22,6 +22,7 @@ from apc.cli.options import (
     hands_option,
     in_option,
     json_option,
+    note_aside,
     print_result,
     set_option,
     tell,
@@ -109,7 +110,9 @@ def region_command(
         raise ApcError(Mistake("E907", Place("region"), what))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
     asked = criterion_with(hands, criterion)
-    systems = [open_scene(one, settings, {"--out": out}, hands=hands) for one in (file, *compare)]
+    systems = [
+        open_scene(one, settings, {"--out": out}, hands=hands, told=note_aside) for one in (file, *compare)
+    ]
     with status_line() as told:
         found = compare_regions(
             systems,

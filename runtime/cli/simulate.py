@@ -22,6 +22,7 @@ from apc.cli.options import (
     file_argument,
     file_option,
     json_option,
+    note_aside,
     print_result,
     set_option,
     tell,
@@ -131,7 +132,7 @@ def simulate_command(
     chosen = parse_method(method) if method is not None else DEFAULT
     asked = parse_duration(duration) if duration is not None else None
     _check_files(out, plot, still)
-    system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still})
+    system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still}, told=note_aside)
     if trace_of is not None:
         from apc.moments.worst import trace_of_worst
 

@@ -24,6 +24,7 @@ from apc.cli.options import (
     hands_option,
     in_option,
     json_option,
+    note_aside,
     print_result,
     set_option,
     tell,
@@ -105,7 +106,7 @@ def sweep_command(
     waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))
     values = _values(over)
     asked = criterion_with(hands, criterion)
-    system = open_scene(file, settings, {"--out": out}, hands=hands)
+    system = open_scene(file, settings, {"--out": out}, hands=hands, told=note_aside)
     with _progress(out) as progress:
         result = sweep(
             system,

@@ -1,13 +1,15 @@
 """What a person calls a parameter or a timing, and what stands behind the name.
 
 Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
-Gives: `Free`, `Range`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`, `unit_of`.
+Gives: `Free`, `Range`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`, `unit_of`,
+`values_by_group`, `notes_for_all_groups`.
 Guarantees: a name that means nothing raises, with the nearest real one.
 Does not: read or change values.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -21,6 +23,7 @@ from apc.compiler.compiled import (
     group_count,
 )
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.words import with_unit
 
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
@@ -95,7 +98,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
             what, hint = f"{written} is the number of all peers, which follows from the groups'", sizes[0]
         raise ApcError(Mistake("E623", place, what, hint=hint))
     if name.startswith(COUNT):
-        what = f"{written} is how many peers are heard: it follows from {sizes[0]} and the graph"
+        what = f"{written} is how many peers are heard, by their weights: from {sizes[0]} and the graph"
         raise ApcError(Mistake("E623", place, what))
     if name not in known:
         near = nearest(name, sorted(known))
@@ -138,3 +141,34 @@ def unit_of(system: CompiledSystem, name: str) -> str:
         if parameter.name == name:
             return parameter.unit
     return "s"
+
+
+def values_by_group(system: CompiledSystem, free: Free) -> tuple[tuple[str, float | None], ...]:
+    """Return what each group has of a parameter, None where its peers differ; nothing where all are alike."""
+    name, only = free.name, free.group
+    several = {group.name for group in system.groups if name in {one.name for one in group.columns}}
+    if only is not None:
+        return ((only, None),) if only in several else ()
+    own = {group.name for group in system.groups if name in {one.name for one in group.values}}
+    if not several | own:
+        return ()
+    return tuple(
+        (group.name, None if group.name in several else parameter_of(system, Free(name, group.name)).value)
+        for group in system.groups
+    )
+
+
+def notes_for_all_groups(system: CompiledSystem, frees: Iterable[Free]) -> list[str]:
+    """Say what groups have now of each parameter that is set for all of them though they differ in it."""
+    notes = []
+    for free in frees:
+        found = values_by_group(system, free)
+        if free.group is not None or not found:
+            continue
+        unit = unit_of(system, free.name)
+        own = [
+            f"{'several values' if value is None else with_unit(f'{value:.6g}', unit)} at {group}"
+            for group, value in found
+        ]
+        notes.append(f"{free.name} is one value for all groups here; the scene has {', '.join(own)}")
+    return notes

@@ -23,7 +23,7 @@ from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.finite_equations import finite_equations
-from apc.frame.names import Range
+from apc.frame.names import Range, notes_for_all_groups
 from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
@@ -301,7 +301,10 @@ def region(
         stepped=stepped,
         linearized=not affine,
         criterion=meant,
-        left_out=left_out(system, linear=affine, network=meant != MEAN_SQUARE),
+        left_out=(
+            *left_out(system, linear=affine, network=meant != MEAN_SQUARE),
+            *notes_for_all_groups(system, free),
+        ),
         system=system,
     )
 

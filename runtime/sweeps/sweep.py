@@ -25,6 +25,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
 from apc.compiler.timings import part
 from apc.frame.jacobians import jacobians
+from apc.frame.names import notes_for_all_groups
 from apc.memory import refuse_beyond
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
@@ -212,13 +213,14 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
         "topology": system.name,
         "peers": system.peers,
         "of": work.of,
-        "left_out": list(
-            left_out(
+        "left_out": [
+            *left_out(
                 system,
                 linear=all(jacobians(kind).affine for kind in system.kinds),
                 network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]),
-            )
-        ),
+            ),
+            *notes_for_all_groups(system, [axis.free for axis in work.grid.axes]),
+        ],
         "points": work.grid.points,
         "over": [
             {

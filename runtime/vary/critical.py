@@ -22,7 +22,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.finite_equations import finite_equations
-from apc.frame.names import Free, find, parameter_of, unit_of
+from apc.frame.names import Free, find, parameter_of, unit_of, values_by_group
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.option_value import option_value
 from apc.result import Result
@@ -188,24 +188,9 @@ def critical(
         verdict="" if chosen else verdict,
         left_out=left_out(system, linear=linear, network=chosen_criterion != MEAN_SQUARE),
         criterion=chosen_criterion,
-        groups=_by_group(system, free),
+        groups=values_by_group(system, free),
         stretches=found.stretches,
         counted=counted,
-    )
-
-
-def _by_group(system: CompiledSystem, free: Free) -> tuple[tuple[str, float | None], ...]:
-    """Return what each group has of a parameter, or one if its peers differ, where not all have one value."""
-    name, only = free.name, free.group
-    several = {group.name for group in system.groups if name in {one.name for one in group.columns}}
-    if only is not None:
-        return ((only, None),) if only in several else ()
-    own = {group.name for group in system.groups if name in {one.name for one in group.values}}
-    if not several | own:
-        return ()
-    return tuple(
-        (group.name, None if group.name in several else parameter_of(system, Free(name, group.name)).value)
-        for group in system.groups
     )
 
 

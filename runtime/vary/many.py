@@ -32,7 +32,7 @@ from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, judge
 from apc.finite_equations import finite_equations
 from apc.frame.exchange import build_exchange
 from apc.frame.jacobians import jacobians
-from apc.frame.names import Free, find, unit_of
+from apc.frame.names import Free, find, notes_for_all_groups, unit_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import Numbers, resolve, scope_of
 from apc.network.nominal import left_out, refuse_channel_number
@@ -258,7 +258,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
         ),
         values=tuple(arrays),
         **{one.name: getattr(found, one.name).reshape(shape) for one in fields(found)},
-        left_out=left_out(system, linear=affine),
+        left_out=(*left_out(system, linear=affine), *notes_for_all_groups(system, frees)),
     )
 
 
