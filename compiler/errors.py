@@ -141,15 +141,28 @@ class Mistakes:
     def __bool__(self) -> bool:
         return bool(self._found)
 
+    def pass_on(self, other: Mistakes) -> None:
+        """Record all of these with others."""
+        if self._found:
+            other.take(ApcError(list(self._found)))
+
     def raise_if_any(self) -> None:
         """Raise `ApcError` with all mistakes in file order, if there is one."""
         if self._found:
             raise ApcError(sorted(self._found, key=lambda mistake: (mistake.place, mistake.code)))
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return the known name closest to a misspelt one, or an empty string when none is close."""
+def nearest(name: str, known: Iterable[str], *, alike: float = 0.6) -> str:
+    """Return the known name closest to a misspelt one, or an empty string when none is close.
+
+    Parameters
+    ----------
+    name, known
+        The name as written, and those there are.
+    alike
+        How alike two names must be, from 0 to 1: what short names share by chance is more.
+    """
     import difflib  # for a mistake only
 
-    close = difflib.get_close_matches(name[:200], list(known), n=1, cutoff=0.6)
+    close = difflib.get_close_matches(name[:200], list(known), n=1, cutoff=alike)
     return close[0] if close else ""

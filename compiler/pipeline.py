@@ -1,6 +1,6 @@
 """The stages one after another: a topology file to a compiled model, or to any stage before it.
 
-Takes: a path. Gives: the value of the last stage asked for, or every one on the way.
+Takes: a path. Gives: the value of the last stage asked for, or every one on the way; `check_definition`.
 Guarantees: each stage sees only the value of the one before.
 Does not: save anything.
 """
@@ -13,7 +13,7 @@ from typing import Literal
 
 from apc.compiler.cache import origin_texts
 from apc.compiler.compiled import CompiledSystem, Origin
-from apc.compiler.components.library import Library
+from apc.compiler.components.library import Library, definition_of
 from apc.compiler.equations.clocks import ClockedSystem, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.equations.structure import SortedSystem, sort
@@ -33,6 +33,27 @@ def compile_topology(path: Path) -> CompiledSystem:
     value = run_stages(path, until="compiled")
     assert isinstance(value, CompiledSystem)
     return value
+
+
+def check_definition(path: Path) -> str:
+    """Read a file that defines a component or connector, with what stands beside it; say what it is.
+
+    Returns
+    -------
+    Its name and kind; an empty text of a topology.
+
+    Raises
+    ------
+    ApcError
+        The mistakes of the definition.
+    """
+    source = read_source(path)
+    kind, name = definition_of(source)
+    if not kind:
+        return ""
+    library = Library((path.parent,))
+    _ = library.component(name) if kind == "component" else library.connector(name)
+    return f"{name}, a {kind}"
 
 
 def run_stages(path: Path, *, until: Stage) -> StageValue:

@@ -270,7 +270,10 @@ CASES = {
         "scene.yaml:13:66: E206 stiffness names peers.real, which is no parameter here; "
         "the nearest is peers. Write: peers",
     ),
-    "a call": (stiffness("\"open('x')\""), "scene.yaml:13:67: E325 there is no function open."),
+    "a call": (
+        stiffness("\"open('x')\""),
+        "scene.yaml:13:67: E325 there is no function open; there are: abs,",
+    ),
     "a subscript": (
         stiffness("'peers[0]'"),
         "scene.yaml:13:67: E324 an index wants a whole number counted from 1, got 0.",

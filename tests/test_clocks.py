@@ -112,8 +112,8 @@ def test_a_continuous_variable_needs_sample_to_be_read_at_a_tick(tmp_path: Path)
 
 def test_a_clocked_variable_needs_hold_to_act(tmp_path: Path) -> None:
     assert told_of(tmp_path, "s = sample(flange.x)", "w = s", "flange.f = k*w") == [
-        "scene.yaml:7:3: E505 in `device.flange.f + hand.flange.f = 0` of connection, hand.flange.f is on "
-        "clock tick and the rest is continuous. Write: hold(hand.flange.f)"
+        "part0.yaml:8:5: E505 hand.flange.f acts on what it is joined to at all times, and is on clock tick. "
+        "Write: flange.f = hold(k*w)"
     ]
 
 

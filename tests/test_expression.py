@@ -35,6 +35,8 @@ from apc.compiler.language.grammar import parse_equation, parse_expression
 A, B, C, X = (Name((letter,)) for letter in "abcx")
 TWO = Number(Fraction(2))
 
+LISTED = ", ".join(sorted(FUNCTIONS))
+
 
 def parse(text: str) -> Expr:
     return parse_expression(text, Place("a.yaml", 1, 1, text))
@@ -111,7 +113,7 @@ def test_every_node_knows_its_part_of_the_text() -> None:
         (
             "2 N",
             "1:1: E323 2 N is not a number, and units stand on parameters only."
-            " Write: 2*N, or a parameter's name",
+            " Write: a parameter, with default: 2 N; of a name, 2*name",
         ),
         ("1e999", "1:1: E323 a number wants an exponent from -300 to 300, got 999."),
         ("1" * 1001, "1:1: E323 a number wants at most 1000 characters, got 1001."),
@@ -124,7 +126,8 @@ def test_every_node_knows_its_part_of_the_text() -> None:
             "1:2: E321 [ cannot stand here: an index is a whole number right behind its name,"
             " as in finger[2].",
         ),
-        ("a().b", "1:1: E325 there is no function a."),
+        ("a().b", f"1:1: E325 there is no function a; there are: {LISTED}."),
+        ("atan2(x)", f"1:1: E325 there is no function atan2; there are: {LISTED}."),
         ("sin(a).b", "1:7: E321 . cannot stand here: only a name can be followed by a dot and another name."),
         ("sine(x)", "1:1: E325 there is no function sine. Write: sin(…)"),
         ("max()", "1:1: E325 max wants 1 to 16 arguments, got 0."),

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.compiler.pipeline import run_stages
+from apc.compiler.language.expression import FUNCTIONS
+from apc.compiler.pipeline import check_definition, run_stages
 from tests.topologies import AVERAGE, replaced
 
 # A component of the user's own, in a folder beside the topology.
@@ -57,7 +59,7 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic: 1",
-        "4:11: E204 haptic wants s, got 1 (no unit). Write: haptic: 1 s",
+        "4:11: E204 haptic wants s, got 1 (no unit). Write: haptic: 1 ms, or 1 s",
     ),
     (
         "haptic: 1 ms",
@@ -123,7 +125,8 @@ TOPOLOGY = [
     (
         "user: {count: 3}",
         "user: {count: three}",
-        "7:17: E208 count wants a whole number from 1 to 1000000000, got three. Write: count: 3",
+        "7:17: E208 count wants a whole number, or an expression over numbers of parameters, got three. "
+        "Write: count: 3",
     ),
     (
         "user: {count: 3}",
@@ -529,7 +532,7 @@ TOPOLOGY = [
     (
         "studies:",
         "experiment: {duration: 3}\nstudies:",
-        "16:24: E204 duration wants s, got 3 (no unit). Write: duration: 3 s",
+        "16:24: E204 duration wants s, got 3 (no unit). Write: duration: 3 ms, or 3 s",
     ),
     (
         "studies:",
@@ -697,7 +700,7 @@ COMPONENT = [
     (
         "f: {unit: N}",
         "f: N",
-        "12:6: E203 f wants a mapping of keys to values, got N. Write: f: {unit: m}",
+        "12:6: E203 f wants a mapping of keys to values, got N. Write: f: {unit: N}",
     ),
     (
         "f: {unit: N}",
@@ -742,8 +745,8 @@ COMPONENT = [
     (
         "b.f = -a.f",
         "b.f = -a.f*2 N",
-        "16:16: E323 2 N is not a number, and units stand on parameters only. Write: 2*N, or a "
-        "parameter's name",
+        "16:16: E323 2 N is not a number, and units stand on parameters only. Write: a "
+        "parameter, with default: 2 N; of a name, 2*name",
     ),
     (
         "b.f = -a.f",
@@ -998,3 +1001,58 @@ def test_all_mistakes_of_a_file_come_together_in_its_order_each_once(
         "scene.yaml:18:16: E206 x names contact.stifness, which is no parameter of a part; the "
         "nearest is contact.stiffness. Write: contact.stiffness",
     ]
+
+
+FAULTS = """\
+component: Pad
+connectors: {flange: Flange}
+parameters: {k: {unit: N/m}}
+variables: {e: N}
+equations:
+  - f = k*flange.y
+  - g = clamp(f)
+  - flange.f = g + q
+"""
+
+
+def test_every_mistake_of_a_component_is_told_at_once(tmp_path: Path) -> None:
+    """An equation that can't be read hides neither another's unknown names nor gives any of its own."""
+    (tmp_path / "pad.yaml").write_text(FAULTS.replace("{e: N}", "{e: {unit: N}}"))
+    with pytest.raises(ApcError) as caught:
+        check_definition(tmp_path / "pad.yaml")
+    assert [mistake.sentence for mistake in caught.value.mistakes] == [
+        "Pad has no flange.y; the nearest is flange.x. Write: flange.x",
+        f"there is no function clamp; there are: {', '.join(sorted(FUNCTIONS))}.",
+        "Pad has no q; there are: e, f, flange.f, flange.x, g, k, others, peers, time.",
+    ]
+
+
+def test_a_component_is_checked_by_itself_and_is_no_topology(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "pad.yaml"
+    path.write_text(FAULTS)
+    assert run(["check", str(path)]) == 1
+    assert (
+        "4:16: E203 e wants a mapping of keys to values, got N. Write: e: {unit: N}"
+        in capsys.readouterr().err
+    )
+    good = "component: Pad\nconnectors: {flange: Flange}\nequations: [flange.f = 0]\n"
+    path.write_text(good)
+    assert run(["check", str(path)]) == 0
+    assert capsys.readouterr().out == f"{path}: no mistakes. Pad, a component.\n"
+    assert run(["analyze", str(path)]) == 1
+    err = capsys.readouterr().err
+    assert err.count("E201") == 1
+    assert "Pad is a component; a topology has parts of its type, and names the folder it is in." in err
+
+
+def test_check_refuses_what_compile_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(AVERAGE.replace("network: 8 ms", "network: 7.777777777 ms"))
+    told = []
+    for command in ("check", "compile"):
+        assert run([command, str(path)]) == 1
+        told.append(capsys.readouterr().err)
+    assert told[0] == told[1]
+    assert "E805 all clocks stand as before only after" in told[0]

@@ -12,7 +12,7 @@ scene give the rest.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from itertools import count
@@ -54,9 +54,11 @@ _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
 class ComponentNames:
     """Resolves a component's names to dimensions, and finds the locals on the way."""
 
-    def __init__(self, component: Component) -> None:
+    def __init__(self, component: Component, undefined: Collection[str] = ()) -> None:
+        """Take a component, and the names given by equations that couldn't be read: of no known dimension."""
         self.component = component
-        self.dimensions: dict[tuple[str, ...], Dimension | None] = dict(_visible_names(component))
+        self.dimensions: dict[tuple[str, ...], Dimension | None] = {(name,): None for name in undefined}
+        self.dimensions |= dict(_visible_names(component))
         passed = {connector for connector, _, _ in component.passed}
         for name, connector in component.connectors:
             if name not in passed:

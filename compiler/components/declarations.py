@@ -1,7 +1,7 @@
 """The declarations of a component: equations, what it sends, variables and parameters; YAML to typed data.
 
 Takes: the sections of a definition.
-Gives: `read_equations`, `read_sends`, `read_variables`, `read_parameters`.
+Gives: `read_equations`, `names_of_faulty`, `read_sends`, `read_variables`, `read_parameters`.
 Guarantees: a number is in SI and of its declared unit's dimension; a fault is reported and its item left out.
 Does not: look at how the declarations fit together (see `definitions`).
 """
@@ -30,6 +30,7 @@ from apc.compiler.source.reading import (
 )
 
 Sends = tuple[tuple[str, Expr, str, Place], ...]
+_DEFINES = re.compile(r"\s*([A-Za-z]\w*)\s*=", re.ASCII)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
 
@@ -53,6 +54,22 @@ def read_equations(node: Node | None, mistakes: Mistakes) -> tuple[Equation, ...
     return tuple(found)
 
 
+def names_of_faulty(node: Node | None, read: tuple[Equation, ...]) -> set[str]:
+    """Return the names that stand alone on the left of equations that couldn't be read.
+
+    Parameters
+    ----------
+    node
+        The section `equations`.
+    read
+        Those of its equations that were read.
+    """
+    items = node.items if isinstance(node, Sequence) else ()
+    known = {equation.text for equation in read}
+    texts = [item.text for item in items if isinstance(item, Scalar) and item.text not in known]
+    return {found[1] for text in texts if (found := _DEFINES.match(text))}
+
+
 def read_sends(node: Node | None, mistakes: Mistakes) -> Sends:
     """Read `sends: {x: sample(object.x)}` as (name, expression, its text, its place)."""
     found = []
@@ -74,7 +91,8 @@ def read_variables(node: Node | None, mistakes: Mistakes) -> tuple[Variable, ...
     found = []
     for key, value in entries(read_mapping(node, "variables", mistakes, hint="variables: {x: {unit: m}}")):
         name = read_name(key, "a variable", mistakes)
-        body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{unit: m}}")
+        meant = value.text if isinstance(value, Scalar) and _is_unit(value.text, value.place) else "…"
+        body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{unit: {meant}}}")
         if name is None or body is None:
             continue
         body = check_keys(body, ("unit", "start", "about"), f"variable {name}", mistakes)
@@ -84,6 +102,13 @@ def read_variables(node: Node | None, mistakes: Mistakes) -> tuple[Variable, ...
         if unit is not None:
             found.append(Variable(name, unit, start, about, key.place))
     return tuple(found)
+
+
+def _is_unit(text: str, place: Place) -> bool:
+    try:
+        return bool(text.strip()) and parse_unit(text, place) is not None
+    except ApcError:
+        return False
 
 
 def read_parameters(node: Node | None, mistakes: Mistakes) -> tuple[Parameter, ...]:

@@ -22,7 +22,13 @@ from apc.compiler.components.component import (
     Variable,
 )
 from apc.compiler.components.component_check import ComponentNames, check_balance
-from apc.compiler.components.declarations import read_equations, read_parameters, read_sends, read_variables
+from apc.compiler.components.declarations import (
+    names_of_faulty,
+    read_equations,
+    read_parameters,
+    read_sends,
+    read_variables,
+)
 from apc.compiler.components.parts import MOST_PARTS, Scope, read_entry
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
@@ -95,29 +101,39 @@ def read_component(source: Source, library: Definitions) -> Component:
     mistakes.raise_if_any()
     assert root is not None
     root = check_keys(root, COMPONENT_KEYS, "a component", mistakes)
-    draft = _read_declarations(root, library, mistakes)
+    # An equation that can't be read hides no mistake of the others.
+    unread = Mistakes()
+    draft = _read_declarations(root, library, mistakes, unread)
+    sends = read_sends(root.get("sends"), unread)
+    if mistakes:
+        unread.pass_on(mistakes)
     mistakes.raise_if_any()
-    names = ComponentNames(draft)
-    sends = read_sends(root.get("sends"), mistakes)
+    names = ComponentNames(draft, names_of_faulty(root.get("equations"), draft.equations))
     locals_, found = names.infer_locals(sends), names.infer_sends(sends, mistakes)
     component = replace(draft, locals=(*draft.locals, *locals_), sends=(*draft.sends, *found))
-    mistakes.raise_if_any()
-    names.check(component, mistakes)
+    if not mistakes:
+        names.check(component, mistakes)
+    unread.pass_on(mistakes)
     mistakes.raise_if_any()
     check_balance(component, mistakes)
     mistakes.raise_if_any()
     return component
 
 
-def _read_declarations(root: Mapping, library: Definitions, mistakes: Mistakes) -> Component:
-    """Read everything but what has to be inferred; what the component extends comes first."""
+def _read_declarations(
+    root: Mapping, library: Definitions, mistakes: Mistakes, unread: Mistakes
+) -> Component:
+    """Read everything but what has to be inferred; what the component extends comes first.
+
+    `unread` takes the mistakes of equations.
+    """
     title = root.get("component")
     name = (read_name(title, "a component", mistakes) if isinstance(title, Scalar) else None) or "?"
     base = _base(root.get("extends"), library, mistakes)
     connectors = _connectors(root.get("connectors"), library, mistakes)
     parameters = read_parameters(root.get("parameters"), mistakes)
     variables = read_variables(root.get("variables"), mistakes)
-    equations = read_equations(root.get("equations"), mistakes)
+    equations = read_equations(root.get("equations"), unread)
     about = read_text(root.get("about"), "about", mistakes) or ""
     cited = read_text(root.get("source"), "source", mistakes) or ""
     place = title.place if title is not None else root.place

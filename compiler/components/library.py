@@ -1,6 +1,6 @@
 """The component library: which definitions there are, each read when it is first asked for.
 
-Takes: folders of YAML files. Gives: `Library`.
+Takes: folders of YAML files. Gives: `Library`, `definition_of`.
 Guarantees: a file is read at most once, and only if a scene needs it (or it lies in a user's own folder); no
 two files of a user's define one name.
 Does not: read what is in a definition (see `definitions`).
@@ -40,7 +40,7 @@ class Library:
         own: dict[str, Path] = {}
         for path in (path for folder in folders for path in files_below(folder, SUFFIX)):
             source = _read(path)
-            name = _title(source)
+            _, name = definition_of(source)
             if not name:
                 continue
             if not same_file(own.setdefault(name, path), path):
@@ -132,13 +132,14 @@ def _text(path: Path) -> bytes:
         return b"component"  # why it is not read tells nothing of what is in it
 
 
-def _title(source: Source) -> str | None:
-    if isinstance(source.root, Mapping):
+def definition_of(source: Source) -> tuple[str, str]:
+    """Return what a text defines, a component or connector, and its name; two empty texts if neither."""
+    if isinstance(source.root, Mapping) and source.root.get("topology") is None:
         for kind in ("component", "connector"):
             node = source.root.get(kind)
             if isinstance(node, Scalar):
-                return node.text
-    return None
+                return kind, node.text
+    return "", ""
 
 
 def _is_definition(source: Source, kind: str) -> bool:

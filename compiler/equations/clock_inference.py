@@ -13,10 +13,17 @@ from __future__ import annotations
 from collections.abc import Container
 
 from apc.compiler.components.component import OTHERS
-from apc.compiler.equations.flatten import FlatEquation
+from apc.compiler.equations.flatten import CONNECTION, FlatEquation
 from apc.compiler.equations.reductions import hears_others
 from apc.compiler.errors import Mistakes
-from apc.compiler.language.expression import Call, Expr, Name, children, format_expression
+from apc.compiler.language.expression import (
+    Call,
+    Expr,
+    Name,
+    children,
+    format_expression,
+    transform,
+)
 
 CONTINUOUS = "continuous"
 
@@ -33,9 +40,13 @@ class ClockInference:
         self._parents: dict[str, str] = {}
         self._clock_of_set: dict[str, str] = {}
         self._hearing: dict[str, FlatEquation] = {}  # by what hears
+        self._given: dict[str, FlatEquation] = {}  # a part's equation, by the name alone on its left
+        self._told: set[str] = set()  # parts whose clocked flow was told of
 
     def visit(self, name: str, equation: FlatEquation) -> None:
         """Join what stands in an equation, which goes by this name."""
+        if isinstance(equation.left, Name) and equation.origin != CONNECTION:
+            self._given.setdefault(".".join(equation.left.parts), equation)
         for side in (equation.left, equation.right):
             self._visit(side, name, equation)
 
@@ -78,6 +89,10 @@ class ClockInference:
             self._report(because, clock, known, equation)
 
     def _report(self, name: str, its: str, others: str, equation: FlatEquation) -> None:
+        given = self._given.get(name)
+        if equation.origin == CONNECTION and others == CONTINUOUS and given is not None:
+            self._report_flow(name, its, given)
+            return
         if its == CONTINUOUS:
             hint = f"sample({name})"
         elif others == CONTINUOUS:
@@ -91,6 +106,25 @@ class ClockInference:
             f"{name} is {domain(its)} and the rest is {domain(others)}",
             hint=hint,
         )
+
+    def _report_flow(self, name: str, its: str, given: FlatEquation) -> None:
+        """Report a part's clocked flow where the part gives it: one of them holds what the others follow."""
+        if given.origin in self._told:
+            return
+        self._told.add(given.origin)
+
+        def own(node: Expr) -> Expr | None:
+            """Write a name as the part does, and a sample at its one clock without that."""
+            if isinstance(node, Name):
+                return Name(tuple(".".join(node.parts).removeprefix(f"{given.origin}.").split(".")))
+            if isinstance(node, Call) and node.function == "sample" and node.arguments[1:] == (at,):
+                return Call("sample", (transform(node.arguments[0], own),))
+            return None
+
+        at = Name((given.clock or "",))
+        left, right = (format_expression(transform(side, own)) for side in (given.left, given.right))
+        what = f"{name} acts on what it is joined to at all times, and is {domain(its)}"
+        self.mistakes.add("E505", given.place, what, hint=f"{left} = hold({right})")
 
     def _visit(self, expression: Expr, domain: str, equation: FlatEquation, *, heard: bool = False) -> None:
         """Join what ticks together; `heard` is inside a reduction, where alone `others` can be named."""

@@ -296,7 +296,8 @@ class _Partitioner:
             if whole in self.variables and self.clocks.of(whole) != CONTINUOUS:
                 its = domain(self.clocks.of(whole))
                 what = f"{send.name} is sent at ticks of {send.link}, and {whole} is {its}"
-                self.mistakes.add("E505", send.place, what, hint=f"sample(hold({whole}))")
+                own = whole.removeprefix(f"{send.name.rpartition('.')[0]}.")
+                self.mistakes.add("E505", send.place, what, hint=f"sample(hold({own}))")
         return replace(send, expression=self._cross(expression, CONTINUOUS, send))
 
 

@@ -38,6 +38,8 @@ from apc.compiler.scene.scene import Scene, SceneGroup
 
 PEERS = Name(("peers",))
 
+CONNECTION = "connection"  # where an equation comes from that is no part's
+
 _HELD = "held"  # with a number behind it, the name of an expression that is held
 
 # The functions whose value hangs on those of their arguments at the same moment, and on nothing else.
@@ -165,7 +167,7 @@ def _flatten_kind(scene: Scene, groups: list[SceneGroup], delays: set[str], mist
         variables += instance.held_variables
         equations += instance.held_equations
     equations += [
-        FlatEquation(left, right, "connection", None, place)
+        FlatEquation(left, right, CONNECTION, None, place)
         for left, right, place in connection_equations(parts, mistakes)
     ]
     for group in groups:

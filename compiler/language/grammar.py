@@ -51,6 +51,7 @@ from apc.compiler.language.expression import (
 from apc.compiler.language.lexer import Token, tokens
 from apc.compiler.words import cut
 
+ALIKE = 0.8  # of the letters of a function's name, for another to be the one that was meant
 MAX_LENGTH = 10_000  # characters of an expression
 MAX_DEPTH = 100  # levels of the tree; Python's own stack allows about 300
 MAX_DIGITS = 1000  # characters of a number: Python refuses an integer of 4300 digits
@@ -305,7 +306,13 @@ class _Parser:
         if self.kind in ("name", "number") and self.text[token.end : self.token.start].strip(" ") == "":
             said = self.text[token.start : self.token.end]
             what = f"{cut(said)} is not a number, and units stand on parameters only"
-            hint = f"{token.text}*{self.token.text}, or a parameter's name" if self.kind == "name" else ""
+            hint = ""
+            if self.kind == "name" and value == 0:
+                hint = token.text  # nothing is nothing in any unit
+            elif self.kind == "name":
+                hint = (
+                    f"a parameter, with default: {token.text} {self.token.text}; of a name, {token.text}*name"
+                )
             self.fail("E323", what, hint=hint, at=token.start)
         return Number(value, start=token.start, end=token.end)
 
@@ -360,9 +367,11 @@ class _Parser:
             return Name(tuple(token.text.split(".")), start=token.start, end=token.end)
         function = token.text
         if function not in FUNCTIONS:
-            close = nearest(function, FUNCTIONS)
-            hint = f"{close}(…)" if close else ""
-            self.fail("E325", f"there is no function {cut(function)}", hint=hint, at=token.start)
+            close = nearest(function, FUNCTIONS, alike=ALIKE)
+            what = f"there is no function {cut(function)}"
+            if not close:
+                what += f"; there are: {', '.join(sorted(FUNCTIONS))}"
+            self.fail("E325", what, hint=f"{close}(…)" if close else "", at=token.start)
         self.step()
         arguments: list[Expr] = []
         while self.kind != ")":

@@ -124,6 +124,8 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         name, right = confused
         got += f" ({name} is {spelled(name)}: case matters)"
     hint = f"{what}: {number.group().strip()}" + ("" if wanted.text == "1" else f" {right}")
+    if found.unit == NO_UNIT and right == "s":  # of either size there are times in a scene
+        hint = f"{what}: {number.group().strip()} ms, or {number.group().strip()} s"
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 
 

@@ -109,9 +109,8 @@ class PartReader:
         peers = sum(self.counts.get(group, 0) for group in groups)
         if entry.component.hears_others and peers == 1:
             what = f"{name} ({entry.component.name}) follows the other peers and"
-            self.mistakes.add(
-                "E208", entry.place, what, expected="at least 2 peers", got="1", hint="count: 2"
-            )
+            hint = f"at: [{', '.join(self.counts)}]" if len(self.counts) > 1 else "count: 2"
+            self.mistakes.add("E208", entry.place, what, expected="at least 2 peers", got="1", hint=hint)
         found: list[Part] = []
         for index in range(1, (entry.count or 1) + 1):
             read = read_entry(

@@ -9,6 +9,7 @@ Does not: know what a number is for, but for the bounds of a component's paramet
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Container, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -29,6 +30,8 @@ from apc.compiler.language.values import (
 )
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import brief, entries, read_mapping, read_name
+
+_WORD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 
 def read_new_name(key: Scalar, what: str, taken: Container[str], mistakes: Mistakes) -> str | None:
@@ -69,9 +72,15 @@ def read_count_by_names(node: Node, parameters: Node | None, mistakes: Mistakes)
     parameters
         The section `parameters`, whose own mistakes are told when it is read for good.
     mistakes
-        Takes E206 what the count names that isn't there, E208 what follows from the number of peers.
+        Takes E208 what the count names that isn't there, or what follows from the number of peers.
     """
     numbers = read_named_numbers(parameters, 1, Mistakes())
+    words = _WORD.findall(node.text) if isinstance(node, Scalar) else []
+    unknown = [word for word in words if word != "peers" and word not in {*numbers.values, *numbers.faulty}]
+    if unknown:
+        expected, got = "a whole number, or an expression over numbers of parameters", brief(unknown[0])
+        mistakes.add("E208", node.place, "count", expected=expected, got=got, hint="count: 3")
+        return None
     found = replace(numbers, mistakes=mistakes).read(node, "count", DIMENSIONLESS, "1")
     waiting = [] if found is None or found.expression is None else list(names(found.expression))
     seen = set()

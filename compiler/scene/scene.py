@@ -18,7 +18,7 @@ from pathlib import Path
 from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Settable
-from apc.compiler.components.library import Library
+from apc.compiler.components.library import Library, definition_of
 from apc.compiler.errors import Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.tables import NamedFiles
@@ -152,6 +152,11 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     files = NamedFiles(_folder_of(source), mistakes)
     root = read_mapping(source.root, "a topology", mistakes, hint="topology: my-scene")
     if root is None:
+        return None
+    kind, name = definition_of(source)
+    if kind:
+        what = f"{name} is a {kind}; a topology has parts of its type, and names the folder it is in"
+        mistakes.add("E201", root.place, what, hint="library: ./parts")
         return None
     root = check_keys(root, KEYS, "a topology", mistakes)
     title = visible(read_text(_required(root, "topology", "my-scene", mistakes), "topology", mistakes) or "")

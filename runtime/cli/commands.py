@@ -119,15 +119,21 @@ def new(name: str) -> None:
 @apc.command()
 @file_argument
 def check(file: str | None) -> None:
-    """Report every mistake in a topology; build nothing.
+    """Report every mistake in a topology or component; write nothing.
 
     Exit code 0 if there is none, 1 otherwise.
     """
-    from apc.compiler.pipeline import compile_topology
+    start_single_threaded()
+    from apc.analysis.selfcheck import check_frame
+    from apc.compiler.pipeline import check_definition, compile_topology
     from apc.inputs import find_input
 
     path = Path(file) if file else find_input(compiled_too=False)
+    if found := check_definition(path):
+        tell(f"{path}: no mistakes. {found}.")
+        return
     system = compile_topology(path)
+    check_frame(system)
     tell(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
 
 
