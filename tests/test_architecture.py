@@ -33,7 +33,7 @@ HOUSE = (
     (
         "apc.compiler.equations",
         """
-        connections flatten reductions clock_inference clocks symbolic zero_test solution matching
+        connections flatten reductions clock_inference clocks terms symbolic zero_test solution matching
         residuals elimination tearing blocks derivatives aliases index structure
         """,
     ),
@@ -133,7 +133,7 @@ FORBIDDEN_CALLS = {
     "S",
     "deserialize",
 }
-FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "sympy.parsing"}
+FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle"}
 
 
 def modules() -> dict[str, Path]:
@@ -266,8 +266,8 @@ def test_analysing_a_compiled_model_needs_no_algebra_and_no_units(tmp_path: Path
     (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
     run = "from apc.__main__ import run\nassert run([{}]) == 0"
     compiled = loaded(run.format("'compile'"), tmp_path)
-    assert {"sympy", "casadi"} <= compiled and "pint" not in compiled  # its units are common ones
-    assert not {"scipy", "rich", "numpy.ma", "numpy.random"} & compiled
+    assert "casadi" in compiled and "pint" not in compiled  # its units are common ones
+    assert not {"sympy", "scipy", "rich", "numpy.ma", "numpy.random"} & compiled
     for words in ("'analyze'", "'analyze', 'scene.apc'", "'analyze', '--json'"):
         found = loaded(run.format(words), tmp_path)
         assert not {"sympy", "pint", "scipy", "matplotlib", "pandas", "rich"} & found
