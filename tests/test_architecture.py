@@ -16,7 +16,10 @@ from tests.topologies import AVERAGE, ROOT
 
 # Folder by folder, and in each its modules, earliest first: each may import only those before it.
 HOUSE = (
-    ("apc.compiler", "errors digits timings files words multiples weights plain compiled formula seal cache"),
+    (
+        "apc.compiler",
+        "frozen errors digits timings files words multiples weights plain compiled formula seal cache",
+    ),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
         "apc.compiler.language",
@@ -255,6 +258,12 @@ def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
     code += "assert len(files) == len(set(files))\n"
     code += "assert not [n for n in ('apc.runtime', 'apc.apc') if importlib.util.find_spec(n)]"
     python(code, tmp_path)
+
+
+def test_classes_are_cheap_to_make() -> None:
+    for name, path in modules().items():
+        own = re.search(r"^from dataclasses import .*\bdataclass\b", path.read_text(encoding="utf-8"), re.M)
+        assert not own, f"{name}: dataclass comes from apc.compiler.frozen"
 
 
 def test_importing_the_package_costs_nothing(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import casadi
@@ -29,6 +28,7 @@ from apc.compiler.equations.terms import (
     symbol,
     terms_of,
 )
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.recordings import TimeTable
 from apc.compiler.plain import Loop, composed
 

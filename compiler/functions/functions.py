@@ -10,7 +10,6 @@ Does not: write files, or put numbers in the place of parameters.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi
@@ -32,6 +31,7 @@ from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
 from apc.compiler.equations.symbolic import derivative_symbol
 from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.frozen import dataclass
 from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.functions.exchange import (
     Timings,

@@ -9,7 +9,6 @@ Does not: write functions (see `functions`).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clocks import HoldCrossing, PreviousCrossing, ReceiveCrossing
@@ -17,6 +16,7 @@ from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSend
 from apc.compiler.equations.symbolic import derivative_symbol, no_derivative, to_term
 from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.frozen import dataclass
 from apc.compiler.functions.casadi_writer import Definition
 
 

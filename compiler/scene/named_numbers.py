@@ -10,11 +10,11 @@ Does not: know what a number is for, but for the bounds of a component's paramet
 from __future__ import annotations
 
 from collections.abc import Collection, Container, Mapping
-from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.components.component import RESERVED, Component, Number, Option, Settable
 from apc.compiler.errors import ApcError, Mistakes
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.values import (
     PEERS,

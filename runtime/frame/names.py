@@ -8,11 +8,11 @@ Does not: read or change values.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.compiled import PEERS, CompiledSystem, Parameter, Timing, counts_peers
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.frozen import dataclass
 
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
