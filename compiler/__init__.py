@@ -1,6 +1,6 @@
 """Text to CasADi, a folder a stage; a module imports only what stands before it.
 
-errors words digits         what all are written in; timings: how long it takes
+frozen errors words digits  what all are written in; timings: how long it takes
 files                       what is read and written, whoever named it
 multiples                   common multiples and divisors of exact times
 weights                     exact sums of the decimals by which peers weigh one another
@@ -15,8 +15,9 @@ scene                       named_numbers, timebase, instances, sections, channe
 equations                   connections: where connectors meet; flatten
                             reductions: what is heard of the others; clock_inference: what ticks together;
                             clocks
-                            symbolic, zero_test: SymPy; solution, matching, residuals, elimination, tearing,
-                            blocks: solving; derivatives, aliases, index: derivatives and states; structure
+                            terms, symbolic, zero_test: algebra; solution, matching, residuals, elimination,
+                            tearing, blocks: solving; derivatives, aliases, index: derivatives and states;
+                            structure
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
 compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others

@@ -13,7 +13,7 @@ What a model was made from, by name:
     ./parts/        a folder of the user's own components: all definitions in it
     Mass            a definition of the built-in library
     apc             the compiler itself: all its modules
-    casadi, sympy   the libraries that write the functions, by their versions
+    casadi          the library that writes the functions, by its version
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
 from apc.compiler.files import RefusedError, files_below, read_file
+from apc.compiler.frozen import dataclass
 from apc.compiler.seal import is_sealed
 
 FORMAT = 9  # of NAME.apc
@@ -45,7 +45,7 @@ MOST_LISTED = 2**22  # bytes of the archive's list of members: each takes ten ti
 MOST_VALUES = 2**22  # in the document: each takes up to a hundred bytes of memory
 SUFFIX = ".yaml"  # of the files in a folder of components
 PROGRAM = "apc"
-LIBRARIES = ("casadi", "sympy")  # a newer one may write other functions
+LIBRARIES = ("casadi",)  # a newer one may write other functions
 # What zipfile, its decompressors, json and our own reading of the document raise at what isn't theirs.
 DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError),

@@ -17,12 +17,13 @@ Every function of a kind takes some of these vectors, in this order:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from apc.compiler.frozen import dataclass
 
 PEERS = "peers"  # the parameter that holds the number of peers
 LARGEST_COUNT = 10**9  # of peers in one group

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Iterable
-from dataclasses import dataclass
+
+from apc.compiler.frozen import dataclass
 
 SHOWN = 75  # characters of a source line, so that it fits a terminal of 80 with its indent
 

@@ -24,11 +24,12 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import casadi
+
+from apc.compiler.frozen import dataclass
 
 _UNARY = {
     name: getattr(casadi, f"OP_{name.upper()}")

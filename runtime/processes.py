@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -28,6 +27,7 @@ from typing import Any, Generic, TypeVar
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.threads import single_threaded
 
 Shared = TypeVar("Shared")

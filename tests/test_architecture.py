@@ -18,7 +18,7 @@ from tests.topologies import AVERAGE, ROOT
 HOUSE = (
     (
         "apc.compiler",
-        "errors digits timings files words multiples weights plain compiled crowd formula seal cache",
+        "frozen errors digits timings files words multiples weights plain compiled crowd formula seal cache",
     ),
     ("apc.compiler.source", "nodes yaml_faults compose source reading"),
     (
@@ -36,7 +36,7 @@ HOUSE = (
     (
         "apc.compiler.equations",
         """
-        connections flatten reductions clock_inference clocks symbolic zero_test solution matching
+        connections flatten reductions clock_inference clocks terms symbolic zero_test solution matching
         residuals elimination tearing blocks derivatives aliases index structure
         """,
     ),
@@ -136,7 +136,7 @@ FORBIDDEN_CALLS = {
     "S",
     "deserialize",
 }
-FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "sympy.parsing"}
+FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle"}
 
 
 def modules() -> dict[str, Path]:
@@ -260,6 +260,12 @@ def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
     python(code, tmp_path)
 
 
+def test_classes_are_cheap_to_make() -> None:
+    for name, path in modules().items():
+        own = re.search(r"^from dataclasses import .*\bdataclass\b", path.read_text(encoding="utf-8"), re.M)
+        assert not own, f"{name}: dataclass comes from apc.compiler.frozen"
+
+
 def test_importing_the_package_costs_nothing(tmp_path: Path) -> None:
     heavy = {"numpy", "casadi", "scipy", "sympy", "pint", "yaml", "click", "rich", "flint"}
     assert not heavy & loaded("import apc", tmp_path)
@@ -269,8 +275,8 @@ def test_analysing_a_compiled_model_needs_no_algebra_and_no_units(tmp_path: Path
     (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
     run = "from apc.__main__ import run\nassert run([{}]) == 0"
     compiled = loaded(run.format("'compile'"), tmp_path)
-    assert {"sympy", "casadi"} <= compiled and "pint" not in compiled  # its units are common ones
-    assert not {"scipy", "rich", "numpy.ma", "numpy.random"} & compiled
+    assert "casadi" in compiled and "pint" not in compiled  # its units are common ones
+    assert not {"sympy", "scipy", "rich", "numpy.ma", "numpy.random"} & compiled
     for words in ("'analyze'", "'analyze', 'scene.apc'", "'analyze', '--json'"):
         found = loaded(run.format(words), tmp_path)
         assert not {"sympy", "pint", "scipy", "matplotlib", "pandas", "rich"} & found

@@ -21,6 +21,7 @@ from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Number
 from apc.compiler.language.grammar import parse_equation, parse_expression
+from tests.algebra import as_sympy
 
 PLACE = Place("test.yaml", 1, 1)
 MASS = """
@@ -71,11 +72,11 @@ def values(kind: SortedKind, **numbers: float) -> dict[str, float]:
     for step in kind.partitions[0].assignments:
         assert not isinstance(step, ImplicitBlock)
         name, expression = step
-        table = {s: known[s.name.replace(".", "_")] for s in expression.free_symbols}
-        known[name.replace(".", "_")] = float(expression.subs(table))
+        table = {as_sympy(s): known[s.name.replace(".", "_")] for s in expression.free_symbols}
+        known[name.replace(".", "_")] = float(as_sympy(expression).subs(table))
     for name, expression in (*kind.aliases, *((s, e) for s, _, e in kind.samples)):
-        table = {s: known[s.name.replace(".", "_")] for s in expression.free_symbols}
-        known[name.replace(".", "_")] = float(expression.subs(table))
+        table = {as_sympy(s): known[s.name.replace(".", "_")] for s in expression.free_symbols}
+        known[name.replace(".", "_")] = float(as_sympy(expression).subs(table))
     return known
 
 

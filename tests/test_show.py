@@ -183,7 +183,7 @@ def test_the_text_tells_graph_equations_and_schedule() -> None:
         "      hears the others over lan",
         "  18 equations, 18 unknowns",
         "    device.mass*der(device.v) = device.flange.f - device.damping*device.v",
-        "    der(device.v) := (-device.damping*device.v + device.flange.f)/device.mass",
+        "    der(device.v) := (device.flange.f - device.damping*device.v)/device.mass",
         "  frame of 8 ms, after which every clock stands as before",
         "  network ticks every 8 ms, once a frame: packets leave over lan",
         "  contact.f acts from 1 ms after its tick, held for 1 ms until the next one acts",

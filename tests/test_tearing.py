@@ -17,7 +17,8 @@ from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.matching import match_columns, strong_components
 from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import ImplicitBlock
-from apc.compiler.equations.symbolic import no_derivative, symbol, to_sympy
+from apc.compiler.equations.symbolic import no_derivative, to_term
+from apc.compiler.equations.terms import symbol
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.language.expression import Name
@@ -33,7 +34,7 @@ def solve(text: str, unknowns: str) -> tuple[tuple[object, ...], list[str]]:
     residuals = []
     for line in filter(None, map(str.strip, text.splitlines())):
         parsed = parse_equation(line, PLACE)
-        left, right = (to_sympy(side, no_derivative) for side in (parsed.left, parsed.right))
+        left, right = (to_term(side, no_derivative) for side in (parsed.left, parsed.right))
         equation = FlatEquation(parsed.left, parsed.right, "test", None, PLACE)
         residuals.append(Residual(left - right, equation))
     mistakes = Mistakes()

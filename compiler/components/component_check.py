@@ -97,9 +97,10 @@ class ComponentNames:
             and equation.left.parts not in self.dimensions
         }
         # An unknown name on the right is reported once, by `check`.
-        open_ = {(OTHERS, name): (expression, text, place) for name, expression, text, place in sends} | {
+        open_: dict[tuple[str, ...], tuple[Expr, str, Place]] = {
             name: (equation.right, equation.text, equation.place) for name, equation in equations.items()
         }
+        open_ = {(OTHERS, name): (expression, text, place) for name, expression, text, place in sends} | open_
         self.dimensions |= dict.fromkeys(open_)
         settled = list(open_)
         while settled:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 
 from apc.compiler.components.component import Component, Entry, Number, Option, Reference
 from apc.compiler.errors import Mistakes, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.values import Binding, read_binding
 from apc.compiler.source.nodes import Mapping as MappingNode

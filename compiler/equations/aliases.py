@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence, Set
 
-import sympy
-
 from apc.compiler.equations.derivatives import Derivative, Derivatives
 from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import Assignment
+from apc.compiler.equations.terms import ZERO, Symbol, Term, terms_of
 
 
 class Aliases:
@@ -43,13 +42,13 @@ class Aliases:
         """What each of the other names stands for."""
         return tuple((name, self._stands_for(name, 0)) for name in self.names if name in self.parent)
 
-    def substitute(self, expression: sympy.Expr) -> sympy.Expr:
+    def substitute(self, expression: Term) -> Term:
         """Return the expression in the names kept."""
         derivatives = self.derivatives.derivatives(expression)
         other = {
             s: one for s, derivative in derivatives.items() if (one := self._stands_for(*derivative)) is not s
         }
-        return expression.xreplace(other) if other else expression  # putting it together anew takes longest
+        return expression.replace(other) if other else expression  # putting it together anew takes longest
 
     def remove(self, residuals: Sequence[Residual]) -> list[Residual]:
         """Take the alias equations out, pass by pass until none is left; return the others, rewritten."""
@@ -75,13 +74,15 @@ class Aliases:
         said = set(self._row.values())
         return [residual for row, residual in rows.items() if row not in said]
 
-    def _pair(self, expression: sympy.Expr) -> tuple[Derivative, Derivative, int] | None:
+    def _pair(self, expression: Term) -> tuple[Derivative, Derivative, int] | None:
         """Return a, b and the sign of a = ±b; for a = 0, a twice and the sign 0; else None."""
-        derivatives = self.derivatives.derivatives(expression)
-        terms = [term.as_coeff_Mul() for term in sympy.Add.make_args(expression)]
-        if len(terms) > 2 or any(s not in derivatives for _, s in terms):
+        terms = terms_of(expression)
+        if not 0 < len(terms) <= 2:
             return None
-        (factor, one), (other_factor, two) = terms[0], terms[-1]
+        derivatives = self.derivatives.derivatives(expression)
+        (one, factor), (two, other_factor) = terms[0], terms[-1]
+        if not (isinstance(one, Symbol) and isinstance(two, Symbol) and {one, two} <= derivatives.keys()):
+            return None
         if len(terms) == 1:
             return derivatives[one], derivatives[one], 0
         if abs(factor) != abs(other_factor):
@@ -108,7 +109,7 @@ class Aliases:
             follows = self.velocities[follows]
         return follows != x
 
-    def _stands_for(self, name: str, order: int) -> sympy.Expr:
+    def _stands_for(self, name: str, order: int) -> Term:
         sign = 1
         while sign:
             if name in self.parent:
@@ -119,4 +120,4 @@ class Aliases:
             else:
                 found = self.derivatives.symbol(name, order)
                 return found if sign == 1 else -found
-        return sympy.S.Zero
+        return ZERO

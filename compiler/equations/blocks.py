@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-import sympy
-
 from apc.compiler.equations.elimination import ZeroTests, eliminate
 from apc.compiler.equations.matching import match_columns, strong_components
 from apc.compiler.equations.residuals import (
@@ -31,9 +29,9 @@ from apc.compiler.equations.symbolic import (
     is_no_number,
     linear_form,
     smooth_pieces,
-    symbol,
 )
 from apc.compiler.equations.tearing import tear
+from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, add, scaled, symbol
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
 from apc.compiler.errors import Mistakes, Place
 
@@ -43,11 +41,11 @@ MOST_GUESSES, MOST_PIECES = 3, 64
 
 def solve_blocks(
     residuals: Sequence[Residual],
-    unknowns: Sequence[sympy.Symbol],
+    unknowns: Sequence[Symbol],
     where: str,
     mistakes: Mistakes,
     *,
-    nonzero: Collection[sympy.Symbol] = (),
+    nonzero: Collection[Symbol] = (),
     vanishes: Vanishing = NOTHING_VANISHES,
     place: Place = SCENE,
 ) -> tuple[Step, ...]:
@@ -99,7 +97,7 @@ class _Solver:
         self.mistakes = mistakes
         self.tests = tests
 
-    def checked(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
+    def checked(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> list[Step]:
         """Solve one block; its expressions must be numbers: what was divided may cancel."""
         steps = self.solve(block, unknowns)
         expressions = (
@@ -116,7 +114,7 @@ class _Solver:
             return []
         return steps
 
-    def solve(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
+    def solve(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> list[Step]:
         """Return what gives the unknowns of one block, explicit where it is linear in them."""
         known = frozenset(unknowns)
         forms = [linear_form(residual.expression, known) for residual in block]
@@ -135,7 +133,7 @@ class _Solver:
             return []
         return [(unknowns[0].name, -rest / coefficient)]
 
-    def _loop(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> list[Step]:
+    def _loop(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> list[Step]:
         """Tear a nonlinear block; every residual of it must be one that the guesses can make zero."""
         made = tear(block, unknowns, self.tests.is_zero)
         residuals = [_put_in(residual, made.inner) for residual in made.residuals]
@@ -147,17 +145,17 @@ class _Solver:
             return []
         return [made]
 
-    def _is_open(self, residuals: Sequence[sympy.Expr], guesses: Sequence[sympy.Symbol]) -> bool:
+    def _is_open(self, residuals: Sequence[Term], guesses: Sequence[Symbol]) -> bool:
         """Return whether between corners the residuals don't depend on the guesses, or only on some."""
         if len(guesses) > MOST_GUESSES:
             return False
-        pieces = smooth_pieces(sympy.Tuple(*residuals), MOST_PIECES)
+        pieces = smooth_pieces(residuals, MOST_PIECES)
         for piece in pieces or ():
             try:
-                slopes = sympy.Matrix([[_slope(one, guess) for guess in guesses] for one in piece])
+                slopes = [[_slope(one, guess) for guess in guesses] for one in piece]
             except NoDerivativeError:
                 continue
-            determinant = slopes.det(method="berkowitz")
+            determinant = _determinant(slopes)
             if self.tests.is_zero(determinant) or self.tests.vanishes(determinant):
                 return True
         return False
@@ -166,7 +164,7 @@ class _Solver:
         what = f"{self.where} {fault}: {made.chain}, by {listed(made.equations)}"
         self.mistakes.add("E503", block[0].equation.place, what)
 
-    def _report_dependent(self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol]) -> None:
+    def _report_dependent(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> None:
         what = (
             f"{self.where} depend on each other and don't determine {listed([u.name for u in unknowns])}: "
             f"{listed([residual.shown for residual in block])}"
@@ -174,14 +172,27 @@ class _Solver:
         self.mistakes.add("E511", block[0].equation.place, what)
 
 
-def _slope(residual: sympy.Expr, by: sympy.Symbol) -> sympy.Expr:
+def _slope(residual: Term, by: Symbol) -> Term:
     """Return the derivative of a residual. Raises NoDerivativeError if it has none."""
-    return differential(residual, lambda s: sympy.Integer(s == by))
+    return differential(residual, lambda s: ONE if s == by else ZERO)
 
 
-def _put_in(residual: sympy.Expr, inner: Sequence[Assignment]) -> sympy.Expr:
+def _determinant(rows: Sequence[Sequence[Term]]) -> Term:
+    """Return the determinant of a few rows, by Laplace's expansion along the first."""
+    if not rows:
+        return ONE
+    minors = (_determinant([[*row[:j], *row[j + 1 :]] for row in rows[1:]]) for j in range(len(rows)))
+    return add(
+        *(
+            scaled(entry * minor, (-1) ** j)
+            for j, (entry, minor) in enumerate(zip(rows[0], minors, strict=True))
+        )
+    )
+
+
+def _put_in(residual: Term, inner: Sequence[Assignment]) -> Term:
     """Return a residual with the inner values put in, when they are few."""
     if len(inner) <= MOST_LISTED:
         for name, expression in reversed(inner):
-            residual = residual.xreplace({symbol(name): expression})
+            residual = residual.replace({symbol(name): expression})
     return residual

@@ -19,7 +19,7 @@ first packet arrives a receiver holds the sender's start values; before the firs
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 
 from apc.compiler.compiled import count_of
@@ -28,6 +28,7 @@ from apc.compiler.equations.clock_inference import CONTINUOUS, ClockInference, d
 from apc.compiler.equations.flatten import FlatEquation, FlatKind, FlatSend, FlatSystem, is_made
 from apc.compiler.equations.reductions import affine_in_others, hears_others
 from apc.compiler.errors import Mistakes
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
     Binary,
     Call,

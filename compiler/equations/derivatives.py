@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-import sympy
-
 from apc.compiler.equations.symbolic import (
     NoDerivativeError,
     derivative_symbol,
     differential,
-    symbol,
 )
+from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, symbol
 
 TIME = symbol("time")
 Derivative = tuple[str, int]  # a variable and how often it is differentiated
@@ -35,7 +33,7 @@ class Derivatives:
         velocities = velocities or {}
         derived = set(velocities.values())
         self.names = [name for name in names if name not in derived]
-        self._derivatives: dict[sympy.Symbol, Derivative] = {}
+        self._derivatives: dict[Symbol, Derivative] = {}
         self._named: dict[str, int] = {}
         for name in self.names:
             self._derivatives[symbol(name)] = (name, 0)
@@ -61,12 +59,12 @@ class Derivatives:
         """Return how many derivatives of a variable have names of their own."""
         return self._named.get(name, 0)
 
-    def add(self, name: str) -> sympy.Symbol:
+    def add(self, name: str) -> Symbol:
         """Add a variable and return its symbol."""
         self.names.append(name)
         return self.symbol(name, 0)
 
-    def symbol(self, name: str, order: int) -> sympy.Symbol:
+    def symbol(self, name: str, order: int) -> Symbol:
         """Return the symbol of a derivative of a variable."""
         known = self._symbols.get((name, order))
         if known is None:
@@ -75,19 +73,19 @@ class Derivatives:
             self._symbols[name, order] = known
         return known
 
-    def derivatives(self, expression: sympy.Expr) -> dict[sympy.Symbol, Derivative]:
+    def derivatives(self, expression: Term) -> dict[Symbol, Derivative]:
         """Return the variables and derivatives an expression holds, in the order of their names."""
         found = [s for s in expression.free_symbols if s in self._derivatives]
         return {s: self._derivatives[s] for s in sorted(found, key=lambda s: s.name)}
 
-    def differentiate(self, expression: sympy.Expr) -> sympy.Expr:
+    def differentiate(self, expression: Term) -> Term:
         """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""
         return differential(expression, self._rate)
 
-    def _rate(self, s: sympy.Symbol) -> sympy.Expr:
+    def _rate(self, s: Symbol) -> Term:
         if s in self._jumping:
             raise NoDerivativeError(s.name, "a force that jumps at its ticks")
         if s in self._derivatives:
             name, order = self._derivatives[s]
             return self.symbol(name, order + 1)
-        return sympy.S.One if s == TIME else sympy.S.Zero
+        return ONE if s == TIME else ZERO

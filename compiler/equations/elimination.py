@@ -14,13 +14,12 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-import sympy
 
 from apc.compiler.equations.solution import Assignment
-from apc.compiler.equations.symbolic import LinearForm, symbol
+from apc.compiler.equations.symbolic import LinearForm
+from apc.compiler.equations.terms import ZERO, Number, Symbol, Term, add, symbol
 from apc.compiler.equations.zero_test import Vanishing, ZeroTest
+from apc.compiler.frozen import dataclass
 
 # An entry with more nodes than this gets a name of its own: substituted into one another, the entries of a
 # chain of a thousand equations would grow without end.
@@ -41,7 +40,7 @@ class ZeroTests:
     can_vanish: ZeroTest
     vanishes: Vanishing
 
-    def define(self, name: sympy.Symbol, expression: sympy.Expr) -> None:
+    def define(self, name: Symbol, expression: Term) -> None:
         """Let a symbol stand for an expression."""
         self.is_zero.define(name, expression)
         self.can_vanish.define(name, expression)
@@ -49,8 +48,8 @@ class ZeroTests:
 
 
 def eliminate(
-    forms: Sequence[LinearForm], unknowns: Sequence[sympy.Symbol], tests: ZeroTests
-) -> tuple[list[Assignment], list[sympy.Symbol]]:
+    forms: Sequence[LinearForm], unknowns: Sequence[Symbol], tests: ZeroTests
+) -> tuple[list[Assignment], list[Symbol]]:
     """Solve as many linear equations as unknowns.
 
     Parameters
@@ -79,9 +78,7 @@ def eliminate(
 class _Elimination:
     """The rows as they are eliminated: `rows[i][j]` is the coefficient of unknown j in equation i."""
 
-    def __init__(
-        self, forms: Sequence[LinearForm], unknowns: Sequence[sympy.Symbol], tests: ZeroTests
-    ) -> None:
+    def __init__(self, forms: Sequence[LinearForm], unknowns: Sequence[Symbol], tests: ZeroTests) -> None:
         place = {unknown: j for j, unknown in enumerate(unknowns)}
         self.unknowns = unknowns
         self.tests = tests
@@ -127,7 +124,7 @@ class _Elimination:
             self.right[other] = self._named(self.right[other] - factor * self.right[i])
         self.holders[j].clear()
 
-    def free(self) -> list[sympy.Symbol]:
+    def free(self) -> list[Symbol]:
         """Return the unknowns without a pivot."""
         solved = {column for _, column in self.pivots}
         return [unknown for j, unknown in enumerate(self.unknowns) if j not in solved]
@@ -136,7 +133,7 @@ class _Elimination:
         """Return what gives each unknown, by back substitution."""
         solved = []
         for i, j in reversed(self.pivots):
-            others = sympy.Add(
+            others = add(
                 *(value * self.unknowns[column] for column, value in self.rows[i].items() if column != j)
             )
             solved.append((self.unknowns[j].name, (self.right[i] - others) / self.rows[i][j]))
@@ -144,10 +141,17 @@ class _Elimination:
 
     def _cost(self, i: int, j: int) -> _Cost:
         entry, fill = self.rows[i][j], (len(self.rows[i]) - 1) * (len(self.holders[j]) - 1)
-        return self.tests.vanishes(entry), self.tests.can_vanish(entry), fill, not entry.is_Number, i, j
+        return (
+            self.tests.vanishes(entry),
+            self.tests.can_vanish(entry),
+            fill,
+            not isinstance(entry, Number),
+            i,
+            j,
+        )
 
-    def _subtract(self, row: int, column: int, value: sympy.Expr) -> None:
-        left = self._named(self.rows[row].get(column, sympy.S.Zero) - value)
+    def _subtract(self, row: int, column: int, value: Term) -> None:
+        left = self._named(self.rows[row].get(column, ZERO) - value)
         if self.tests.is_zero(left):
             self.rows[row].pop(column, None)
             self.holders[column].discard(row)
@@ -156,16 +160,11 @@ class _Elimination:
             self.holders[column].add(row)
             heapq.heappush(self.heap, self._cost(row, column))
 
-    def _named(self, entry: sympy.Expr) -> sympy.Expr:
+    def _named(self, entry: Term) -> Term:
         """Return an entry, or the name it gets when it is long."""
-        if not _is_long(entry):
+        if entry.size <= LARGEST_ENTRY:
             return entry
         short = symbol(f"{self.unknowns[0].name} by elimination {len(self.named) + 1}")
         self.tests.define(short, entry)
         self.named.append((short.name, entry))
         return short
-
-
-def _is_long(expression: sympy.Expr) -> bool:
-    """Return whether an expression has more than `LARGEST_ENTRY` nodes."""
-    return any(count >= LARGEST_ENTRY for count, _ in enumerate(sympy.preorder_traversal(expression)))

@@ -18,16 +18,15 @@ start value of a chosen state counts; the variables that depend on it follow, wh
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Set
-from dataclasses import dataclass
-
-import sympy
 
 from apc.compiler.equations.derivatives import TIME, Derivative, Derivatives
 from apc.compiler.equations.matching import match_columns
 from apc.compiler.equations.residuals import SCENE, Residual, report_singular
 from apc.compiler.equations.symbolic import NoDerivativeError, linear_form
+from apc.compiler.equations.terms import ZERO, Number, Symbol, Term
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
 from apc.compiler.errors import Mistakes, Place
+from apc.compiler.frozen import dataclass
 
 # More derivatives than this of one variable: no mechanical model needs them (a constraint on a position
 # needs two), so the equations do not end.
@@ -43,8 +42,8 @@ class Reduced:
     """Equations to solve for the unknowns. `states` are x, and der(x) where der(der(x)) is solved."""
 
     residuals: tuple[Residual, ...]
-    unknowns: tuple[sympy.Symbol, ...]
-    states: tuple[sympy.Symbol, ...]
+    unknowns: tuple[Symbol, ...]
+    states: tuple[Symbol, ...]
 
 
 def reduce_index(
@@ -91,8 +90,8 @@ def reduce_index(
     dummies = system.choose_dummies(started, where, mistakes)
     if dummies is None:
         return None
-    states: list[sympy.Symbol] = []
-    unknowns: list[sympy.Symbol] = []
+    states: list[Symbol] = []
+    unknowns: list[Symbol] = []
     for name in names:
         top = system.order[name]
         # The orders made unknowns of begin here; the one below is solved for as the derivative of a state.
@@ -193,7 +192,7 @@ class _System:
             report_no_derivative(residual, missing, mistakes)
             return False
         self.derivative[row], self.integral[len(self.residuals)] = len(self.residuals), row
-        if any(count >= LARGEST for count, _ in enumerate(sympy.preorder_traversal(expression))):
+        if expression.size > LARGEST:
             self._report_endless([row], mistakes)
             return False
         made = Residual(expression, residual.equation)
@@ -261,7 +260,7 @@ class _System:
         """
         symbols = {self.derivatives.symbol(*derivative): derivative for derivative in candidates}
         is_zero = ZeroTest()
-        matrix: dict[int, dict[Derivative, sympy.Expr]] = {}
+        matrix: dict[int, dict[Derivative, Term]] = {}
         for row in rows:
             form = linear_form(self.residuals[row].expression, symbols.keys())
             if form is None:  # else a derivative is linear in the highest derivatives
@@ -282,7 +281,10 @@ class _System:
             ]
             if not fixed:
                 continue
-            pivot = min(fixed, key=lambda row: (not matrix[row][derivative].is_Number, len(matrix[row]), row))
+            pivot = min(
+                fixed,
+                key=lambda row: (not isinstance(matrix[row][derivative], Number), len(matrix[row]), row),
+            )
             entries = matrix.pop(pivot)
             chosen.append(derivative)
             for row in still:
@@ -290,7 +292,7 @@ class _System:
                     continue
                 factor = matrix[row][derivative] / entries[derivative]
                 for other, value in entries.items():
-                    left = matrix[row].get(other, sympy.S.Zero) - factor * value
+                    left = matrix[row].get(other, ZERO) - factor * value
                     if other == derivative or is_zero(left):
                         matrix[row].pop(other, None)
                     else:
@@ -301,7 +303,7 @@ class _System:
             return None
         return chosen
 
-    def _moves(self, expression: sympy.Expr) -> bool:
+    def _moves(self, expression: Term) -> bool:
         return TIME in expression.free_symbols or bool(self.derivatives.derivatives(expression))
 
     def _report_condition(self, row: int, where: str, mistakes: Mistakes) -> None:
@@ -315,15 +317,13 @@ class _System:
         )
 
     def _report_no_choice(
-        self, matrix: dict[int, dict[Derivative, sympy.Expr]], where: str, mistakes: Mistakes
+        self, matrix: dict[int, dict[Derivative, Term]], where: str, mistakes: Mistakes
     ) -> None:
         """Say which constraints are left without a variable that follows from them."""
         for row, entries in matrix.items():
             residual = self.residuals[row]
             if entries and not all(self.vanishes(c) for c in entries.values()):
-                factors = ", ".join(
-                    f"{name} (by the factor {sympy.sstr(c)})" for (name, _), c in sorted(entries.items())
-                )
+                factors = ", ".join(f"{name} (by the factor {c})" for (name, _), c in sorted(entries.items()))
                 what = (
                     f"{where}: no variable follows from the constraint {residual.shown} in every position, "
                     f"since the factor moves and may vanish: {factors}"

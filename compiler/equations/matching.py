@@ -13,7 +13,8 @@ of Modelica compilers (Cellier and Kofman, Continuous System Simulation, ch. 7).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+
+from apc.compiler.frozen import dataclass
 
 # ---- matching ----
 

@@ -8,13 +8,12 @@ Does not: solve anything.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-import sympy
 
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.matching import leftovers
+from apc.compiler.equations.terms import Term
 from apc.compiler.errors import Mistakes, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.words import counted
 
 SCENE = Place("topology")
@@ -25,7 +24,7 @@ MOST_LISTED = 8  # equations or unknowns in one message
 class Residual:
     """An equation as `expression = 0`, with its origin for messages."""
 
-    expression: sympy.Expr
+    expression: Term
     equation: FlatEquation
 
     @property

@@ -7,13 +7,10 @@ Does not: solve anything (see `blocks`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.frozen import dataclass
 
-import sympy
-
-from apc.compiler.equations.symbolic import symbol
-
-Assignment = tuple[str, sympy.Expr]  # an unknown, and the expression that gives it
+Assignment = tuple[str, Term]  # an unknown, and the expression that gives it
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +24,11 @@ class ImplicitBlock:
     unknowns: tuple[str, ...]
     tearing: tuple[str, ...]
     inner: tuple[Assignment, ...]
-    residuals: tuple[sympy.Expr, ...]  # as many as tearing unknowns
+    residuals: tuple[Term, ...]  # as many as tearing unknowns
     equations: tuple[str, ...]
 
     @property
-    def free_symbols(self) -> set[sympy.Symbol]:
+    def free_symbols(self) -> set[Symbol]:
         """The symbols the block's solution depends on."""
         found = {s for e in (*self.residuals, *(e for _, e in self.inner)) for s in e.free_symbols}
         return found - {symbol(name) for name in self.unknowns}

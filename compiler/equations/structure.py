@@ -13,10 +13,7 @@ variables with a start value the one named first; those of the others are not lo
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence, Set
-from dataclasses import dataclass
 from fractions import Fraction
-
-import sympy
 
 from apc.compiler.equations.aliases import Aliases
 from apc.compiler.equations.blocks import solve_blocks
@@ -33,9 +30,11 @@ from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.index import reduce_index, report_no_derivative
 from apc.compiler.equations.residuals import SCENE, Residual, report_no_number
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
-from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, symbol, to_sympy
+from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, to_term
+from apc.compiler.equations.terms import ZERO, Symbol, Term, symbol
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Given, Vanishing
 from apc.compiler.errors import Mistakes
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import Expr, Name, names
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.scene.scene import Scene
@@ -52,7 +51,7 @@ class SortedPartition:
     assignments: tuple[Step, ...]
 
     @property
-    def definitions(self) -> dict[sympy.Symbol, sympy.Expr | ImplicitBlock]:
+    def definitions(self) -> dict[Symbol, Term | ImplicitBlock]:
         """What gives each unknown its value."""
         return {
             symbol(name): step if isinstance(step, ImplicitBlock) else step[1]
@@ -68,7 +67,7 @@ class SortedSend:
     name: str
     link: str
     unit: str
-    expression: sympy.Expr
+    expression: Term
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +78,7 @@ class SortedKind:
     states: tuple[str, ...]
     aliases: tuple[Assignment, ...]
     partitions: tuple[SortedPartition, ...]
-    samples: tuple[tuple[str, str, sympy.Expr], ...]  # (symbol, clock, expression)
+    samples: tuple[tuple[str, str, Term], ...]  # (symbol, clock, expression)
     holds: tuple[HoldCrossing, ...]
     previous: tuple[PreviousCrossing, ...]
     receives: tuple[ReceiveCrossing, ...]
@@ -116,7 +115,7 @@ def _positive_parameters(scene: Scene) -> list[str]:
     ]
 
 
-def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[sympy.Symbol, Given]]:
+def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     """Return the numbers of each group of a kind, those that differ from peer to peer as they do."""
     common = {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
     found = []
@@ -131,7 +130,7 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[sympy.Symbol, Given]]
                 continue
             # Inside a part, what depends on a number that differs from peer to peer does so too.
             if any(".".join(node.parts) in columns for node in names(value.expression)):
-                columns[name] = to_sympy(value.expression, no_derivative)
+                columns[name] = to_term(value.expression, no_derivative)
         found.append({symbol(name): number for name, number in (numbers | columns).items()})
     return found
 
@@ -192,12 +191,12 @@ class _Continuous:
     states: tuple[str, ...] = ()
     aliases: tuple[Assignment, ...] = ()
     steps: tuple[Step, ...] = ()
-    sampled: tuple[sympy.Expr, ...] = ()
-    sent: tuple[sympy.Expr, ...] = ()
+    sampled: tuple[Term, ...] = ()
+    sent: tuple[Term, ...] = ()
 
 
 def _sort_continuous(
-    kind: ClockedKind, divisors: Sequence[sympy.Symbol], vanishes: Vanishing, mistakes: Mistakes
+    kind: ClockedKind, divisors: Sequence[Symbol], vanishes: Vanishing, mistakes: Mistakes
 ) -> _Continuous:
     partition = kind.partitions[0]
     assert partition.clock == CONTINUOUS
@@ -262,7 +261,7 @@ def _sort_continuous(
 
 def _residuals(
     equations: Sequence[FlatEquation],
-    differentiate: Callable[[sympy.Expr], sympy.Expr],
+    differentiate: Callable[[Term], Term],
     mistakes: Mistakes,
 ) -> list[Residual]:
     """Return the equations as residuals, without those whose derivatives don't exist."""
@@ -278,13 +277,13 @@ def _residuals(
 def _value(
     equation: FlatEquation,
     expression: Expr,
-    differentiate: Callable[[sympy.Expr], sympy.Expr],
+    differentiate: Callable[[Term], Term],
     mistakes: Mistakes,
-) -> sympy.Expr | None:
+) -> Term | None:
     try:
-        value = to_sympy(expression, differentiate)
+        value = to_term(expression, differentiate)
     except NoDerivativeError as missing:
-        report_no_derivative(Residual(sympy.S.Zero, equation), missing, mistakes)
+        report_no_derivative(Residual(ZERO, equation), missing, mistakes)
         return None
     if is_no_number(value):
         report_no_number([Residual(value, equation).shown], equation.place, mistakes)
@@ -293,7 +292,7 @@ def _value(
 
 
 def _probes(
-    reads: Sequence[FlatEquation], values: Sequence[sympy.Expr], derivatives: Derivatives
+    reads: Sequence[FlatEquation], values: Sequence[Term], derivatives: Derivatives
 ) -> dict[str, Residual]:
     """Return, for each derivative that is sampled or sent, the equation `sampled der(x) = der(x)`.
 

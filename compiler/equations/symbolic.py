@@ -1,18 +1,34 @@
-"""The language's expressions as SymPy expressions.
+"""The language's expressions as terms, and what is asked of terms: derivatives, pieces, linear forms.
 
-Takes: `Expr`. Gives: `sympy.Expr`, by building nodes; no text is ever parsed by SymPy.
-Guarantees: functions whose SymPy versions would search for simplifications (min, max, if, …) stay opaque.
+Takes: `Expr`. Gives: `Term`; `differential`, `smooth_pieces`, `linear_form` of one.
+Guarantees: functions with a corner or a jump (min, max, if, …) stay as they are.
 Does not: know clocks or crossings, or which symbols move (see `index`).
 """
 
 from __future__ import annotations
 
-import operator
-import sys
-from collections.abc import Callable, Set
+from collections.abc import Callable, Sequence, Set
+from fractions import Fraction
 
-import sympy
-
+from apc.compiler.equations.terms import (
+    LARGEST,
+    NO_NUMBER,
+    ONE,
+    ZERO,
+    Function,
+    Number,
+    Product,
+    Sum,
+    Symbol,
+    Term,
+    add,
+    apply,
+    multiply,
+    number,
+    power,
+    scaled,
+    symbol,
+)
 from apc.compiler.language.expression import (
     Binary,
     Call,
@@ -23,97 +39,67 @@ from apc.compiler.language.expression import (
     Name,
     Negate,
     Not,
-    Number,
     fold,
 )
-
-# Smooth functions are SymPy's own; the others are opaque heads that only `functions` gives a meaning.
-SMOOTH: dict[str, Callable[[sympy.Expr], sympy.Expr]] = {
-    "sqrt": sympy.sqrt,
-    "exp": sympy.exp,
-    "log": sympy.log,
-    "sin": sympy.sin,
-    "cos": sympy.cos,
-    "tanh": sympy.tanh,
-}
-ARITHMETIC: dict[str, Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "/": operator.truediv,
-    "^": operator.pow,
-}
-COMPARISONS = {
-    "<": "less",
-    "<=": "less_or_equal",
-    ">": "more",
-    ">=": "more_or_equal",
-    "==": "equal",
-    "!=": "unequal",
-}
+from apc.compiler.language.expression import Number as ExactNumber
 
 
-LARGEST = int(sys.float_info.max)
-NO_FLOATS = frozenset({sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I})
-
-
-def head(name: str) -> sympy.core.function.UndefinedFunction:
-    """Return the opaque function of this name."""
-    return sympy.Function(name)
-
-
-def symbol(name: str) -> sympy.Symbol:
-    """Return the real symbol of this name; the same name always gives the same symbol."""
-    return sympy.Symbol(name, real=True)
-
-
-def derivative_symbol(name: str) -> sympy.Symbol:
+def derivative_symbol(name: str) -> Symbol:
     """Return the symbol for the time derivative of a variable."""
     return symbol(f"der({name})")
 
 
-def to_sympy(expression: Expr, differentiate: Callable[[sympy.Expr], sympy.Expr]) -> sympy.Expr:
-    """Build the SymPy expression; `differentiate` gives the time derivative of one, for `der`."""
+def to_term(expression: Expr, differentiate: Callable[[Term], Term]) -> Term:
+    """Build the term; `differentiate` gives the time derivative of one, for `der`."""
 
-    def leaf(node: Name | Number) -> sympy.Expr:
-        if isinstance(node, Name):
-            return symbol(".".join(node.parts))
-        return sympy.Rational(node.value.numerator, node.value.denominator)
+    def leaf(node: Name | ExactNumber) -> Term:
+        return symbol(".".join(node.parts)) if isinstance(node, Name) else number(node.value)
 
-    def operation(node: Expr, *operands: sympy.Expr) -> sympy.Expr:
+    def operation(node: Expr, *operands: Term) -> Term:
         match node:
             case Negate():
                 return -operands[0]
+            case Binary("^"):
+                assert isinstance(operands[1], Number)
+                return power(operands[0], operands[1].value)
+            case Binary("/"):
+                return operands[0] / operands[1]
+            case Binary("*"):
+                return operands[0] * operands[1]
+            case Binary("-"):
+                return operands[0] - operands[1]
             case Binary():
-                return ARITHMETIC[node.operator](*operands)
-            case Compare():
-                return head(COMPARISONS[node.operator])(*operands)
+                return operands[0] + operands[1]
+            case Compare() | Logic():
+                return apply(node.operator, *operands)
             case Not():
-                return head("not")(*operands)
-            case Logic():
-                return head(node.operator)(*operands)
+                return apply("not", *operands)
             case Conditional():
-                return head("if")(*operands)
+                return apply("if", *operands)
             case Call("der"):
                 return differentiate(*operands)
         assert isinstance(node, Call)
-        return (SMOOTH.get(node.function) or head(node.function))(*operands)
+        return apply(node.function, *operands)
 
     return fold(expression, leaf, operation)
 
 
-def is_no_number(expression: sympy.Expr) -> bool:
+def is_no_number(expression: Term) -> bool:
     """Return whether an expression holds a constant that no float can be: 1/0, sqrt(-1), 1e300^2."""
-    return any(map(_no_float, sympy.preorder_traversal(expression)))
+    return expression is NO_NUMBER or any(map(_no_float, expression.walk()))
 
 
-def _no_float(part: sympy.Basic) -> bool:
-    """Return whether a part of an expression is by itself a constant that no float can be."""
-    if part.is_Rational:
-        return bool(abs(part.p) > LARGEST * part.q)
-    if part.is_Pow:
-        return bool(part.is_number and part.is_real is False)
-    return part in NO_FLOATS
+def _no_float(part: Term) -> bool:
+    """Return whether a number in a term is larger than a float can be."""
+    if isinstance(part, Sum):
+        return any(map(_too_large, (part.constant, *(factor for _, factor in part.terms))))
+    if isinstance(part, Product):
+        return _too_large(part.coefficient)
+    return isinstance(part, Number) and _too_large(part.value)
+
+
+def _too_large(value: int | Fraction) -> bool:
+    return abs(value.numerator) > LARGEST * value.denominator
 
 
 class NoDerivativeError(Exception):
@@ -123,132 +109,151 @@ class NoDerivativeError(Exception):
         super().__init__(f"{what}, {why}")
 
 
-def differential(expression: sympy.Expr, rate: Callable[[sympy.Symbol], sympy.Expr]) -> sympy.Expr:
+def differential(expression: Term, rate: Callable[[Symbol], Term]) -> Term:
     """Return Σ ∂expression/∂s · rate(s) over the symbols s, by the chain rule.
 
     Where min, max, abs and if have a corner, the derivative is that of the branch taken; sign, floor and
     conditions are constant between their jumps. Raises NoDerivativeError for other opaque functions.
     """
 
-    def go(node: sympy.Expr) -> sympy.Expr:
-        if node.is_Symbol:
-            return rate(node)
-        if not node.args:
-            return sympy.S.Zero
-        if node.is_Add:
-            return sympy.Add(*(go(term) for term in node.args))
-        if node.is_Mul:
-            return sympy.Add(
-                *(
-                    sympy.Mul(slope, *node.args[:place], *node.args[place + 1 :])
-                    for place, factor in enumerate(node.args)
-                    if (slope := go(factor)) != 0
+    def go(node: Term) -> Term:
+        match node:
+            case Symbol():
+                return rate(node)
+            case Sum():
+                return add(*(scaled(go(term), factor) for term, factor in node.terms))
+            case Product():
+                return add(
+                    *(
+                        multiply(slope, scaled(power(base, exponent - 1), exponent), _without(node, base))
+                        for base, exponent in node.powers
+                        if (slope := go(base)) != ZERO
+                    )
                 )
-            )
-        if node.is_Pow and node.exp.is_Number:
-            return node.exp * node.base ** (node.exp - 1) * go(node.base)
-        return of_function(node.func.__name__, node)
+            case Function():
+                return of_function(node.name, node)
+        return ZERO
 
-    def of_function(name: str, node: sympy.Expr) -> sympy.Expr:
+    def of_function(name: str, node: Function) -> Term:
         if name == "if":
-            condition, then, otherwise = node.args
+            condition, then, otherwise = node.arguments
             return _choice(condition, go(then), go(otherwise))
         if name in ("min", "max"):
-            best, slope = node.args[0], go(node.args[0])
-            for argument in node.args[1:]:
+            best, slope = node.arguments[0], go(node.arguments[0])
+            for argument in node.arguments[1:]:
                 order = (best, argument) if name == "min" else (argument, best)
-                slope = _choice(head("less_or_equal")(*order), slope, go(argument))
-                best = head(name)(best, argument)
+                slope = _choice(apply("<=", *order), slope, go(argument))
+                best = apply(name, best, argument)
             return slope
-        if name.lower() == "abs":
-            slope = go(node.args[0])
-            return slope and head("sign")(node.args[0]) * slope
-        if name in SMOOTH:
-            slope = go(node.args[0])
-            return slope and node.fdiff(1) * slope
+        if name in _SLOPES:
+            slope = go(node.arguments[0])
+            return slope if slope == ZERO else _SLOPES[name](node.arguments[0]) * slope
         if name in ("sign", "floor"):
-            return sympy.S.Zero
+            return ZERO
         why = "a value that jumps at its ticks" if name in ("hold", "sample") else "which has none"
         raise NoDerivativeError(str(node), why)
 
     return go(expression)
 
 
-def smooth_pieces(expression: sympy.Expr, most: int) -> list[sympy.Expr] | None:
-    """Return what an expression may be between its corners and jumps, None if that is more than `most`.
+_SLOPES: dict[str, Callable[[Term], Term]] = {
+    "abs": lambda x: apply("sign", x),
+    "exp": lambda x: apply("exp", x),
+    "log": lambda x: power(x, -1),
+    "sin": lambda x: apply("cos", x),
+    "cos": lambda x: -apply("sin", x),
+    "tanh": lambda x: ONE - power(apply("tanh", x), 2),
+}
+
+
+def _without(product: Product, base: Term) -> Term:
+    """Return a product without one of its powers."""
+    others = (power(*one) for one in product.powers if one[0] is not base)
+    return multiply(Number(product.coefficient), *others)
+
+
+def smooth_pieces(expressions: Sequence[Term], most: int) -> list[tuple[Term, ...]] | None:
+    """Return what expressions may be between their corners and jumps, None if that is more than `most`.
 
     Each min and max is one of its arguments, each `if` one of its branches, abs(x) is x or −x; sign and floor
     are constant.
     """
-    pieces = [expression]
+    pieces = [tuple(expressions)]
     while True:
-        bent = next((node for node in sympy.preorder_traversal(sympy.Tuple(*pieces)) if _is_bent(node)), None)
-        if bent is None:
+        bent = next(
+            (node for piece in pieces for one in piece for node in one.walk() if _is_bent(node)), None
+        )
+        if not isinstance(bent, Function):
             return pieces
-        match bent.func.__name__:
+        match bent.name:
             case "if":
-                choices = bent.args[1:]
+                choices = bent.arguments[1:]
             case "min" | "max":
-                choices = bent.args
-            case "abs" | "Abs":
-                choices = (bent.args[0], -bent.args[0])
+                choices = bent.arguments
+            case "abs":
+                choices = (bent.arguments[0], -bent.arguments[0])
             case _:
-                choices = (sympy.Dummy(real=True),)
-        pieces = list(dict.fromkeys(one.xreplace({bent: choice}) for one in pieces for choice in choices))
+                choices = (symbol(f"constant {bent}"),)
+        pieces = list(
+            dict.fromkeys(
+                tuple(one.replace({bent: choice}) for one in piece) for piece in pieces for choice in choices
+            )
+        )
         if len(pieces) > most:
             return None
 
 
-def _is_bent(node: sympy.Basic) -> bool:
-    return node.func.__name__ in ("if", "min", "max", "abs", "Abs", "sign", "floor")
+def _is_bent(node: Term) -> bool:
+    return isinstance(node, Function) and node.name in ("if", "min", "max", "abs", "sign", "floor")
 
 
-def _choice(condition: sympy.Expr, then: sympy.Expr, otherwise: sympy.Expr) -> sympy.Expr:
-    return then if then == otherwise else head("if")(condition, then, otherwise)
+def _choice(condition: Term, then: Term, otherwise: Term) -> Term:
+    return then if then == otherwise else apply("if", condition, then, otherwise)
 
 
-LinearForm = tuple[dict[sympy.Symbol, sympy.Expr], sympy.Expr]
+LinearForm = tuple[dict[Symbol, Term], Term]
 
 
-def linear_form(expression: sympy.Expr, unknowns: Set[sympy.Symbol]) -> LinearForm | None:
+def linear_form(expression: Term, unknowns: Set[Symbol]) -> LinearForm | None:
     """Return the coefficients and the rest of Σ coefficient·unknown + rest, or None if it isn't linear.
 
     Reads the terms as they stand: no differentiation, no expansion, so its cost is the expression's size.
     """
     if unknowns.isdisjoint(expression.free_symbols):
         return {}, expression
-    if expression.is_Symbol:
-        return {expression: sympy.S.One}, sympy.S.Zero
-    if expression.is_Add:
-        forms = [linear_form(term, unknowns) for term in expression.args]
-        if any(form is None for form in forms):
-            return None
-        known = [form for form in forms if form is not None]
-        parts: dict[sympy.Symbol, list[sympy.Expr]] = {}
-        for coefficients, _ in known:
-            for unknown, coefficient in coefficients.items():
-                parts.setdefault(unknown, []).append(coefficient)
-        return {u: sympy.Add(*terms) for u, terms in parts.items()}, sympy.Add(*(rest for _, rest in known))
-    if expression.is_Mul:
-        moving = [factor for factor in expression.args if not unknowns.isdisjoint(factor.free_symbols)]
-        form = linear_form(moving[0], unknowns) if len(moving) == 1 else None
-        if form is None:
-            return None
-        scale = sympy.Mul(*(factor for factor in expression.args if factor is not moving[0]))
-        return {u: scale * coefficient for u, coefficient in form[0].items()}, scale * form[1]
-    if expression.func.__name__ == "if" and unknowns.isdisjoint(expression.args[0].free_symbols):
-        condition, *branches = expression.args
-        then, otherwise = (linear_form(branch, unknowns) for branch in branches)
-        if then is None or otherwise is None:
-            return None
-        zero = sympy.S.Zero
-        names = dict.fromkeys((*then[0], *otherwise[0]))
-        return {
-            u: _choice(condition, then[0].get(u, zero), otherwise[0].get(u, zero)) for u in names
-        }, _choice(condition, then[1], otherwise[1])
+    match expression:
+        case Symbol():
+            return {expression: ONE}, ZERO
+        case Sum():
+            found: dict[Symbol, list[Term]] = {}
+            rests: list[Term] = [Number(expression.constant)] if expression.constant else []
+            for term, factor in expression.terms:
+                form = linear_form(term, unknowns)
+                if form is None:
+                    return None
+                for unknown, coefficient in form[0].items():
+                    found.setdefault(unknown, []).append(scaled(coefficient, factor))
+                rests.append(scaled(form[1], factor))
+            return {u: add(*several) for u, several in found.items()}, add(*rests)
+        case Product():
+            moving = [one for one in expression.powers if not unknowns.isdisjoint(one[0].free_symbols)]
+            base, exponent = moving[0]
+            form = linear_form(base, unknowns) if len(moving) == 1 and exponent == 1 else None
+            if form is None:
+                return None
+            scale = _without(expression, base)
+            return {u: scale * coefficient for u, coefficient in form[0].items()}, scale * form[1]
+        case Function("if", (condition, *branches)) if unknowns.isdisjoint(condition.free_symbols):
+            then, otherwise = (linear_form(branch, unknowns) for branch in branches)
+            if then is None or otherwise is None:
+                return None
+            names = dict.fromkeys((*then[0], *otherwise[0]))
+            return {
+                u: _choice(condition, then[0].get(u, ZERO), otherwise[0].get(u, ZERO)) for u in names
+            }, _choice(condition, then[1], otherwise[1])
     return None
 
 
-def no_derivative(expression: sympy.Expr) -> sympy.Expr:
+def no_derivative(expression: Term) -> Term:
     """Stand in for `differentiate` where `der` can't occur."""
     raise AssertionError(f"der of {expression} stands in a clocked equation")

@@ -12,15 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import sympy
-
 from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
 from apc.compiler.equations.symbolic import linear_form
+from apc.compiler.equations.terms import Symbol, Term
 from apc.compiler.equations.zero_test import ZeroTest
 
 
-def tear(block: Sequence[Residual], unknowns: Sequence[sympy.Symbol], is_zero: ZeroTest) -> ImplicitBlock:
+def tear(block: Sequence[Residual], unknowns: Sequence[Symbol], is_zero: ZeroTest) -> ImplicitBlock:
     """Guess as few unknowns as simply found, so that the others follow one by one.
 
     When no equation computes an unknown, the open unknown in most of the open equations is torn, of several
@@ -51,13 +50,11 @@ def tear(block: Sequence[Residual], unknowns: Sequence[sympy.Symbol], is_zero: Z
 class _Loop:
     """The equations that are left, the unknowns that are open, and what was computed and guessed so far."""
 
-    def __init__(
-        self, block: Sequence[Residual], unknowns: Sequence[sympy.Symbol], is_zero: ZeroTest
-    ) -> None:
+    def __init__(self, block: Sequence[Residual], unknowns: Sequence[Symbol], is_zero: ZeroTest) -> None:
         self.block = block
         members = frozenset(unknowns)
         self.holds = [set(residual.expression.free_symbols & members) for residual in block]  # open ones
-        self.standing: dict[sympy.Symbol, list[int]] = {u: [] for u in unknowns}
+        self.standing: dict[Symbol, list[int]] = {u: [] for u in unknowns}
         for i, these in enumerate(self.holds):
             for u in these:
                 self.standing[u].append(i)
@@ -65,12 +62,12 @@ class _Loop:
         self.left = dict.fromkeys(range(len(block)))
         self.open = dict.fromkeys(unknowns)
         self.inner: list[Assignment] = []
-        self.torn: list[sympy.Symbol] = []
+        self.torn: list[Symbol] = []
 
-        def solvable(coefficient: sympy.Expr) -> bool:
+        def solvable(coefficient: Term) -> bool:
             return members.isdisjoint(coefficient.free_symbols) and not is_zero(coefficient)
 
-        self.computable: dict[sympy.Symbol, set[int]] = {u: set() for u in unknowns}
+        self.computable: dict[Symbol, set[int]] = {u: set() for u in unknowns}
         for i, residual in enumerate(block):
             for u in self.holds[i]:
                 form = linear_form(residual.expression, frozenset((u,)))
@@ -98,11 +95,11 @@ class _Loop:
         self.torn.append(unknown)
         self._close(unknown)
 
-    def _gain(self, unknown: sympy.Symbol) -> tuple[int, int]:
+    def _gain(self, unknown: Symbol) -> tuple[int, int]:
         rows = [i for i in self.standing[unknown] if i in self.left]
         return len(rows), -sum(i in self.computable[unknown] for i in rows)
 
-    def _close(self, unknown: sympy.Symbol) -> None:
+    def _close(self, unknown: Symbol) -> None:
         del self.open[unknown]
         for i in self.standing[unknown]:
             self.holds[i].discard(unknown)

@@ -1,4 +1,4 @@
-"""SymPy expressions written as CasADi's, each definition once.
+"""Terms written as CasADi's, each definition once.
 
 Takes: symbols whose values are known, and what defines the others. Gives: `Writer`, `Definition`.
 Guarantees: written in the order in which things depend on one another; a chain of definitions may be as long
@@ -11,22 +11,32 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import casadi
-import sympy
 
 from apc.compiler.equations.solution import ImplicitBlock
-from apc.compiler.equations.symbolic import symbol
+from apc.compiler.equations.terms import (
+    HALF,
+    Function,
+    Number,
+    Product,
+    Ratio,
+    Sum,
+    Symbol,
+    Term,
+    symbol,
+    terms_of,
+)
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.recordings import TimeTable
 from apc.compiler.plain import Loop, composed
 
-Definition: TypeAlias = sympy.Expr | ImplicitBlock
+Definition: TypeAlias = Term | ImplicitBlock
+MOST_FACTORS = 100  # of a power that is written as a product
 _EXTREMES = {"min": casadi.fmin, "max": casadi.fmax}  # of two values each
 _CASADI: dict[str, Callable[..., Any]] = {
     "abs": casadi.fabs,
-    "Abs": casadi.fabs,  # what SymPy makes of sqrt(x^2)
     "sign": casadi.sign,
     "floor": casadi.floor,
     "exp": casadi.exp,
@@ -37,12 +47,12 @@ _CASADI: dict[str, Callable[..., Any]] = {
     "and": casadi.logic_and,
     "or": casadi.logic_or,
     "not": casadi.logic_not,
-    "less": operator.lt,
-    "less_or_equal": operator.le,
-    "more": operator.gt,
-    "more_or_equal": operator.ge,
-    "equal": operator.eq,
-    "unequal": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
 }
 
 
@@ -57,15 +67,15 @@ class _Torn:
 
 
 class Writer:
-    """Translates SymPy expressions to CasADi's SX, each definition once.
+    """Translates terms to CasADi's SX, each definition once.
 
     `starts` gives the start values of the unknowns that have one, where a loop's iteration begins.
     """
 
     def __init__(
         self,
-        known: Mapping[sympy.Symbol, Any],
-        definitions: Mapping[sympy.Symbol, Definition],
+        known: Mapping[Symbol, Any],
+        definitions: Mapping[Symbol, Definition],
         tables: Mapping[str, TimeTable],
         starts: Mapping[str, Any],
     ) -> None:
@@ -80,9 +90,7 @@ class Writer:
         listed = list(values)
         return casadi.densify(casadi.vertcat(*listed)) if listed else casadi.SX(0, 1)
 
-    def extended(
-        self, known: Mapping[sympy.Symbol, Any], definitions: Mapping[sympy.Symbol, Definition]
-    ) -> Writer:
+    def extended(self, known: Mapping[Symbol, Any], definitions: Mapping[Symbol, Definition]) -> Writer:
         """Return a writer that knows more."""
         more = Writer({**self.known, **known}, {**self.definitions, **definitions}, self.tables, self.starts)
         more.torn = list(self.torn)
@@ -123,7 +131,7 @@ class Writer:
         )
         return composed(name, solved, result, words)
 
-    def write(self, wanted: sympy.Symbol) -> Any:
+    def write(self, wanted: Symbol) -> Any:
         """Return the value of a symbol, writing what it depends on first.
 
         A stack instead of recursion, so that the length of a chain of definitions is no limit.
@@ -167,44 +175,44 @@ class Writer:
         self.known |= {s: found[i] for i, s in enumerate(own)}
         self.definitions |= others
 
-    def translate(self, expression: sympy.Expr) -> Any:
+    def translate(self, expression: Term) -> Any:
         """Return the value of an expression."""
         for s in self._needed(expression):
             self.write(s)
         return self._build(expression)
 
-    def _needed(self, expression: Definition) -> list[sympy.Symbol]:
+    def _needed(self, expression: Definition) -> list[Symbol]:
         return sorted((s for s in expression.free_symbols if s.name not in self.tables), key=str)
 
-    def _build(self, expression: sympy.Expr, taken: Any = None) -> Any:
+    def _build(self, expression: Term, taken: Any = None) -> Any:
         """Return the value of an expression whose symbols are known.
 
         `taken` is the condition of the branch it stands in. CasADi computes every branch, and the slopes of
         one that isn't taken times 0, which is no number where they are infinite. What is singular somewhere
         gets the argument 1 there, where the branch isn't taken.
         """
-        if expression.is_Symbol:
+        if isinstance(expression, Symbol):
             return self.known[expression]
-        if expression.is_number and not expression.args:
-            return casadi.SX(float(expression))
-        if expression.is_Mul:
-            return self._product(expression, taken)
-        name = expression.func.__name__
+        if isinstance(expression, Number):
+            return casadi.SX(float(expression.value))
+        if isinstance(expression, Sum):
+            return _fold([self._scaled(*one, taken) for one in terms_of(expression)], operator.add)
+        if isinstance(expression, Product):
+            return self._scaled(expression, 1, taken)
+        assert isinstance(expression, Function)
+        name = expression.name
         if name == "interpolate":
-            return self._interpolated(*expression.args)
+            table, time = expression.arguments
+            return self._interpolated(table, time)
         if name == "if":
-            condition, then, otherwise = expression.args
+            condition, then, otherwise = expression.arguments
             return self._chosen(condition, then, otherwise, taken)
-        arguments = [self._build(argument, taken) for argument in expression.args]
-        if expression.is_Add:
-            return _fold(arguments, operator.add)
-        if taken is not None and _is_singular(expression):
+        arguments = [self._build(argument, taken) for argument in expression.arguments]
+        if taken is not None and name in ("log", "exp"):  # infinite, or no number, or so is the slope
             arguments[0] = casadi.if_else(taken, arguments[0], 1)
-        if expression.is_Pow:
-            return _power(arguments[0], expression.exp, arguments[1])
         return _fold(arguments, _EXTREMES[name]) if name in _EXTREMES else _CASADI[name](*arguments)
 
-    def _chosen(self, condition: sympy.Expr, then: sympy.Expr, otherwise: sympy.Expr, taken: Any) -> Any:
+    def _chosen(self, condition: Term, then: Term, otherwise: Term, taken: Any) -> Any:
         """Return the value of a conditional in a branch."""
         holds = self._build(condition, taken)
         first, second = holds, casadi.logic_not(holds)
@@ -212,23 +220,40 @@ class Writer:
             first, second = casadi.logic_and(taken, first), casadi.logic_and(taken, second)
         return casadi.if_else(holds, self._build(then, first), self._build(otherwise, second))
 
-    def _interpolated(self, table: sympy.Symbol, time: sympy.Expr) -> Any:
+    def _interpolated(self, table: Term, time: Term) -> Any:
         """Return a table's value, linear between its rows and constant beyond its ends."""
+        assert isinstance(table, Symbol)
         found = self.tables[table.name]
         start, end = found.times[0], found.times[-1]
         inside = casadi.fmin(casadi.fmax(self._build(time), start), end)
         return casadi.pw_lin(inside, found.times.tolist(), found.numbers.tolist())
 
-    def _product(self, expression: sympy.Expr, taken: Any) -> Any:
-        """Return a product, dividing by its factors of negative power: a/b rounds once, a*b**-1 twice."""
-        above = [self._build(node, taken) for node in expression.args if not _is_reciprocal(node)]
-        below = [self._build(1 / node, taken) for node in expression.args if _is_reciprocal(node)]
+    def _scaled(self, term: Term, factor: Ratio, taken: Any) -> Any:
+        """Return a number times a term, dividing by what has a negative power: a*(1/b) rounds twice."""
+        if not isinstance(term, Product):
+            value = self._build(term, taken)
+            return value if factor == 1 else float(factor) * value
+        coefficient = factor * term.coefficient
+        above = [casadi.SX(float(coefficient))] if coefficient != 1 else []
+        above += [self._power(base, size, taken) for base, size in term.powers if size > 0]
+        below = [self._power(base, -size, taken) for base, size in term.powers if size < 0]
         product = _fold(above, operator.mul) if above else casadi.SX(1)
         if not below:
             return product
         divisor = _fold(below, operator.mul)
-        moving = any(node.free_symbols for node in expression.args if _is_reciprocal(node))
+        moving = any(base.free_symbols for base, size in term.powers if size < 0)
         return product / (casadi.if_else(taken, divisor, 1) if taken is not None and moving else divisor)
+
+    def _power(self, base: Term, exponent: Ratio, taken: Any) -> Any:
+        """Return a power with a positive exponent."""
+        value = self._build(base, taken)
+        if exponent.denominator != 1 and taken is not None:
+            value = casadi.if_else(taken, value, 1)
+        if exponent == HALF:
+            return casadi.sqrt(value)
+        if exponent.denominator == 1 and exponent <= MOST_FACTORS:
+            return _fold([value] * int(exponent), operator.mul)
+        return value ** float(exponent)
 
 
 def _fold(values: Sequence[Any], join: Callable[[Any, Any], Any]) -> Any:
@@ -236,25 +261,3 @@ def _fold(values: Sequence[Any], join: Callable[[Any, Any], Any]) -> Any:
     for value in values[1:]:
         total = join(total, value)
     return total
-
-
-def _is_singular(node: sympy.Expr) -> bool:
-    """Return whether a function, or its slope, is infinite or no number for some argument."""
-    if node.is_Pow:
-        return not (node.exp.is_Integer and node.exp.is_positive)
-    return node.func.__name__ in ("log", "exp")
-
-
-def _is_reciprocal(node: sympy.Expr) -> bool:
-    return bool(node.is_Pow and node.exp.is_Number and node.exp.is_negative)
-
-
-def _power(base: Any, exponent: sympy.Expr, written: Any) -> Any:
-    if exponent == -1:
-        return 1 / base
-    if exponent == sympy.Rational(1, 2):
-        return casadi.sqrt(base)
-    if exponent.is_Integer and 0 < abs(int(exponent)) <= 100:
-        product = _fold([base] * abs(int(exponent)), operator.mul)
-        return product if exponent > 0 else 1 / product
-    return base**written

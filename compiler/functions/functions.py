@@ -10,11 +10,9 @@ Does not: write files, or put numbers in the place of parameters.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi
-import sympy
 
 from apc.compiler.compiled import (
     ClockPartition,
@@ -31,7 +29,9 @@ from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clocks import HoldCrossing, ReceiveCrossing
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
-from apc.compiler.equations.symbolic import derivative_symbol, symbol
+from apc.compiler.equations.symbolic import derivative_symbol
+from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.frozen import dataclass
 from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.functions.exchange import (
     Timings,
@@ -319,11 +319,11 @@ class _Port:
     """A connector of part `part`: its potential, and the flow into the part, as expressions."""
 
     part: str
-    potential: sympy.Expr
-    flow: sympy.Expr
+    potential: Term
+    flow: Term
 
     @property
-    def symbols(self) -> set[sympy.Symbol]:
+    def symbols(self) -> set[Symbol]:
         """What the port is written in."""
         return set(self.potential.free_symbols | self.flow.free_symbols)
 
@@ -369,12 +369,12 @@ def _connector_pairs(part: Part) -> list[tuple[str, str]]:
     ]
 
 
-def _whole(wanted: sympy.Symbol, known: dict[sympy.Symbol, sympy.Expr]) -> sympy.Expr | None:
+def _whole(wanted: Symbol, known: dict[Symbol, Term]) -> Term | None:
     """Return a symbol in terms of states, holds and parameters; None if a loop decides it."""
-    expression = wanted
+    expression: Term = wanted
     for _ in range(len(known) + 1):
         replaceable = expression.free_symbols & known.keys()
         if not replaceable:
             return expression
-        expression = expression.xreplace({s: known[s] for s in replaceable})
+        expression = expression.replace({s: known[s] for s in replaceable})
     return None

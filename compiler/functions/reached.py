@@ -9,15 +9,14 @@ Does not: write functions (see `functions`).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-
-import sympy
 
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clocks import HoldCrossing, PreviousCrossing, ReceiveCrossing
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSend
-from apc.compiler.equations.symbolic import derivative_symbol, no_derivative, symbol, to_sympy
+from apc.compiler.equations.symbolic import derivative_symbol, no_derivative, to_term
+from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.frozen import dataclass
 from apc.compiler.functions.casadi_writer import Definition
 
 
@@ -30,14 +29,14 @@ class Reached:
 
     def __init__(self, kind: SortedKind) -> None:
         self.kind = kind
-        self.continuous: dict[sympy.Symbol, Definition] = kind.partitions[0].definitions
-        self.clocked: dict[sympy.Symbol, Definition] = {
+        self.continuous: dict[Symbol, Definition] = kind.partitions[0].definitions
+        self.clocked: dict[Symbol, Definition] = {
             s: definition for part in kind.partitions[1:] for s, definition in part.definitions.items()
         }
         self.samples = {symbol(name): expression for name, _, expression in kind.samples}
         self.sends: dict[str, SortedSend] = {send.name: send for send in kind.sends}
         self.edges = {
-            symbol(receive.symbol): to_sympy(receive.edge, no_derivative)
+            symbol(receive.symbol): to_term(receive.edge, no_derivative)
             for receive in kind.receives
             if receive.edge is not None
         }
@@ -98,9 +97,9 @@ class Reached:
         starts |= {v.name for v in self.kind.clocked.flat.variables if v.start and v.name in guessed}
         return sorted({name for name in free if not name.startswith("initial(")} | starts)
 
-    def _closure(self, wanted: Iterable[sympy.Symbol]) -> set[sympy.Symbol]:
+    def _closure(self, wanted: Iterable[Symbol]) -> set[Symbol]:
         """Return these symbols and every symbol that they depend on."""
-        seen: set[sympy.Symbol] = set()
+        seen: set[Symbol] = set()
         work = list(wanted)
         while work:
             s = work.pop()
@@ -109,7 +108,7 @@ class Reached:
                 work += self._read_by(s)
         return seen
 
-    def _read_by(self, s: sympy.Symbol) -> Iterable[sympy.Symbol]:
+    def _read_by(self, s: Symbol) -> Iterable[Symbol]:
         """Yield what a symbol's value is computed from, on the other side of a crossing if it is one."""
         for table in (self.continuous, self.clocked, self.samples, self.edges):
             if s in table:
@@ -128,12 +127,12 @@ class Reached:
 class _Crossings:
     """Every crossing of a kind, by its symbol."""
 
-    holds: dict[sympy.Symbol, HoldCrossing]
-    previous: dict[sympy.Symbol, PreviousCrossing]
-    receives: dict[sympy.Symbol, ReceiveCrossing]
+    holds: dict[Symbol, HoldCrossing]
+    previous: dict[Symbol, PreviousCrossing]
+    receives: dict[Symbol, ReceiveCrossing]
 
 
-def _others(expression: sympy.Expr | None) -> list[str]:
+def _others(expression: Term | None) -> list[str]:
     """Return what an expression reads of another peer."""
     if expression is None:
         return []

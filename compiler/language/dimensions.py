@@ -7,8 +7,9 @@ Does not: know units, which have a scale as well (see `units`), or their text (s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fractions import Fraction
+
+from apc.compiler.frozen import dataclass
 
 
 @dataclass(frozen=True, slots=True)

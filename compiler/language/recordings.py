@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from array import array
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.tables import MOST_MISTAKES, Headings, open_table, read_table
 from apc.compiler.language.units import NO_UNIT, Unit

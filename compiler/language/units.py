@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.unit_grammar import NAME, FaultError, parse_factor
 from apc.compiler.language.unit_names import COMMON, look_up, spelled

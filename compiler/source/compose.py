@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any, NoReturn
 
 import yaml
 
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
+from apc.compiler.frozen import dataclass
 from apc.compiler.source.nodes import Lines, Mapping, Node, Scalar, Sequence
 from apc.compiler.source.yaml_faults import not_yaml
 from apc.compiler.words import cut

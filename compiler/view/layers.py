@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from apc.compiler.frozen import dataclass
 from apc.compiler.view.diagram import Diagram, Vertex
 from apc.compiler.view.svg import FAINT, INK, SIZE, SMALL, Line, text_width
 

@@ -26,7 +26,7 @@ from apc.compiler.pipeline import each_stage, run_stages
 from apc.compiler.scene.scene import Scene
 from apc.compiler.view.diagram import Diagram, build_diagram, draw_dot, one_of, seconds
 from apc.compiler.view.picture import place
-from apc.compiler.view.stages import plain, step_lines
+from apc.compiler.view.stages import step_lines
 from apc.compiler.view.svg import draw_svg
 from apc.compiler.words import counted, wrapped
 
@@ -81,12 +81,12 @@ def show_document(path: Path) -> dict[str, Any]:
                     for p in two.partitions
                 ],
                 "states": list(three.states),
-                "aliases": [{"name": name, "is": plain(value)} for name, value in three.aliases],
+                "aliases": [{"name": name, "is": str(value)} for name, value in three.aliases],
                 "computed": [
                     {"clock": p.clock, "steps": [_step_document(step) for step in p.assignments]}
                     for p in three.partitions
                 ],
-                "sent": [{"name": s.name, "link": s.link, "is": plain(s.expression)} for s in three.sends],
+                "sent": [{"name": s.name, "link": s.link, "is": str(s.expression)} for s in three.sends],
             }
             for one, two, three in zip(flat.kinds, clocked.kinds, ordered.kinds, strict=True)
         ],
@@ -189,14 +189,14 @@ def _computed_lines(kind: SortedKind) -> Iterator[str]:
     for partition in kind.partitions:
         yield f"  {partition.clock}" if partition.clock == "continuous" else f"  tick of {partition.clock}"
         for name, expression in samples.get(partition.clock, []):
-            yield from wrapped(f"{name} := {plain(expression)}", "    ", "        ")
+            yield from wrapped(f"{name} := {expression}", "    ", "        ")
         for step in partition.assignments:
             for line in step_lines(step):
                 indent = line[: len(line) - len(line.lstrip())]
                 yield from wrapped(line.lstrip(), indent, indent + "    ")
     for send in kind.sends:
-        yield from wrapped(f"sent over {send.link}: {send.name} := {plain(send.expression)}", "  ", "      ")
-    pairs = {name: plain(value) for name, value in kind.aliases}
+        yield from wrapped(f"sent over {send.link}: {send.name} := {send.expression}", "  ", "      ")
+    pairs = {name: str(value) for name, value in kind.aliases}
     if pairs:
         yield "  the same as another"
         yield from wrapped(", ".join(f"{name} = {value}" for name, value in pairs.items()), "    ", "    ")
@@ -204,12 +204,12 @@ def _computed_lines(kind: SortedKind) -> Iterator[str]:
 
 def _step_document(step: Any) -> dict[str, Any]:
     if not isinstance(step, ImplicitBlock):
-        return {"name": step[0], "is": plain(step[1])}
+        return {"name": step[0], "is": str(step[1])}
     return {
         "loop": list(step.unknowns),
         "guess": list(step.tearing),
-        "inner": [{"name": name, "is": plain(value)} for name, value in step.inner],
-        "zero": [plain(residual) for residual in step.residuals],
+        "inner": [{"name": name, "is": str(value)} for name, value in step.inner],
+        "zero": [str(residual) for residual in step.residuals],
     }
 
 

@@ -1,6 +1,6 @@
 """The value of any stage as text for a person to read: what `apc compile --until` prints.
 
-Takes: the value of a stage. Gives: `describe`; `step_lines` and `plain`, of what is computed.
+Takes: the value of a stage. Gives: `describe`; `step_lines`, of what is computed.
 Guarantees: the same topology gives the same bytes.
 Does not: compute anything new.
 """
@@ -12,7 +12,6 @@ from functools import singledispatch
 from typing import Any
 
 import casadi
-import sympy
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.equations.clocks import ClockedSystem, ReceiveCrossing
@@ -30,17 +29,12 @@ from apc.compiler.source.source import Source
 def step_lines(step: Assignment | ImplicitBlock) -> Iterator[str]:
     """Yield an assignment, or a nonlinear loop: its chain, then what is computed on the way round."""
     if not isinstance(step, ImplicitBlock):
-        yield f"    {step[0]} := {plain(step[1])}"
+        yield f"    {step[0]} := {step[1]}"
         return
     yield f"    loop {step.chain}"
     yield from (f"      guess {name}" for name in step.tearing)
-    yield from (f"      {name} := {plain(expression)}" for name, expression in step.inner)
-    yield from (f"      until 0 = {plain(expression)}" for expression in step.residuals)
-
-
-def plain(expression: sympy.Expr) -> str:
-    """Return an expression as text, terms and factors in a fixed order."""
-    return str(sympy.sstr(expression, order="lex"))
+    yield from (f"      {name} := {expression}" for name, expression in step.inner)
+    yield from (f"      until 0 = {expression}" for expression in step.residuals)
 
 
 @singledispatch
@@ -142,12 +136,12 @@ def _(system: SortedSystem) -> str:
     lines = []
     for kind in system.kinds:
         lines.append(f"kind {kind.clocked.flat.name}: states {', '.join(kind.states)}")
-        lines += [f"  alias {name} = {plain(expression)}" for name, expression in kind.aliases]
+        lines += [f"  alias {name} = {expression}" for name, expression in kind.aliases]
         for partition in kind.partitions:
             lines.append(f"  {partition.clock}:")
             lines += [line for step in partition.assignments for line in step_lines(step)]
-        lines += [f"  {name} := {plain(expression)}" for name, _, expression in kind.samples]
-        lines += [f"  send over {s.link}: {s.name} := {plain(s.expression)}" for s in kind.sends]
+        lines += [f"  {name} := {expression}" for name, _, expression in kind.samples]
+        lines += [f"  send over {s.link}: {s.name} := {s.expression}" for s in kind.sends]
     return "\n".join(lines)
 
 

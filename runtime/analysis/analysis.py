@@ -11,7 +11,7 @@ Does not: read files, or draw.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peer_group import PeerGroup, states_of, used_ways

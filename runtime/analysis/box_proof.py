@@ -17,7 +17,6 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.box import Box, open_box
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.balls import (
     Balls,

@@ -19,7 +19,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi
@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.plain import straight, symbolic, walk
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.start import start_values

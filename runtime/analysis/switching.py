@@ -22,7 +22,7 @@ pole of H at z = 1, R/(z − 1). Where it is one motion, y follows it alike at a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from apc.analysis.contact_modes import ContactModes
 from apc.analysis.opened import OpenLoop, open_loops
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.dissipation import least_real, proves_positive

@@ -14,13 +14,14 @@ Does not: know where the weights come from (see `modes`, `graph_loops`); compute
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.frozen import dataclass
 from apc.eigen.graph_modes import Surd
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.frame.discretize import UNIT

@@ -14,12 +14,12 @@ have nothing to do with the next part's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.frozen import dataclass
 from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
 from apc.eigen.relative import independent_places

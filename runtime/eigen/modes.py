@@ -26,11 +26,12 @@ and all else at rest, each of them hearing w_own âˆ’ w_other times itself, n_c â
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 
+from apc.compiler.frozen import dataclass
 from apc.compiler.weights import exact_weight
 from apc.eigen.closing import ClosedSystem, Coupling, Loop, close_loop
 from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale

@@ -8,11 +8,12 @@ Does not: compare what depends on the parameters, or take a root of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import flint
+
+from apc.compiler.frozen import dataclass
 
 # Terms a numerator or denominator may have: products of many parameters grow without end.
 MOST_TERMS = 2000

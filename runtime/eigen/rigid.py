@@ -19,7 +19,7 @@ It makes a generalized eigenvector, a Jordan pair.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from operator import mul
 from typing import Any
@@ -28,6 +28,7 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Coupling, Loop
 from apc.eigen.graph_modes import QUICK_PRIME
 from apc.eigen.peer_group import PeerGroup, states_of

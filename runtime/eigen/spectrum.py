@@ -13,12 +13,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.frozen import dataclass
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.frozen import dataclass
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.overrides import apply, parse_override

@@ -18,7 +18,6 @@ precision loses log₂(bT/m) bits where the mass is tiny. Arb's exponential (Joh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -26,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]

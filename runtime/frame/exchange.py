@@ -9,7 +9,6 @@ Does not: know what is sent, or when (see `scheduling`), or a graph's eigenvalue
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Graph, Link
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import casadi
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import ClockPartition, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.frame.site import LinearSite, Matrix, assemble, with_own_parts
 
 # Kinds whose Jacobians are remembered.

@@ -17,7 +17,7 @@ sent.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted

@@ -10,7 +10,6 @@ Does not: read or change values.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.compiled import (
@@ -23,6 +22,7 @@ from apc.compiler.compiled import (
     group_count,
 )
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.frozen import dataclass
 from apc.compiler.words import with_unit
 
 # The sections of a topology, which a name may start with.

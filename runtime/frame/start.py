@@ -9,7 +9,7 @@ Does not: ask who hears whom (see `peers`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -17,6 +17,7 @@ import casadi
 import numpy as np
 
 from apc.compiler.compiled import PEERS
+from apc.compiler.frozen import dataclass
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
 

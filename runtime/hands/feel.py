@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -24,6 +23,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.analysis.analysis import analyze as judge
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop
 from apc.eigen.modes import arrange, dense_loop

@@ -10,12 +10,11 @@ Does not: say with which hand it shakes: which motion of the devices takes energ
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from apc.analysis.analysis import Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.dissipation import least_real, proves_positive
 from apc.finite_equations import finite_equations

@@ -20,7 +20,7 @@ remains has the motions of the scene with devices clamped, and no others.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -29,6 +29,7 @@ from apc.analysis.box import OpenSites, open_sites
 from apc.analysis.box_proof import BITS, UNDECIDED, BoxProof, Cell, halved, middle, range_ball, site_at
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.balls import frame_steps, precision
 from apc.eigen.closing import without_packets

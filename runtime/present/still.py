@@ -12,7 +12,6 @@ sent to the others, or else the second, is drawn with a half width of w, the oth
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.frame.jacobians import guards_of, jacobians
 from apc.frame.parameters import resolve

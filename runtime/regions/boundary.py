@@ -20,11 +20,12 @@ have log|λ_a| = log|λ_b| = 0.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.frozen import dataclass
 from apc.frame.discretize import UNIT
 from apc.regions.boundary_points import MOST_STEPS, SHORT, clear, cross, just_inside, moved, polish
 from apc.regions.cells import Survey

@@ -10,7 +10,6 @@ Does not: draw, or write files (see `present`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.finite_equations import finite_equations

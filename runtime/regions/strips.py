@@ -14,13 +14,14 @@ with the delay: the boundary is a straight line at a critical value of the other
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.frozen import dataclass
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace

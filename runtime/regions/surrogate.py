@@ -15,12 +15,12 @@ loses a digit at most (Trefethen, Approximation Theory and Approximation Practic
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
 
+from apc.compiler.frozen import dataclass
 from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.names import Range

@@ -24,7 +24,6 @@ speed reached over that one's scale L at its first rate of change a, and at leas
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -33,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.frozen import dataclass
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.start import start_values
 from apc.simulation.integrate import integrated

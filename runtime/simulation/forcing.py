@@ -15,7 +15,6 @@ rounding, a panel is halved.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of
 from apc.simulation.propagate import Rates

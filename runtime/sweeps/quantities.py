@@ -10,13 +10,13 @@ Does not: choose points, or hold results.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.frozen import dataclass
 from apc.eigen.spectrum import finite
 from apc.frame.names import find, unit_of
 from apc.frame.overrides import apply

@@ -24,12 +24,12 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file, unwritable, write_file
+from apc.compiler.frozen import dataclass
 from apc.tables import Row
 
 SUFFIX = ".parts"

@@ -13,7 +13,6 @@ import hashlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.frame.jacobians import jacobians
 from apc.frame.names import notes_for_all_groups

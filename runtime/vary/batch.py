@@ -15,7 +15,7 @@ Trapp, SIAM Review 40, 1998), through the composition of the frame; CasADi diffe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol, TypeVar
 
 import casadi
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Closed, ClosedSystem, Loop, close, close_loop
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup

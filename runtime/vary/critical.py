@@ -11,7 +11,6 @@ Does not: prove that there are no others, or find two nearer to each other than 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -19,6 +18,7 @@ import numpy as np
 from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.finite_equations import finite_equations

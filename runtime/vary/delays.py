@@ -18,7 +18,6 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -26,6 +25,7 @@ import numpy as np
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import time_left
 from apc.frame.names import Free

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor
 from apc.eigen.bordered import Bordered, Logarithm, bordered, logarithm, side_by_side
 from apc.eigen.closing import Loop, without_packets

@@ -13,13 +13,13 @@ a delay by a hold or link that waits for it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.spectrum import finite
 from apc.finite_equations import finite_equations

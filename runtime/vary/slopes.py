@@ -14,12 +14,13 @@ sites. A product of dM and a vector is a few products of one site.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
