@@ -74,7 +74,7 @@ HOUSE = (
         "apc.analysis",
         """
         methods switches pushes plan selfcheck analysis needs box box_proof openloop paper conventions
-        contact_modes opened alternating switching describing
+        contact_modes opened alternating multipliers switching describing
         """,
     ),
     (

@@ -58,7 +58,7 @@ class Opened:
     """Peers with their contacts cut open: `map` over [z, y of each tick] and [r, f of each tick].
 
     `states` are those of z; `ticks` names each y and f by its part and tick, `slopes` are those of each y
-    over the continuous states, exactly; `plain` says that it follows nothing else.
+    over the continuous states, exactly; `plain` says that it follows nothing else. `jumps` is as of a loop.
     """
 
     group: PeerGroup
@@ -67,6 +67,7 @@ class Opened:
     ticks: tuple[tuple[str, int], ...]
     slopes: tuple[tuple[Fraction, ...], ...]
     plain: bool
+    jumps: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +75,8 @@ class OpenLoop:
     """A loop with its contacts cut open; A, B, C and D are `a` to `d`, `seen` is s and `moved` is m.
 
     `ports` name each f by its site, part and tick, `counts` how many peers have it. `seen` is exact, its
-    first that isn't 0 being 1; it is empty where nothing may drift.
+    first that isn't 0 being 1; it is empty where nothing may drift. `jumps` names a part whose force jumps
+    (see `pushes`), "" if none does.
     """
 
     name: str
@@ -86,6 +88,7 @@ class OpenLoop:
     counts: Floats
     seen: tuple[Fraction, ...]
     moved: Matrix
+    jumps: str
 
 
 def contact_groups(
@@ -164,7 +167,7 @@ def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop] | s
     opened: list[Opened] = []
     for group, pushes in groups:
         for one in pushes:
-            if one.sector:
+            if one.sector and not one.shares:
                 return one.sector
         opened.append(_cut_open(group, pushes))
     of_site = {id(one.group.lifted): one for one in opened}
@@ -231,7 +234,8 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     )
     wide_map = compose(with_roundings(wide), whole, off, numbers=RADII)
     plain = not any(one.slopes[one.states :].any() for one in pushes)
-    return Opened(bare, wide_map, len(bare.lifted.z_names), tuple(ticks), tuple(slopes), plain)
+    jumps = next((one.part for one in pushes if one.sector), "")
+    return Opened(bare, wide_map, len(bare.lifted.z_names), tuple(ticks), tuple(slopes), plain, jumps)
 
 
 def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
@@ -258,7 +262,8 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     each = list(zip(loop.sites, opened, strict=True))
     ports = tuple((site.name, *tick) for site, one in each for tick in one.ticks)
     counts = np.array([float(site.count) for site, one in each for _ in one.ticks])
-    plain = OpenLoop(loop.name, a, b, negated(c), negated(d), ports, counts, (), np.zeros((2, 1, len(ports))))
+    still, jumps = np.zeros((2, 1, len(ports))), next((one.jumps for one in opened if one.jumps), "")
+    plain = OpenLoop(loop.name, a, b, negated(c), negated(d), ports, counts, (), still, jumps)
     if free.exact and not all(one.plain for one in opened):
         return "what a contact follows is more than positions, and something may drift with all contacts open"
     seen = _seen(opened, free.exact, layout, n, outside)
