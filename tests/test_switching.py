@@ -234,26 +234,17 @@ def test_an_unstable_mode_of_contact_rules_it_out() -> None:
     assert judged(compiled(mesh)).reason == "it is not stable in any mode"
 
 
+# More would be unstable with two.
+TIES = {2: 200.0, 3: 500.0}
+
 CONTACT = "type: OneSidedContact, a: device, b: cube, half_width: 20 mm, stiffness: 100 N/m"
 
 
-@pytest.mark.parametrize(
-    ("instead", "reason"),
-    [
-        (
-            "type: ForceSaturation, a: device, b: cube, limit: 2 N, stiffness: 100 N/m, damping: 1 N*s/m",
-            "depends on more than one number",
-        ),
-        (
-            "type: SampledHuntCrossleyContact, a: device, b: cube, stiffness: 100 N/m^(3/2)",
-            "not known when",
-        ),
-    ],
-)
-def test_what_is_in_no_sector_is_refused_by_name(instead: str, reason: str) -> None:
+def test_what_is_in_no_sector_is_refused_by_name() -> None:
+    instead = "type: SampledHuntCrossleyContact, a: device, b: cube, stiffness: 100 N/m^(3/2)"
     found = judged(compiled(replaced(HELD, (CONTACT, instead))))
-    assert (found.verdict, found.stable) == (OPEN, None)
-    assert reason in found.reason
+    assert (found.verdict, found.stable, found.settles) == (OPEN, None, False)
+    assert "not known when" in found.reason
 
 
 def test_devices_that_all_drift_are_not_decided_where_no_pattern_grows() -> None:
@@ -291,7 +282,7 @@ def test_over_a_lossy_link_nothing_is_called_proved() -> None:
     assert found.reason == "packets may be lost or late, and it is looked for on time only"
 
 
-def settled(count: int, stiffness: float, start: Floats, frames: int, *, tie: float = 500.0) -> float:
+def settled(count: int, stiffness: float, start: Floats, frames: int, *, tie: float) -> float:
     """Return how far a scene still moves in a frame, played with contacts that never pull.
 
     `start` is as in `played`; contacts are 20 mm deep at 0.
@@ -313,24 +304,17 @@ def test_what_is_proved_to_settle_comes_to_rest_though_a_pattern_at_will_may_gro
     count: int, stiffness: float
 ) -> None:
     text = replaced(HELD, ("count: 3", f"count: {count}"), ("mass: 0.6 kg", f"mass: {0.2 * count} kg"))
+    text = replaced(text, ("stiffness: 500 N/m", f"stiffness: {TIES[count]} N/m"))
     found = judged(stiff(text, stiffness))
     assert found.settles
     assert found.stable is (False if stiffness > 300 else None)
     generator = np.random.default_rng(2)
     for _ in range(3):
         start = generator.normal(size=7 * count) * np.tile([0.05, 0.5, 0.05, 0.5, 0, 0, 0], count)
-        assert settled(count, stiffness, start, 6000) < 1e-9
+        assert settled(count, stiffness, start, 6000, tie=TIES[count]) < 1e-9
 
 
-def test_a_scene_that_shakes_for_ever_is_not_said_to_settle() -> None:
-    # Pressed together its contacts shake; the springs of the arms press here.
-    start = np.tile([0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 3)
-    start[0] = 0.02
-    assert settled(3, 2700.0, start, 4000) > 1e-4
-    assert not judged(stiff(HELD, 2700.0)).settles
-
-
-@pytest.mark.parametrize("part", [0.5, 0.95])
+@pytest.mark.parametrize("part", [0.5, 0.95, 0.98])
 def test_a_wall_settles_nearly_as_far_as_it_is_stable_when_always_touched(part: float) -> None:
     # Closed for ever: x⁺ of a device under a held force, which is K times the sample of a tick before.
     rates = np.array([[0, 1, 0], [0, -50, -10], [0, 0, 0]])
@@ -346,13 +330,14 @@ def test_a_wall_settles_nearly_as_far_as_it_is_stable_when_always_touched(part: 
         low, high = (middle, high) if radius(middle) < 1 else (low, middle)
     found = judged(wall(0.1, 5.0, TICK, part * low))
     assert found.stable is not True and found.settles
-    assert "comes to rest" in str(found) or "come to rest" in " ".join(str(found).split())
+    assert "it is proved to come to rest" in " ".join(str(found).split())
     assert not judged(wall(0.1, 5.0, TICK, 1.01 * low)).settles
 
 
 def test_what_is_left_open_says_so() -> None:
-    found = judged(stiff(HELD, 2550.0))
-    assert not found.settles and "come to rest" not in " ".join(str(found).split())
+    found = judged(stiff(ALONE, 2500.0))  # with its contacts closed it is stable up to 2557 N/m
+    assert not found.settles and found.reach is not None
+    assert "come to rest" not in " ".join(str(found).split())
     held = judged(stiff(HELD, 100.0))
     assert held.settles and held.stable
 

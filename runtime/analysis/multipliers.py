@@ -20,9 +20,9 @@ Where φ is the same at all ticks and never falls, f is a slope of a convex func
     f_k (w_k − w_{k−1}) ≥ Ψ(w_k) − Ψ(w_{k−1})
 
 The storage ξᵀP ξ + 2 h Ψ(w) falls where that of ξ and of the w of the frame before, v, grows by less than
-−2 fᵀ(Λ w + h (w − w_before)), for any h ≥ 0 (Jury and Lee, 1964). Of one-sided contacts Ψ is a square on either
-side of the touch: the storage is quadratic piece by piece. Seen from where the drift has come to, v⁺ is the
-last w less s m f.
+−2 fᵀ(Λ w + h (w − w_before)), for any h ≥ 0 (Jury and Lee, 1964). Of one-sided contacts Ψ is a square on
+either side of the touch: the storage is quadratic piece by piece. Seen from where the drift has come to, v⁺
+is the last w less s m f.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def _course(one: OpenLoop) -> tuple[Floats, list[int], Floats]:
 
 
 def _means(one: OpenLoop, weights: Weights) -> Floats:
-    """Return the mean weight of each tick's contact, of all its peers: alike in all loops, but for rounding."""
+    """Return the mean weight of each tick's contact, of all its peers."""
     own: dict[tuple[str, str], list[float]] = {}
     for port in one.ports:
         own.setdefault(port[:2], []).append(weights.get(port, (1.0, 0.0))[0])

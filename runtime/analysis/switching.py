@@ -21,6 +21,7 @@ is proved at will holds of what is linear about it, and loads of constant size l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -139,22 +140,18 @@ def _settles(loops: Sequence[OpenLoop], weights: Weights) -> bool:
     The least real part is concave in the lag.
     """
 
-    def least(lag: float) -> float:
-        return min(least_of(one, weights, lag) for one in loops)
+    known: dict[float, float] = {}
 
     def proved(lag: float) -> bool:
+        known[lag] = min(least_of(one, weights, lag) for one in loops)
         return known[lag] > -1 and all(is_proved(one, weights, lag) for one in loops)
 
-    known: dict[float, float] = {}
-    for lag in LAGS:
-        known[lag] = least(lag)
-        if proved(lag):
-            return True
+    if any(proved(lag) for lag in LAGS):
+        return True
     for _ in range(HALVINGS):
         tried, best = sorted(known), max(known, key=lambda lag: known[lag])
         place = tried.index(best)
-        for near in tried[max(place - 1, 0) : place] + tried[place + 1 : place + 2]:
-            known[lag := float(np.sqrt(best * near))] = least(lag)
-            if proved(lag):
-                return True
+        beside = tried[max(place - 1, 0) : place] + tried[place + 1 : place + 2]
+        if any(proved(math.sqrt(best * near)) for near in beside):
+            return True
     return False
