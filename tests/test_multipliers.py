@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 import apc
 from apc.analysis.analysis import prepare
 from apc.analysis.multipliers import is_proved, least_of, weights_of
 from apc.analysis.opened import OpenLoop, open_loops
-from tests.test_switching import ALONE, HELD, TIES, stiff, tick
+from tests.test_switching import HELD, TIES, stiff, tick
 from tests.topologies import compiled, replaced
 
 Floats = NDArray[np.float64]
@@ -78,23 +79,57 @@ def test_all_peers_at_once_take_out_as_little_energy_as_the_least_of_their_modes
     assert all(is_proved(one, weights, lag) for one in loops) is (truth > 0)
 
 
-def test_contacts_of_one_peer_count_their_own_ticks() -> None:
-    # One from the left and one from the right: by symmetry of their signs they weigh alike.
-    other = "  stop: {type: OneSidedContact, a: device, b: cube, side: right, half_width: 5 mm, stiffness: 60 N/m, clock: haptic}\n"  # noqa: E501
-    text = ALONE.rstrip("\n") + "\n" + other
-    text = replaced(text, ("clocks: {haptic: 1 ms}", "clocks: {haptic: 1 ms, slow: 3 ms}"))
-    text = replaced(
-        text,
-        (
-            "masses:",
-            "hands:\n  arm: {type: SpringDamperArm, flange: device, stiffness: 9 N/m, damping: 1 N*s/m}\nmasses:",
-        ),
-    )  # noqa: E501
-    system = compiled(text.replace("clock: haptic}", "clock: slow}", 1))
-    loops = loops_of(system)
+GRIPPED = """\
+topology: gripped
+clocks: {haptic: 1 ms, slow: 3 ms}
+peers: {user: {count: 1}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube: {mass: 0.6 kg, damping: 5 N*s/m}
+couplers:
+  push: {type: OneSidedContact, a: device, b: cube, stiffness: 80 N/m, clock: slow, delay: 1 ms}
+  pull: {type: OneSidedContact, a: device, b: cube, side: right, half_width: 5 mm, stiffness: 300 N/m, clock: haptic}
+hands:
+  arm: {type: SpringDamperArm, flange: device, stiffness: 9 N/m, damping: 1 N*s/m}
+"""  # noqa: E501
+
+
+@pytest.mark.parametrize("lag", [0.0, 4.0, 200.0])
+def test_each_contact_of_a_peer_counts_its_own_ticks(lag: float) -> None:
+    # A tick of (x, v, x_O, v_O) under both forces, then a frame of three from four forces: one of push, which
+    # acts a tick later, and three of pull.
+    rates = np.zeros((6, 6))
+    rates[0, 1] = rates[2, 3] = 1.0
+    rates[1, [0, 1, 4, 5]] = -90, -60, -10, 10
+    rates[3, [3, 4, 5]] = np.array([-5, 1, -1]) / 0.6
+    step = expm(1e-3 * rates)[:4]
+    whole = np.eye(9)
+    apart = np.array([1, 0, -1, 0, 0]) @ whole[:5]
+    follows = [80 * apart]
+    for k in range(3):
+        follows.append(-300 * (whole[0] - whole[2]))
+        acting = whole[4] if k == 0 else np.eye(9)[5]
+        whole[:4] = step @ np.vstack([whole[:4], acting, np.eye(9)[6 + k]])
+    whole[4] = np.eye(9)[5]
+    (a, b), y = (whole[:5, :5], whole[:5, 5:]), np.array(follows)
+
+    loops = loops_of(compiled(GRIPPED))
     weights = weights_of(loops)
     assert not isinstance(weights, str)
     (one,) = loops
-    assert len({port[:2] for port in one.ports}) == 2
-    for lag in (0.0, 30.0):
-        assert np.isfinite(least_of(one, weights, lag))
+    listed = [("user", "push.push", 0), *(("user", "pull.push", k) for k in range(3))]
+    assert sorted(one.ports) == sorted(listed)
+    own = np.array([weights.get(port, (1.0, 0.0))[0] for port in listed])
+    h = lag * np.array([own[0], *[own[1:].mean()] * 3])
+    before, around = np.diag([0.0, 1, 1], -1), np.zeros((4, 4))
+    before[1, 0] = 0.0
+    around[0, 0] = around[1, 3] = 1.0
+    truth = np.inf
+    for angle in np.geomspace(1e-3, np.pi, 3000):
+        z = np.exp(1j * angle)
+        inner = np.eye(4) - y[:, :5] @ np.linalg.solve(z * np.eye(5) - a, b) - y[:, 5:]
+        real = (np.diag(own) + h[:, None] * (np.eye(4) - before - around / z)) @ inner
+        scaled = (real + real.conj().T) / 2 / np.sqrt(np.outer(own, own))
+        truth = min(truth, float(np.linalg.eigvalsh(scaled)[0]))
+    assert 1 + least_of(one, weights, lag) == pytest.approx(truth, rel=1e-3, abs=1e-5 * (1 + lag))
+    assert is_proved(one, weights, lag) is (truth > 0)

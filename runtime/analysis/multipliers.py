@@ -108,7 +108,7 @@ def _posed(one: OpenLoop, weights: Weights, lag: float) -> tuple[Matrix, Matrix,
     # −w = C ξ + (D + 1) f, and less that of the tick before, which is −v at the first of a frame.
     whole = RADII.add(one.d, RADII.exact(np.eye(many)))
     push = RADII.exact(np.diag(lag * _means(one, weights)))
-    push[1] = 2 * UNIT * push[0]
+    push[1] = 4 * UNIT * push[0]
     rise, first = (RADII.multiply(push, RADII.exact(each)) for each in (np.eye(many) - before, first))
     seen = np.array([float(share) for share in one.seen] or [0.0] * many)[last]
     drift = RADII.multiply(np.stack([seen, UNIT * np.abs(seen)])[..., None], one.moved)
