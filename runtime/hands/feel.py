@@ -103,12 +103,13 @@ class Noise:
 
     `error_m` of a copy less the mean of the others', `velocity_m_s` of a device: for forces of 1 N rms at
     hands, or samples of positions off by 1 m rms (a sensor of steps q is off by q/√12). None in a scene that
-    drifts for it. By a Lyapunov equation in floats, without a bound.
+    drifts for it. ± `errors`, in this order, proved.
     """
 
     source: str
     error_m: float | None
     velocity_m_s: float | None
+    errors: tuple[float | None, float | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -649,17 +650,30 @@ def _noise(system: CompiledSystem, modes: _Modes, responses: _Responses) -> tupl
     for source, sensors in (("hands", False), ("sensors", True)):
         velocity = _variance(modes, responses, ticks, responses.velocity_weights, sensors=sensors)
         error = _variance(modes, responses, ticks, responses.error_weights, sensors=sensors)
-        found.append(Noise(source, *(None if one is None else one**0.5 for one in (error, velocity))))
+        (error_m, error_off), (velocity_m_s, velocity_off) = map(_rms, (error, velocity))
+        found.append(Noise(source, error_m, velocity_m_s, (error_off, velocity_off)))
     return tuple(found)
+
+
+def _rms(variance: tuple[float, float] | None) -> tuple[float, float] | tuple[None, None]:
+    """Return the root of a variance, and a bound on what that is off by."""
+    if variance is None:
+        return None, None
+    value, off = variance
+    root = max(value, 0.0) ** 0.5
+    return root, min(off / root if root else np.inf, off**0.5) + 2 * UNIT * root
 
 
 def _variance(
     modes: _Modes, responses: _Responses, ticks: list[Fraction], weights: _Weights | None, *, sensors: bool
-) -> float | None:
-    """Return the variance of states of the pushed peer, each class's noise its own at each of its peers."""
+) -> tuple[float, float] | None:
+    """Return the variance of states of the pushed peer, each class's noise its own at each of its peers.
+
+    With a bound on what it is off by.
+    """
     if weights is None:
         return None
-    total = 0.0
+    total = off = 0.0
     loop, basis = modes.loops[0], modes.bases[0]
     held = [place for place, site in enumerate(loop.sites) if site.device is not None]
     if weights.common:
@@ -667,7 +681,7 @@ def _variance(
         found = noise_variance(loop, ticks, sources, weights.common, basis, sensors=sensors)
         if found is None:
             return None
-        total += found
+        total, off = total + found[0], off + found[1]
     number = modes.apart.get(responses.own)
     if number is not None and weights.apart:
         sources = {0: 1 - 1 / modes.members[responses.own]}
@@ -676,8 +690,8 @@ def _variance(
         )
         if found is None:
             return None
-        total += found
-    return total
+        total, off = total + found[0], off + found[1]
+    return total, off + 2 * UNIT * total
 
 
 def _ticks(system: CompiledSystem, frame: float) -> list[Fraction] | None:
