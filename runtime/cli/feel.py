@@ -84,7 +84,8 @@ def feel_command(
         apc feel --from "0.1 Hz" --to "60 Hz" --out bode.svg
     """
     start_single_threaded()
-    from apc.hands.feel import feel, read_frequencies
+    from apc.hands.asked import read_frequencies
+    from apc.hands.feel import feel
     from apc.inputs import open_scene
     from apc.present.hands import check_feel_path, write_feel
     from apc.present.pictures import FORMATS
