@@ -39,7 +39,7 @@ from apc.frame.discretize import UNIT, discretize
 from apc.frame.exchange import build_exchange
 from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
 from apc.frame.parameters import resolve
-from apc.frame.radius import RADII, radius_of, value_of, with_radius
+from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Heard, Sent, Tick, Value, Way
 from apc.frame.site import LinearSite
 
@@ -275,9 +275,12 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
         closed[:, outside[first : first + 1]][..., held], RADII.multiply(c[:, first : first + 1], at.weights)
     )
     pushed = RADII.multiply(factors, closed[:, held][..., rest])
-    along = _solved(pushed, a)
-    if along is None:
+    # k (1 − A) = what is pushed.
+    left = RADII.subtract(RADII.exact(np.eye(a.shape[-1])), a)
+    solved = solve(np.swapaxes(left, -1, -2), np.swapaxes(pushed, -1, -2))
+    if solved is None:
         return "what moves with all contacts open can't be told from what drifts"
+    along = np.swapaxes(solved, -1, -2)
     share = [one / seen[first] for one in seen]
     column = np.array([[(float(one),) for one in share], [(UNIT * abs(float(one)),) for one in share]])
     moved = RADII.add(RADII.multiply(factors, closed[:, held][..., n:]), RADII.multiply(along, b))
@@ -334,21 +337,3 @@ def _seen(
 def _along(slopes: Sequence[Fraction], motion: Sequence[Fraction]) -> Fraction:
     """Return how far a y follows a motion of the continuous states that come first."""
     return sum((s * x for s, x in zip(slopes, motion, strict=False)), Fraction(0))
-
-
-def _solved(right: Matrix, a: Matrix) -> Matrix | None:
-    """Return k with k (1 − A) = a row (2, 1, n), with its radius; None where that can't be bounded."""
-    n = a.shape[-1]
-    left = RADII.subtract(RADII.exact(np.eye(n)), a)
-    try:
-        inverse = np.linalg.inv(value_of(left))
-    except np.linalg.LinAlgError:
-        return None
-    near = value_of(right) @ inverse
-    off = RADII.subtract(right, RADII.multiply(RADII.exact(near), left))
-    wrong = RADII.subtract(RADII.exact(np.eye(n)), RADII.multiply(left, RADII.exact(inverse)))
-    size = float((np.abs(value_of(wrong)) + radius_of(wrong)).sum(axis=0).max(initial=0.0))
-    if not size < 0.5:
-        return None
-    bound = (np.abs(value_of(off)) + radius_of(off)) @ np.abs(inverse)
-    return with_radius(near, (1 + (n + 4) * UNIT) * (bound + 2 * size * bound.max(initial=0.0)))
