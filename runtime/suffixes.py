@@ -16,6 +16,9 @@ from apc.compiler.files import is_special
 # What goes into a device or pipe whose name has no suffix: text, as whoever reads there expects.
 TEXTS = (".csv", ".txt", ".json", ".svg")
 
+# What other programs take for standard output.
+DASH = Path("-")
+
 
 def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
     """Return the suffix that says the format of what is written to a path.
@@ -42,6 +45,13 @@ def check_suffix(path: Path, known: Iterable[str], option: str) -> str:
         return texts[0]
     wanted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
     what, proposed = f"the suffix of {option.removesuffix('=')}", Path(path.name or "result")
+    if path == DASH:  # whoever writes it wants standard output, which takes text
+        told = (
+            Path("/dev/stdout")
+            if any(one in names for one in TEXTS)
+            else Path("result").with_suffix(names[0])
+        )
+        raise ApcError(Mistake("E878", Place(str(path)), what, wanted, "none", written(option, told)))
     hint = written(option, path.parent / proposed.with_suffix(names[0]))
     raise ApcError(Mistake("E878", Place(str(path)), what, wanted, path.suffix or "none", hint))
 

@@ -77,7 +77,7 @@ HOUSE = (
         "apc.analysis",
         """
         methods switches pushes plan selfcheck analysis needs box box_proof openloop paper conventions
-        contact_modes opened alternating switching describing
+        contact_modes opened alternating multipliers switching describing
         """,
     ),
     (
@@ -87,7 +87,7 @@ HOUSE = (
         hands errors network box
         """,
     ),
-    ("apc.hands", "port passivity response norms feel"),
+    ("apc.hands", "port passivity response norms asked answers feel"),
     (
         "apc.vary",
         """

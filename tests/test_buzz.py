@@ -99,6 +99,10 @@ def test_a_cycle_that_motions_leave_is_told_from_one_they_come_to() -> None:
     assert found.predicted is not None and not found.predicted.attracts
     assert found.lines == () and found.steady and found.bounded
     assert any("one that motions leave" in text for text in found.notes)
+    assert found.settles
+    told = str(found).splitlines()
+    assert sum(line.endswith("settles") for line in told) == 1 + len(found.contacts)
+    assert not any("e-" in line for line in told)
 
 
 def test_two_lines_in_the_spectrum_are_said_to_defeat_one_sinusoid() -> None:

@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import mpmath
 import numpy as np
 import pytest
 
@@ -68,10 +69,13 @@ def test_a_lone_mass_feels_like_itself() -> None:
     (peak,) = found.hinf
     assert peak.sampled_data.norm == pytest.approx(1 / 3, rel=1e-9)
     # Each tick's 1 N rms: v⁺ = e^{−bT/m} v + (1 − e^{−bT/m})/b F, whose variance is (1 − a)²/(b²(1 − a²)).
-    decay = math.exp(-3e-3 / 2)
-    hands = next(one for one in found.h2 if one.source == "hands")
-    assert hands.velocity_m_s == pytest.approx((1 - decay) / 3 / math.sqrt(1 - decay**2), rel=1e-12)
-    assert hands.error_m is None
+    with mpmath.workdps(50):
+        decay = mpmath.exp(mpmath.mpf(-3) / 2000)
+        truth = (1 - decay) / 3 / mpmath.sqrt(1 - decay**2)
+        hands = next(one for one in found.h2 if one.source == "hands")
+        assert hands.velocity_m_s is not None and hands.errors[1] is not None
+        assert abs(mpmath.mpf(hands.velocity_m_s) - truth) <= hands.errors[1] < 1e-11 * truth
+    assert (hands.error_m, hands.errors[0]) == (None, None)
 
 
 # Made by an independent program, which follows harmonics and takes norms by bisection and fast sampling:
@@ -116,6 +120,8 @@ def test_numbers_of_an_independent_program(known: tuple[object, ...]) -> None:
     assert [one.on_ticks.norm for one in found.hinf] == pytest.approx(ticks, rel=1e-9)
     assert [one.sampled_data.norm for one in found.hinf] == pytest.approx(sampled, rel=1e-9)
     assert found.h2[0].error_m == pytest.approx(rms, rel=1e-12)
+    off = found.h2[0].errors[0]
+    assert off is not None and abs(found.h2[0].error_m - float(str(rms))) <= off < 1e-10 * float(str(rms))
 
 
 @pytest.mark.parametrize(("text", "others"), [(AVERAGE, 1), (MESH, 2)])
@@ -326,6 +332,12 @@ def test_the_command_line_says_what_python_does(
     assert "E935" in capsys.readouterr().err
     assert run(["feel", "three.yaml", "--out", "bode.txt"]) == 1
     assert "E878" in capsys.readouterr().err
+    assert run(["feel", "three.yaml", "--out", "-"]) == 1
+    assert "got none. Write: --out /dev/stdout\n" in capsys.readouterr().err
+    for words_too in (["--from", "1 Hz"], ["--to", "9 Hz", "--points", "3"]):
+        assert run(["feel", "three.yaml", "--frequencies", "1 Hz", *words_too]) == 2
+        named = " or ".join(words_too[::2])
+        assert f"names every frequency there is: no {named} with it" in capsys.readouterr().err
     assert run(["feel", "three.yaml", "--at", "user[3]", "--between", "user[1]:user[2]"]) == 2
     assert run(["feel", "three.yaml", "--nyquist", "--out", "table.csv"]) == 2
     capsys.readouterr()

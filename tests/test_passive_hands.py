@@ -290,5 +290,7 @@ def test_the_command_line(
     assert "devices clamped: stable" in capsys.readouterr().out
     assert run(["analyze", "three.yaml", "--hands", "passive", "--box", "contact.stiffness=±1%"]) == 1
     assert "E930" in capsys.readouterr().err
+    assert run(["analyze", "three.yaml", "--hands", ""]) == 1
+    assert "E930 no hands are named (free, clamped," in capsys.readouterr().err
     assert run(["analyze", "three.yaml", "--hands", "claped"]) == 1
     assert "clamped" in capsys.readouterr().err

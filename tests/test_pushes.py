@@ -52,26 +52,29 @@ def own(law: str, folder: Path) -> Push | str | None:
 
 
 @pytest.mark.parametrize(
-    ("law", "sector", "one_sided"),
+    ("law", "sector", "one_sided", "shares"),
     [
-        ("k*max(0, d)", "", True),
-        ("if d > 0 then k*d else 0", "", True),
-        ("max(-force, min(force, k*d))", "", False),
-        ("if d > 0 then k*d else k*d/2", "", False),
-        ("if d > length then k*d else 0", "it.f jumps", False),
-        ("if d > 0 then k*d + force else 0", "it.f jumps", False),
-        ("k*abs(d)", "it.f falls, or grows faster in some piece than where it is on", False),
+        ("k*max(0, d)", "", True, True),
+        ("if d > 0 then k*d else 0", "", True, True),
+        ("max(-force, min(force, k*d))", "", False, False),
+        ("if d > 0 then k*d else k*d/2", "", False, True),
+        ("if d > length then k*d else 0", "it.f jumps", False, True),
+        ("if d > 0 then k*d + force else 0", "it.f jumps", False, True),
+        ("k*abs(d)", "it.f falls, or grows faster in some piece than where it is on", False, False),
         (
             "if d > 0 then max(0, k*(d + span*sample(der(a.x)))) else 0",
             "it.f depends on more than one number, such as a depth and its rate",
             True,
+            True,
         ),
     ],
 )
-def test_a_law_of_force_is_in_a_sector_or_not(law: str, sector: str, one_sided: bool, tmp_path: Path) -> None:
+def test_a_law_of_force_is_in_a_sector_or_not(
+    law: str, sector: str, one_sided: bool, shares: bool, tmp_path: Path
+) -> None:
     found = own(law, tmp_path)
     assert isinstance(found, Push)
-    assert (found.sector, found.one_sided) == (sector, one_sided)
+    assert (found.sector, found.one_sided, found.shares) == (sector, one_sided, shares)
     assert abs(found.slopes[0]) == pytest.approx(700.0)
     assert found.states == 2 and not np.asarray(found.slopes[2:]).any()
 

@@ -40,7 +40,7 @@ from apc.frame.discretize import UNIT, discretize
 from apc.frame.exchange import build_exchange
 from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
 from apc.frame.parameters import resolve
-from apc.frame.radius import RADII, radius_of, value_of, with_radius
+from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Heard, Sent, Tick, Value, Way
 from apc.frame.site import LinearSite
 
@@ -59,7 +59,7 @@ class Opened:
     """Peers with their contacts cut open: `map` over [z, y of each tick] and [r, f of each tick].
 
     `states` are those of z; `ticks` names each y and f by its part and tick, `slopes` are those of each y
-    over the continuous states, exactly; `plain` says that it follows nothing else.
+    over the continuous states, exactly; `plain` says that it follows nothing else. `jumps` is as of a loop.
     """
 
     group: PeerGroup
@@ -68,6 +68,7 @@ class Opened:
     ticks: tuple[tuple[str, int], ...]
     slopes: tuple[tuple[Fraction, ...], ...]
     plain: bool
+    jumps: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +76,8 @@ class OpenLoop:
     """A loop with its contacts cut open; A, B, C and D are `a` to `d`, `seen` is s and `moved` is m.
 
     `ports` name each f by its site, part and tick, `counts` how many peers have it. `seen` is exact, its
-    first that isn't 0 being 1; it is empty where nothing may drift.
+    first that isn't 0 being 1; it is empty where nothing may drift. `jumps` names a part whose force jumps
+    (see `pushes`), "" if none does.
     """
 
     name: str
@@ -87,6 +89,7 @@ class OpenLoop:
     counts: Floats
     seen: tuple[Fraction, ...]
     moved: Matrix
+    jumps: str
 
 
 def contact_groups(
@@ -165,7 +168,7 @@ def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop] | s
     opened: list[Opened] = []
     for group, pushes in groups:
         for one in pushes:
-            if one.sector:
+            if one.sector and not one.shares:
                 return one.sector
         opened.append(_cut_open(group, pushes))
     of_site = {id(one.group.lifted): one for one in opened}
@@ -232,7 +235,8 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     )
     wide_map = compose(with_roundings(wide), whole, off, numbers=RADII)
     plain = not any(one.slopes[one.states :].any() for one in pushes)
-    return Opened(bare, wide_map, len(bare.lifted.z_names), tuple(ticks), tuple(slopes), plain)
+    jumps = next((one.part for one in pushes if one.sector), "")
+    return Opened(bare, wide_map, len(bare.lifted.z_names), tuple(ticks), tuple(slopes), plain, jumps)
 
 
 def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
@@ -259,7 +263,8 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     each = list(zip(loop.sites, opened, strict=True))
     ports = tuple((site.name, *tick) for site, one in each for tick in one.ticks)
     counts = np.array([float(site.count) for site, one in each for _ in one.ticks])
-    plain = OpenLoop(loop.name, a, b, negated(c), negated(d), ports, counts, (), np.zeros((2, 1, len(ports))))
+    still, jumps = np.zeros((2, 1, len(ports))), next((one.jumps for one in opened if one.jumps), "")
+    plain = OpenLoop(loop.name, a, b, negated(c), negated(d), ports, counts, (), still, jumps)
     if free.exact and not all(one.plain for one in opened):
         return "what a contact follows is more than positions, and something may drift with all contacts open"
     seen = _seen(opened, free.exact, layout, n, outside)
@@ -271,9 +276,12 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
         closed[:, outside[first : first + 1]][..., held], RADII.multiply(c[:, first : first + 1], at.weights)
     )
     pushed = RADII.multiply(factors, closed[:, held][..., rest])
-    along = _solved(pushed, a)
-    if along is None:
+    # k (1 − A) = what is pushed.
+    left = RADII.subtract(RADII.exact(np.eye(a.shape[-1])), a)
+    solved = solve(np.swapaxes(left, -1, -2), np.swapaxes(pushed, -1, -2))
+    if solved is None:
         return "what moves with all contacts open can't be told from what drifts"
+    along = np.swapaxes(solved, -1, -2)
     share = [one / seen[first] for one in seen]
     column = np.array([[(float(one),) for one in share], [(UNIT * abs(float(one)),) for one in share]])
     moved = RADII.add(RADII.multiply(factors, closed[:, held][..., n:]), RADII.multiply(along, b))
@@ -330,21 +338,3 @@ def _seen(
 def _along(slopes: Sequence[Fraction], motion: Sequence[Fraction]) -> Fraction:
     """Return how far a y follows a motion of the continuous states that come first."""
     return sum((s * x for s, x in zip(slopes, motion, strict=False)), Fraction(0))
-
-
-def _solved(right: Matrix, a: Matrix) -> Matrix | None:
-    """Return k with k (1 − A) = a row (2, 1, n), with its radius; None where that can't be bounded."""
-    n = a.shape[-1]
-    left = RADII.subtract(RADII.exact(np.eye(n)), a)
-    try:
-        inverse = np.linalg.inv(value_of(left))
-    except np.linalg.LinAlgError:
-        return None
-    near = value_of(right) @ inverse
-    off = RADII.subtract(right, RADII.multiply(RADII.exact(near), left))
-    wrong = RADII.subtract(RADII.exact(np.eye(n)), RADII.multiply(left, RADII.exact(inverse)))
-    size = float((np.abs(value_of(wrong)) + radius_of(wrong)).sum(axis=0).max(initial=0.0))
-    if not size < 0.5:
-        return None
-    bound = (np.abs(value_of(off)) + radius_of(off)) @ np.abs(inverse)
-    return with_radius(near, (1 + (n + 4) * UNIT) * (bound + 2 * size * bound.max(initial=0.0)))

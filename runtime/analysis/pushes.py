@@ -4,6 +4,7 @@ Takes: a `SwitchedKind`, a `SwitchingPart` of it, a parameter vector.
 Gives: `Push`, `push_of`.
 Guarantees: what is called a sector is one between any two points: f = φ(y) with 0 ≤ Δφ ≤ Δy, y a linear
 combination of states, holds and memories at a tick; found in the equations, whatever the part is called.
+What is called shares is f = g y in each of its pieces, 0 ≤ g ≤ 1, whatever decides which piece it is.
 Does not: serve forces that act at every moment.
 
 y is measured as the part's own force: φ has slope 1 where it is on. A one-sided spring f = K max(0, d) has
@@ -39,7 +40,8 @@ class Push:
     """A part's force: output `output` of clock partition `partition`, y where it is on.
 
     y = `slopes` · (x, u, m) + `offset`; the first `states` slopes are those of x. `sector` is "" where the
-    force is φ(y) in a sector, else says why not. `one_sided` says that, along its slopes, it is max(0, y).
+    force is φ(y) in a sector, else says why not. `shares` says that each of its pieces is a share of y, and
+    `one_sided` that, along its slopes, it is max(0, y).
     """
 
     part: str
@@ -49,6 +51,7 @@ class Push:
     offset: float
     states: int
     sector: str
+    shares: bool
     one_sided: bool
 
 
@@ -116,12 +119,19 @@ def push_of(
         at = np.split(start + (y - offset - line @ start) / square * line, np.cumsum(sizes)[:-1])
         return float(np.asarray(tick(*at, [0.0] * heard.numel(), parameters, 0.0)).ravel()[row])
 
-    breaks, alone = [], True
+    breaks, alone, shares = [], True, True
     for setting in itertools.product((False, True), repeat=len(symbols)):
         values, slopes = piece(setting)
         along = slopes @ line / square
         aside = np.abs(slopes - along[:, None] * line).max(axis=1)
         alone = alone and not (aside > ROUNDED * np.abs(slopes).max(axis=1)).any()
+        scale = np.abs(line) @ np.abs(start) + abs(offset)
+        shares = (
+            shares
+            and -ROUNDED <= along[0] <= 1 + ROUNDED
+            and bool(aside[0] <= ROUNDED * np.abs(line).max())
+            and abs(values[0] - along[0] * (line @ start + offset)) <= ROUNDED * scale
+        )
         at = values - along * (line @ start + offset)
         breaks += [-float(at[k] / along[k]) for k in range(1, len(along)) if along[k]]
     size = max(float(np.abs(line) @ np.abs(start)), *map(abs, (*breaks, offset))) or 1.0
@@ -132,6 +142,7 @@ def push_of(
     return Push(
         *(part.name, partition, row, line, offset, sizes[0]),
         sector=sector and f"{part.name} {sector}",
+        shares=shares,
         one_sided=max(off) <= ROUNDED * size,
     )
 

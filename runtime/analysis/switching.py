@@ -1,53 +1,49 @@
-"""May contacts open and close at will: one quadratic function that falls whatever is on, tick by tick.
+"""May contacts open and close: at will, or as far in as they are; by one function that falls all the while.
 
 Takes: a `CompiledSystem` whose peers have parts that switch, and its modes of contact.
 Gives: `Switching`, `switching`.
 Guarantees: what is called stable is proved, for every pattern of contacts that are on, off or anything
 between, each peer and tick by itself: motions die out, but for what drifts with all contacts open, and that
-stays within bounds. The cost grows with the different peers, not with their number.
-Does not: look for functions that are not quadratic, or that change with the contacts; say that a scene whose
-proof fails is unstable, unless a mode of contact is, or contacts that close and open by turns make it grow.
+stays within bounds. What is said to settle is proved for contacts whose force is one function of one number:
+every motion comes to rest where loads that stay leave it one. The cost grows with the different peers, not
+with their number.
+Does not: say that a scene whose proof fails is unstable, unless a mode of contact is, or contacts that close
+and open by turns make it grow.
 
-All contacts cut open, H is the lifted map from their forces f, tick by tick over a frame, to the numbers y
-they follow (see `pushes`). Closed again f = φ(y) with f(y − f) ≥ 0, at each tick for itself. So the scene
-settles if for some weights λ > 0 of the ticks, Λ = diag(λ),
+At will it is proved by one quadratic function, the circle criterion (see `multipliers`). Functions that know
+what was on at the last ticks prove next to nothing more: contacts switch far more often than anything moves.
+Where contacts open and close by themselves, one that is quadratic piece by piece reaches nearly as far as
+contacts that are always closed.
 
-    Λ + He(−Λ H(e^{jθ})) ≻ 0        for all θ
-
-which is the circle criterion (Tsypkin, 1964) on the lifted system. What can drift with all contacts open is a
-pole of H at z = 1, R/(z − 1). Where it is one motion, y follows it alike at all ticks, R = c mᵀ, and with
-λ = −m/c the rest is free of it: He(−ΛR/(z − 1)) = ΛR/2 on the circle, of either sign of θ.
+A force that jumps as its contact opens, as a damped one does, is between none and that of a closed one: what
+is proved at will holds of what is linear about it, and loads of constant size leave motions within bounds.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apc.analysis.alternating import alternating
 from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.contact_modes import ContactModes
+from apc.analysis.multipliers import Weights, is_proved, least_of, weights_of
 from apc.analysis.opened import OpenLoop, open_loops
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.eigen.dissipation import least_real, proves_positive
-from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, value_of
 from apc.result import Result
 
-Matrix = NDArray[Any]
-
-# λ of a tick of a part at a site, and its radius.
-_Weights = dict[tuple[str, str, int], tuple[float, float]]
-
 STABLE, CANNOT, OPEN = "stable", "cannot be", "not decided"
+
+# How much the tick before counts, beside the tick itself: tried one after the other, then between the two
+# about the best, halving their distance so many times.
+LAGS, HALVINGS = tuple(4.0**k for k in range(9)), 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +62,8 @@ class Switching(Result):
     reason: str
     reach: float | None = None
     mode: str = ""
+    settles: bool = False
+    jumps: str = ""
 
     @property
     def stable(self) -> bool | None:
@@ -104,9 +102,15 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
 
 
 def _judge(topology: str, loops: Sequence[OpenLoop]) -> Switching:
-    """Prove the circle criterion of all loops, or a pattern by which one grows, or say what fails."""
-    found = _circle(topology, loops)
-    grows = None if found.stable else alternating(loops)
+    """Prove that contacts may switch at will, or a pattern by which the scene grows; else that it settles."""
+    weights = weights_of(loops)
+    jumps = next((one.jumps for one in loops if one.jumps), "")
+    found = _circle(topology, loops, weights)
+    if found.stable:
+        return replace(found, settles=not jumps, jumps=jumps)
+    settles = not isinstance(weights, str) and not jumps and _settles(loops, weights)
+    found = replace(found, settles=settles, jumps=jumps)
+    grows = alternating(loops)
     if grows is None:
         return found
     ticks = f"closed for {counted(grows.closed, 'tick')} and open for {counted(grows.opened, 'tick')}"
@@ -114,57 +118,41 @@ def _judge(topology: str, loops: Sequence[OpenLoop]) -> Switching:
     return replace(found, verdict=CANNOT, reason=reason)
 
 
-def _circle(topology: str, loops: Sequence[OpenLoop]) -> Switching:
+def _circle(topology: str, loops: Sequence[OpenLoop], weights: Weights | str) -> Switching:
     """Prove the circle criterion of all loops, or say which fails."""
-    drifting = [one for one in loops if one.seen]
-    if len(drifting) > 1:
-        names = " and ".join(one.name for one in drifting)
-        reason = f"with all contacts open, what may drift is of several modes: {names}"
-        return Switching(topology, OPEN, reason)
-    weights: _Weights = {}
-    for one in drifting:
-        for k, (site, name, tick) in enumerate(one.ports):
-            if not one.seen[k]:
-                return Switching(
-                    topology, OPEN, f"{name} does not hold what may drift with all contacts open"
-                )
-            by = -1 / (float(one.seen[k]) * one.counts[k])
-            moved, off = (float(one.moved[which, 0, k]) for which in (0, 1))
-            weights[site, name, tick] = by * moved, abs(by) * (off + 8 * UNIT * abs(moved))
-            if not weights[site, name, tick][0] > weights[site, name, tick][1]:
-                return Switching(topology, OPEN, f"{name} drives away what may drift with all contacts open")
-    least, worst = np.inf, ""
-    for one in loops:
-        root = np.sqrt(np.diag(value_of(_weigh(one, weights))))
-        a, b, c, d = (value_of(block) for block in (one.a, one.b, one.c, one.d))
-        pole = value_of(one.moved)[0] / root
-        scaled = b / root, root[:, None] * c, root[:, None] * d / root
-        found, _ = least_real(a, *scaled, -np.outer(pole, pole) / 2)
-        if found < least:
-            least, worst = found, one.name
+    if isinstance(weights, str):
+        return Switching(topology, OPEN, weights)
+    least, worst = min(((least_of(one, weights), one.name) for one in loops), default=(np.inf, ""))
     reach = float("inf") if least >= 0 else float(-1 / least)
-    fails = [one.name for one in loops if not _is_proved(one, weights)]
     if not reach > 1:
         reason = f"the circle criterion fails in the {worst} mode"
-    elif fails:
+    elif fails := [one.name for one in loops if not is_proved(one, weights)]:
         reason = f"the circle criterion holds too narrowly to be proved in the {fails[0]} mode"
     else:
         return Switching(topology, STABLE, "", reach, worst)
     return Switching(topology, OPEN, reason, reach, worst)
 
 
-def _weigh(one: OpenLoop, weights: _Weights) -> Matrix:
-    """Return the weights of a loop's ticks, of all their peers, on a diagonal with their radii."""
-    found = np.zeros((2, len(one.ports), len(one.ports)))
-    for k, (port, count) in enumerate(zip(one.ports, one.counts.tolist(), strict=True)):
-        value, radius = weights.get(port, (1.0, 0.0))
-        found[:, k, k] = value * count, (radius + UNIT * value) * count * (1 + 4 * UNIT)
-    return found
+def _settles(loops: Sequence[OpenLoop], weights: Weights) -> bool:
+    """Say whether a function that is quadratic piece by piece is proved to fall.
 
+    Notes
+    -----
+    The least real part is concave in the lag.
+    """
 
-def _is_proved(one: OpenLoop, weights: _Weights) -> bool:
-    """Say whether a loop's circle criterion is proved with these weights of the ticks."""
-    weigh = _weigh(one, weights)
-    half = RADII.multiply(np.swapaxes(one.moved / 2, -1, -2), one.moved)
-    c, d = (RADII.multiply(weigh, block) for block in (one.c, one.d))
-    return proves_positive(one.a, one.b, c, d, RADII.subtract(weigh, half))
+    known: dict[float, float] = {}
+
+    def proved(lag: float) -> bool:
+        known[lag] = min(least_of(one, weights, lag) for one in loops)
+        return known[lag] > -1 and all(is_proved(one, weights, lag) for one in loops)
+
+    if any(proved(lag) for lag in LAGS):
+        return True
+    for _ in range(HALVINGS):
+        tried, best = sorted(known), max(known, key=lambda lag: known[lag])
+        place = tried.index(best)
+        beside = tried[max(place - 1, 0) : place] + tried[place + 1 : place + 2]
+        if any(proved(math.sqrt(best * near)) for near in beside):
+            return True
+    return False

@@ -10,6 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 
 from apc.cli.options import (
     Command,
@@ -24,6 +25,9 @@ from apc.cli.options import (
     tell,
 )
 from apc.threads import start_single_threaded
+
+# The options that --frequencies takes the place of, by parameter.
+_SPANNED = {"low": "--from", "high": "--to", "points": "--points"}
 
 
 @click.command("feel", cls=Command)
@@ -52,7 +56,9 @@ from apc.threads import start_single_threaded
 @click.option("--nyquist", is_flag=True, help="Draw Nyquist's plot, not Bode's.")
 @file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
 @json_option
+@click.pass_context
 def feel_command(
+    context: click.Context,
     file: str | None,
     settings: tuple[str, ...],
     at: str,
@@ -79,11 +85,16 @@ def feel_command(
         apc feel --from "0.1 Hz" --to "60 Hz" --out bode.svg
     """
     start_single_threaded()
-    from apc.hands.feel import feel, read_frequencies
+    from apc.hands.asked import read_frequencies
+    from apc.hands.feel import feel
     from apc.inputs import open_scene
     from apc.present.hands import check_feel_path, write_feel
     from apc.present.pictures import FORMATS
 
+    given = [name for name in _SPANNED if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
+    if frequencies is not None and given:
+        named = " or ".join(_SPANNED[name] for name in given)
+        raise click.UsageError(f"--frequencies names every frequency there is: no {named} with it")
     first, colon, second = between.partition(":")
     if at and colon and at != first:
         raise click.UsageError("--between A:B names the hand's device, A: no --at with it")

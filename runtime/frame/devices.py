@@ -378,7 +378,8 @@ def published(name: str) -> dict[str, tuple[str, str, str]]:
     found = {one: ranges for one in known.component_names if (ranges := _ranges(known.component(one)))}
     if name not in found:
         listed = (*HANDS, *found)
-        what = f"{name[:40]} are no hands ({', '.join(listed)})"
+        got = f"{name[:40]} are no hands" if name.strip() else "no hands are named"
+        what = f"{got} ({', '.join(listed)})"
         near = nearest(name, listed)
         raise ApcError(Mistake("E930", Place("--hands"), what, hint=f"--hands {near or CLAMPED}"))
     return found[name]

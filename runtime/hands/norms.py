@@ -3,7 +3,8 @@
 Takes: a mode whose peers may be pushed (`response.Pushed`), and its rigid motions.
 Gives: `Peak`, `tick_peak`, `sampled_data_peak`; `noise_variance`.
 Guarantees: no grid of frequencies decides anything; an output that a rigid motion shows in has no norm.
-Does not: prove it: norms are right to what rounding leaves, some 1e-12 of them, and to `error`.
+Does not: prove H∞: such norms are right to what rounding leaves, some 1e-12 of them, and to `error`; a
+variance has a bound.
 
 On ticks, a force is held from one instant at which anything happens to the next, and what comes of it is read
 at these. Of the motion in between, force and motion are taken at Gauss nodes of each interval, as polynomials
@@ -13,7 +14,6 @@ Pearson, IEEE Trans. Autom. Control 37 (1992) 418, reduce the same operator; its
 
 from __future__ import annotations
 
-import warnings
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
 from apc.eigen.dissipation import peak_gain
-from apc.eigen.relative import relative, relative_coordinates, relative_rows
-from apc.frame.discretize import exponential_rows
-from apc.frame.radius import value_of
+from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
+from apc.frame.discretize import UNIT, exponential_rows
+from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.hands.response import Pushed, Site, force_lanes
-from apc.threads import load_pool
+from apc.moments.gains import around, stein
 
 Floats = NDArray[np.float64]
 
@@ -157,8 +157,10 @@ def noise_variance(
     basis: Floats,
     *,
     sensors: bool,
-) -> float | None:
+) -> tuple[float, float] | None:
     """Return the variance of what white noise makes of some states, on the average over the ticks of a frame.
+
+    With a bound on what it is off by, proved for all matrices within their radii.
 
     Parameters
     ----------
@@ -177,40 +179,43 @@ def noise_variance(
 
     Returns
     -------
-    None where a rigid motion that noise drives shows in the states: it drifts.
+    None where a rigid motion that noise drives shows in the states: it drifts; or nearly, so that no end of
+    it is known.
     """
-    m, k, c, d = map(value_of, (loop.m, loop.k, loop.c, loop.d))
     columns = []
     for site, variance in sources.items():
         own = loop.sites[site]
-        inputs = np.zeros((k.shape[1], len(ticks)))
+        inputs = np.zeros((2, loop.k.shape[-1], len(ticks)))
         for place, (seconds, start) in enumerate(zip(own.seconds, own.starts, strict=True)):
             drawn = bisect_right(ticks, start) - 1
             if sensors:
-                inputs[loop.kicks[site][place, -1], drawn] = variance**0.5
+                inputs[0, loop.kicks[site][place, -1], drawn] = 1.0
             else:
-                inputs[loop.kicks[site][place, :-1], drawn] = (
-                    variance**0.5 * _lanes(own, float(seconds), 1)[:, 0]
-                )
+                step = force_lanes(own, float(seconds), 1)
+                lanes = with_radius(step.matrix, step.roundings * UNIT * step.size)[0]
+                inputs[:, loop.kicks[site][place, :-1], drawn] = lanes[:, : len(own.states), -1]
+        inputs *= variance**0.5
+        inputs[1] += 4 * UNIT * np.abs(inputs[0])
         columns.append(inputs)
-    inputs = np.concatenate(columns, axis=1)
-    read = np.zeros((len(ticks), c.shape[0]))
+    inputs = np.concatenate(columns, axis=-1)
+    read = np.zeros((2, len(ticks), loop.c.shape[-2]))
     for (site, state), weight in outputs.items():
         place_of = {start: place for place, start in enumerate(loop.sites[site].starts)}
         for line, tick in enumerate(ticks):
-            read[line, loop.reads[site][place_of[tick], state]] += weight
-    at = relative_coordinates(basis)
-    b, seen = k @ inputs, read @ c
-    if _shows(basis, seen):
+            read[0, line, loop.reads[site][place_of[tick], state]] += weight
+    read[1] = 4 * UNIT * np.abs(read[0])
+    seen = RADII.multiply(read, loop.c)
+    if _shows(basis, value_of(seen)):
         return None
-    root = relative_rows(b, at)
-    linalg = load_pool("scipy.linalg")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", linalg.LinAlgWarning)
-        try:
-            moments = linalg.solve_discrete_lyapunov(relative(m, at), root @ root.T)
-        except linalg.LinAlgWarning:  # it all but drifts: no digit of it is known
-            return None
-    seen = seen[:, at.rest]
-    through = read @ d @ inputs
-    return float((np.einsum("ij,jk,ik->i", seen, moments, seen) + (through**2).sum(axis=1)).mean())
+    at = with_doubt(relative_coordinates(basis))
+    root = relative_rows(RADII.multiply(loop.k, inputs), at, RADII)
+    driven = RADII.multiply(root, np.swapaxes(root, -1, -2))
+    moments = stein(relative(loop.m, at, RADII), driven[None], RADII)
+    if moments is None:
+        return None
+    through = RADII.multiply(RADII.multiply(read, loop.d), inputs)
+    whole = RADII.add(
+        around(seen[..., at.rest], moments[0], RADII), RADII.multiply(through, np.swapaxes(through, -1, -2))
+    )
+    value, off = (float(np.trace(one)) / len(ticks) for one in (value_of(whole), radius_of(whole)))
+    return value, off + (len(ticks) + 4) * UNIT * value

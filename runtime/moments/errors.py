@@ -27,7 +27,7 @@ from apc.compiler.frozen import dataclass
 from apc.eigen.modes import dense_loop
 from apc.eigen.relative import Relative, relative_coordinates
 from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, radius_of, rounded, value_of
+from apc.frame.radius import RADII, radius_of, rounded, solve, value_of
 from apc.moments.bursts import tagged_moments
 from apc.moments.crowd import crowd, hearing, peer_classes
 from apc.moments.gains import Moments, around, gain_of, number_of, stein, units_of
@@ -47,9 +47,6 @@ SIZED = 40
 
 # By what factor of its rounding a covariance that vanishes is taken to be there.
 VANISHING = 1e3
-
-# How often a bound is put into itself: some entries have one far better than the largest.
-SHARPENED = 4
 
 # How far a motion that nothing holds back may move copies apart: those of rational weights are rounded.
 APART = 1e-9
@@ -336,9 +333,8 @@ def _solved(matrix: Matrix, known: Matrix, squares: Sequence[tuple[int, int]]) -
 
     Notes
     -----
-    With an inverse Y in floats, x = Y V₀ and r = V₀ − (1 − G) x, what x is off by is e = Y r + F e, where
-    F = 1 − Y (1 − G): at most twice the largest of |Y r| if ‖F‖ < 1/2, and then |Y r| + |F| e again. Sizes
-    are those of covariances, √(V_aa V_bb), of a few frames: `squares` says where each entry's a and b are.
+    Entries are solved for beside their sizes, those of covariances, √(V_aa V_bb), of a few frames: `squares`
+    says where each entry's a and b are.
     """
     a, b = np.array(squares).T
     few = known[0]
@@ -355,21 +351,12 @@ def _solved(matrix: Matrix, known: Matrix, squares: Sequence[tuple[int, int]]) -
     inner[1] += 4 * UNIT * np.abs(inner[0])
     of = known[:, kept] / size
     of[1] += 2 * UNIT * np.abs(of[0])
-    unit = RADII.exact(np.eye(len(kept)))
-    left = RADII.subtract(unit, inner)
-    inverse = np.linalg.inv(value_of(left))
-    guess = inverse @ of[0]
-    off = RADII.subtract(of[..., None], RADII.multiply(left, RADII.exact(guess[:, None])))
-    reached = np.abs(RADII.multiply(RADII.exact(inverse), off)).sum(axis=0)[:, 0]
-    wrong = np.abs(RADII.subtract(unit, RADII.multiply(RADII.exact(inverse), left))).sum(axis=0)
-    most = float(wrong.sum(axis=1).max(initial=0.0))
-    if not most < 1 / 2:
+    solved = solve(RADII.subtract(RADII.exact(np.eye(len(kept))), inner), of[..., None])
+    if solved is None:
         return None
-    radius = np.full(len(kept), 2 * reached.max(initial=0.0))
-    for _ in range(SHARPENED):
-        radius = (reached + wrong @ radius) * (1 + len(kept) * UNIT)
-    radius += 2 * UNIT * np.abs(guess)
-    found[:, kept] = np.stack([guess, radius * (1 + 8 * UNIT)]) * size
+    solved[1] += 2 * UNIT * np.abs(solved[0])
+    found[:, kept] = solved[..., 0] * size
+    found[1] *= 1 + 8 * UNIT
     return found
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
+from apc.eigen.dissipation import is_positive
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
@@ -161,7 +162,8 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     scale = np.outer(weights, weights)
     size = (np.abs(value_of(left)) + radius_of(left)) / scale
     *thetas, phi = size.sum(axis=-1).max(axis=-1) * (1 + (n + 8) * UNIT)
-    if not (phi < 1 and _is_positive(still[0] / scale)):
+    shape = still[0] / scale
+    if not (phi < 1 and is_positive(with_radius(shape, 2 * UNIT * np.abs(shape)))):
         return None
     wide = np.sqrt(np.diagonal(still[0]))
     reach = np.array(thetas)[:, None, None] / (1 - phi) * np.outer(wide, wide)
@@ -176,20 +178,6 @@ def _weights(found: Matrix, matrix: Matrix) -> Floats:
         least = (weights[weights > 0] / alike[weights > 0]).min(initial=np.inf)
         weights = np.where(weights > 0, weights, alike * (least if np.isfinite(least) else 1.0))
     return np.asarray(weights)
-
-
-def _is_positive(matrix: Matrix) -> bool:
-    """Say whether a symmetric matrix, its entries rounded twice, is proved to have no eigenvalue below 0.
-
-    A Cholesky factorization that runs to its end is one of a matrix that is off by (n + 1) u times its trace
-    at most (Higham, Accuracy and Stability of Numerical Algorithms, theorem 10.3).
-    """
-    n, trace = len(matrix), float(np.trace(matrix))
-    try:
-        np.linalg.cholesky(matrix - 4 * (n + 8) * UNIT * trace * np.eye(n))
-    except np.linalg.LinAlgError:
-        return False
-    return bool(np.isfinite(trace))
 
 
 def _doubled(matrix: Matrix, driven: Matrix) -> Matrix | None:

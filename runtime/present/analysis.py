@@ -394,6 +394,8 @@ def switching_text(found: Switching) -> str:
     reach = found.reach
     if found.stable:
         said = "proved stable by the circle criterion"
+        if found.jumps:
+            said += f" (as {found.jumps} jumps where it opens, within bounds: it need not come to rest)"
     else:
         said = f"{'cannot be proved' if found.stable is False else 'not decided'}: {found.reason}"
     if reach is not None and math.isfinite(reach):
@@ -401,6 +403,11 @@ def switching_text(found: Switching) -> str:
         said += f"; the criterion holds for contacts up to {times} times as stiff"
     elif reach is not None:
         said += "; the criterion holds however stiff the contacts"
+    if found.settles and not found.stable:
+        said += (
+            ". As they open and close by themselves it is proved to come to rest where its loads let it, by "
+            "a function that is quadratic piece by piece"
+        )
     return "\n".join(wrapped(f"{found.topology}, contacts that open and close at will: {said}", "", "  "))
 
 

@@ -152,11 +152,15 @@ def feel_text(found: Feel) -> str:
         lines += [_extreme(one) for one in found.hinf]
     for one in found.h2:
         values = [
-            f"copies apart {one.error_m * 1e3:.5g} mm" if one.error_m is not None else "",
-            f"velocity {one.velocity_m_s * 1e3:.5g} mm/s" if one.velocity_m_s is not None else "",
+            f"{what} {measured(value * 1e3, off * 1e3, unit)}"
+            for what, value, off, unit in (
+                ("copies apart", one.error_m, one.errors[0], "mm"),
+                ("velocity", one.velocity_m_s, one.errors[1], "mm/s"),
+            )
+            if value is not None and off is not None
         ]
         what = "1 N rms of every hand" if one.source == "hands" else "1 m rms of every device's samples"
-        words = f"{', '.join(one for one in values if one) or 'it drifts'} (rms) for {what}, new at each tick"
+        words = f"{', '.join(values) or 'it drifts'} (rms) for {what}, new at each tick"
         lines += ["", *wrapped(words, "  ", "    ")]
     return "\n".join(lines)
 

@@ -65,14 +65,15 @@ _WORDS = {
 def buzz_text(found: Buzz) -> str:
     """Return a buzz as it is predicted beside what was played."""
     known = found.predicted
-    played = in_hertz(found.lines[0].frequency_hz) if found.lines else "–"
+    settles = "settles" if found.settles else ""
+    played = in_hertz(found.lines[0].frequency_hz) if found.lines else settles or "–"
     title = f"{found.topology}: the buzz of its contacts, predicted beside {found.played_s:g} s played"
     rows = [("frequency", in_hertz(known.frequency_hz) if known else "–", played)]
     share = f"{known.in_contact:.1%}" if known else "–"
     for one in found.contacts:
         depth = "–" if one.predicted_depth_m is None else f"{one.predicted_depth_m * 1e3:.4g} mm"
         rows += [
-            (f"{one.name}: depth", depth, f"{one.depth_m * 1e3:.4g} mm"),
+            (f"{one.name}: depth", depth, settles or f"{one.depth_m * 1e3:.4g} mm"),
             (f"{one.name}: in contact", share, f"{one.in_contact:.1%}"),
         ]
     width = max(len(name) for name, _, _ in rows)

@@ -103,6 +103,11 @@ class Buzz(Result):
     contacts: tuple[ContactBuzz, ...]
     notes: tuple[str, ...]
 
+    @property
+    def settles(self) -> bool:
+        """Whether the motion played came to rest: what is left of its swings is rounding."""
+        return self.steady and not self.lines
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Measured:

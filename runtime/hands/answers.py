@@ -1,0 +1,269 @@
+"""How peers answer a push at one of them, put together from the answers of modes.
+
+Takes: a `CompiledSystem` with what `analysis.prepare` made of it, and two devices.
+Gives: `Modes`, `open_modes`; `Responses`, `Weights`.
+Guarantees: an answer is exact for the sampled, held and sent signals of the scene, with a bound on its
+rounding.
+Does not: ask whether the scene is stable.
+
+Peers' answers are put together from those of modes: with all n peers of a class alike, or one against their
+mean, a push at one of them is 1/n of the first and 1 − 1/n of the second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared, lifted_groups
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
+from apc.eigen.closing import Loop
+from apc.eigen.modes import arrange, dense_loop
+from apc.eigen.peer_group import MOST_STATES, PeerGroup
+from apc.eigen.rigid import find_rigid_modes
+from apc.frame.devices import OWN_MASS, Device, find_device
+from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange
+from apc.hands.asked import Port
+from apc.hands.response import Carried, Pushed, add, open_site, pushed_loop, spectra
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+# Turns a frame, so near a whole number of which a scene that may rest anywhere is asked around a frequency,
+# how far around, in 1/s, and at how many points.
+NEAR, ASIDE, AROUND = 1e-5, 0.25, 16
+
+# States and readings of all kinds of peers together, in one matrix.
+MOST_TOGETHER = 2000
+
+# Intervals of a peer times its states, of what is kicked and read in a frame.
+MOST_KICKS = 4000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Modes:
+    """A scene as modes of which any device may be pushed: that of all classes first, then each class apart.
+
+    `bases` are the modes' rigid motions. A class is a site of the first: `apart` gives its own mode,
+    `members` how many peers it stands for, `class_of` the class of a peer. `device` is what is pushed,
+    `other` what else is looked at.
+    """
+
+    loops: tuple[Pushed, ...]
+    bases: tuple[Floats, ...]
+    apart: dict[int, int]
+    class_of: dict[int, int]
+    members: tuple[int, ...]
+    device: Device
+    other: Device
+
+
+def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> tuple[Modes, Exchange]:
+    """Open all peers of a scene, and put them together to modes."""
+    groups, exchange = lifted_groups(system, prepared=prepared)
+    unit_of = {one.name: one.unit for one in system.parameters}
+    opened, sites, held = [], {}, {}
+    for group in groups:
+        device = None
+        for one in (other, port):
+            if one.peer not in group.peers:
+                continue
+            named = one.part or (port.part if port.peer in group.peers else "")
+            device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=named)
+            if not isinstance(device, Device):
+                what = device or f"{group.name} has no device"
+                hint = f"--at with the part that is held, as {group.name}[1].device" if device else OWN_MASS
+                raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+            held[one] = device
+        if device is None:
+            device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
+        kicks = len(group.schedule.events) * len(group.site.a)
+        if kicks > MOST_KICKS:
+            what = f"a frame of {group.name} has too many events and states: {kicks:,} together"
+            hint = f"{MOST_KICKS:,} at most"
+            raise ApcError(Mistake("E933", Place(system.origin.topology), what, hint=hint))
+        own, site = open_site(group, device if isinstance(device, Device) else None)
+        opened.append(own)
+        sites[id(own.schedule)] = site
+    plain, wide = _arranged(system, groups, exchange), _arranged(system, opened, exchange)
+    common = wide[0]
+    if (states := sum(len(site.lifted.z_names) for site in common.sites)) > MOST_TOGETHER:
+        what = f"{len(common.sites):,} peers that differ have {states:,} states and readings in a frame"
+        hint = f"fewer peers that differ: {MOST_TOGETHER:,} at most"
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
+    class_of = {
+        peer: place
+        for place, site in enumerate(common.sites)
+        for peer in (port.peer, other.peer)
+        if peer in site.peers
+    }
+    counts = tuple(site.count if common.name == "common" else 1 for site in common.sites)
+    loops = tuple(
+        pushed_loop(loop, sites, counts if number == 0 else (1,)) for number, loop in enumerate(wide)
+    )
+    apart = {}
+    for number, loop in enumerate(wide[1:], 1):
+        for place, alike in enumerate(common.sites):
+            if loop.sites[0].name == alike.name:
+                apart[place] = number
+    bases = tuple(find_rigid_modes(loop).basis for loop in plain)
+    return Modes(loops, bases, apart, class_of, counts, held[port], held[other]), exchange
+
+
+def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
+    """Return one loop of all classes of equal peers, and one of each class apart; or all peers in one."""
+    first, *apart = arrange(groups, exchange).loops
+    if first.name in ("common", "single") and _by_classes(first, apart):
+        return first, *apart
+    states = sum(group.count * len(group.lifted.z_names) for group in groups)
+    if states > MOST_STATES:
+        what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and readings"
+        hint = f"peers on complete graphs, or {MOST_STATES:,} in all"
+        raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
+    return (dense_loop(groups, exchange),)
+
+
+def _by_classes(common: Loop, apart: Sequence[Loop]) -> bool:
+    """Say whether each other loop is all there is of one class apart: a ring has more of them, one a wave."""
+    many = {site.name: site.count - 1 for site in common.sites}
+    return all(len(loop.sites) == 1 and loop.multiplicity == many.get(loop.sites[0].name) for loop in apart)
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """What a quantity of the pushed peer is over (site, state): of classes' means, and of its own apart."""
+
+    common: dict[tuple[int, int], float]
+    apart: dict[tuple[int, int], float]
+
+
+class Responses:
+    """The answers to a push of one peer, put together from those of modes."""
+
+    def __init__(self, modes: Modes, peer: int, other: int) -> None:
+        self.modes = modes
+        self.peer, self.across = peer, other
+        self.own, self.to = modes.class_of[peer], modes.class_of[other]
+        self.device, self.other = modes.device, modes.other
+        self.copies = [_copy(site.group) for site in modes.loops[0].sites]
+        named = self.copies[self.own]
+        self.copy = named[0] if named else ""
+
+    def at(self, s: Complex, aliases: Sequence[int] = (0,)) -> list[Carried]:
+        """Return the velocity here at each alias, the velocity there, and the copy's error (k,)."""
+        common = self.modes.loops[0]
+        n = self.modes.members[self.own]
+        copies = [(place, one[1], 0) for place, one in enumerate(self.copies) if one]
+        here, there, own = self.device.velocity, self.other.velocity, self.copies[self.own]
+        wanted = [(self.own, here, alias) for alias in aliases]
+        wanted = [*wanted, (self.to, there, 0), *copies]
+        together = [_scaled(one, 1 / n) for one in spectra(common, self.own, wanted, s)]
+        velocity, (across, *rest) = together[: len(aliases)], together[len(aliases) :]
+        parts = dict(zip([place for place, _, _ in copies], rest, strict=True))
+        apart: list[Carried] = []
+        if n > 1:
+            loop = self.modes.loops[self.modes.apart[self.own]]
+            rows = [(0, here, alias) for alias in aliases]
+            rows += ([(0, there, 0)] if self.own == self.to else []) + ([(0, own[1], 0)] if own else [])
+            apart = spectra(loop, 0, rows, s)
+            velocity = [add(a, _scaled(b, 1 - 1 / n)) for a, b in zip(velocity, apart, strict=False)]
+            if self.own == self.to:
+                share = 1 - 1 / n if self.peer == self.across else -1 / n
+                across = add(across, _scaled(apart[len(aliases)], share))
+        error = self._error(parts, apart[-1] if own and n > 1 else None, len(s))
+        return [*velocity, across, error]
+
+    def steady(self, s: Complex, aliases: Sequence[int]) -> list[Carried]:
+        """Return the same on the imaginary axis, at multiples of the frame rate too.
+
+        Notes
+        -----
+        There e^{sT} = 1, and where a scene may rest anywhere its equations of a frame say nothing, though the
+        response has a value: the mean over a circle about s. Its mean against the direction is 0 if no pole
+        is within.
+        """
+        turns = s.imag * float(self.modes.loops[0].frame) / (2 * np.pi)
+        drifting = any(basis.size for basis in self.modes.bases)
+        near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5) & drifting
+        found = [(np.zeros(len(s), complex), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
+        if not near.all():
+            for (value, off), (own, doubt) in zip(found, self.at(s[~near], aliases), strict=True):
+                value[~near], off[~near] = own, doubt
+        around = ASIDE * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
+        for place in np.flatnonzero(near):
+            circles = self.at(s[place] + np.concatenate([2 * around, around]), aliases)
+            for (value, off), (own, doubt) in zip(found, circles, strict=True):
+                inner = own[AROUND:]
+                pole = abs((inner * around).mean()) / ASIDE
+                value[place] = inner.mean()
+                off[place] = abs(own[:AROUND].mean() - value[place]) + pole + doubt.max()
+        return found
+
+    @property
+    def velocity_weights(self) -> Weights:
+        """What the velocity of the pushed peer is, in the modes."""
+        one = {(self.own, self.device.velocity): 1.0}
+        return Weights(one, {(0, self.device.velocity): 1.0})
+
+    @property
+    def error_weights(self) -> Weights | None:
+        """What the error of the pushed peer's copy is, in the modes; None without any."""
+        others = self._others()
+        total = sum(others.values())
+        own = self.copies[self.own]
+        if own is None or not total:
+            return None
+        common = {(self.own, own[1]): 1.0}
+        for place, many in others.items():
+            copy = self.copies[place]
+            assert copy is not None
+            common[place, copy[1]] = common.get((place, copy[1]), 0.0) - many / total
+        return Weights(
+            {key: weight for key, weight in common.items() if abs(weight) > UNIT},
+            {(0, own[1]): 1 + 1 / total},
+        )
+
+    def _others(self) -> dict[int, int]:
+        """Return how many others have a copy of the pushed peer's, class by class."""
+        return {
+            place: self.modes.members[place] - (place == self.own)
+            for place, one in enumerate(self.copies)
+            if one and one[0] == self.copy
+        }
+
+    def _error(self, parts: dict[int, Carried], apart: Carried | None, count: int) -> Carried:
+        """Return how far the copy here is from the mean of all others' of its name."""
+        others = self._others()
+        total = sum(others.values())
+        nothing = np.zeros(count, complex), np.zeros(count)
+        if not total:
+            return nothing
+        found = parts[self.own]
+        for place, many in others.items():
+            found = add(found, _scaled(parts[place], -many / total))
+        if apart is not None:
+            # One peer less the mean of its class moves by 1 − 1/n here, and by −1/n at each of the others.
+            n = self.modes.members[self.own]
+            found = add(found, _scaled(apart, (1 - 1 / n) * (1 + 1 / total)))
+        return found
+
+
+def _copy(group: PeerGroup) -> tuple[str, int] | None:
+    """Return what a peer tells others the position of, and which state that is; None if nothing."""
+    kind = group.jacobians.kind
+    for send, sending in zip(group.site.sends, kind.sends, strict=True):
+        for row, unit in zip(send.x, sending.units, strict=True):
+            places = np.flatnonzero(row)
+            if unit == "m" and len(places) == 1 and row[places[0]] == 1:
+                place = int(places[0])
+                return kind.states[place].name.rpartition(".")[0], place
+    return None
+
+
+def _scaled(one: Carried, share: float) -> Carried:
+    return one[0] * share, one[1] * abs(share) + 2 * UNIT * np.abs(one[0] * share)

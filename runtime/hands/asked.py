@@ -1,0 +1,159 @@
+"""What is asked of a scene's hands: a device by its name, and frequencies.
+
+Takes: a `CompiledSystem`, texts.
+Gives: `Port`, `find_port`, `next_peer`; `read_frequencies`, `check_frequencies`, `ticks_in`.
+Guarantees: nothing is folded: a frequency beyond half the fastest clock is refused.
+Does not: ask whether the part named is a device.
+"""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.frozen import dataclass
+from apc.frame.parameters import resolve
+from apc.option_value import option_value
+
+Floats = NDArray[np.float64]
+
+# The highest frequency in Hz, where none is named: hands feel more, and do less.
+HIGHEST = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """A device: its peer, counted from 0 over all groups, and the part, "" for the only one there is."""
+
+    peer: int
+    part: str
+
+
+_PORT = re.compile(r"(?:(?P<group>[^.\[\]]+)\[(?P<number>[0-9]{1,9})\])?\.?(?P<part>.*)\Z")
+
+
+def find_port(system: CompiledSystem, text: str, option: str) -> Port:
+    """Return the device that a name such as `left[1].device` means.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    text, option
+        The name, and where it was given.
+
+    Raises
+    ------
+    ApcError
+        E936 no such peer or part.
+    """
+    counts = [group.count for group in system.groups]
+    starts = np.cumsum([0, *counts]).tolist()
+    names = [group.name for group in system.groups]
+    matched = _PORT.match(text)
+    assert matched is not None
+    group, number, own = matched["group"], matched["number"], matched["part"]
+    if group is None:
+        first, _, rest = own.partition(".")
+        if first in names:
+            group, number, own = first, "1", rest
+    parts = sorted({name.name.rpartition(".")[0] for kind in system.kinds for name in kind.states})
+    named = own if own in parts else "device" if "device" in parts else next(iter(parts), "device")
+    example = f'{option} "{names[0]}[1].{named}"'
+    if group is not None and group not in names:
+        what = f"{option}: no group of peers is called {group[:40]}"
+        hint = nearest(group, names)
+        hint = f'{option} "{hint}[{number}].{named}"' if hint else example
+        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint))
+    place = 0 if group is None else names.index(group)
+    peer = int(number or 1)
+    if not 1 <= peer <= counts[place]:
+        example = f'{option} "{names[place]}[{counts[place]}].{named}"'
+        what = f"{option}: {names[place]} has {counts[place]:,} peers, counted from 1; there is no {peer}"
+        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=example))
+    if own and own not in parts:
+        what = f"{option}: nothing that moves is called {own[:40]}"
+        hint = f'{option} "{names[place]}[{peer}].{nearest(own, parts) or named}"'
+        raise ApcError(Mistake("E936", Place(system.origin.topology), what, hint=hint))
+    return Port(starts[place] + peer - 1, own)
+
+
+def read_frequencies(
+    system: CompiledSystem, listed: str | None, low: str, high: str | None, points: int
+) -> Floats:
+    """Return the frequencies that options name, in Hz: those listed, or points between two at equal ratios.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    listed
+        Frequencies with units and commas between, or None.
+    low, high, points
+        From where to where, `HIGHEST` or half the fastest clock if not given, and how many.
+
+    Raises
+    ------
+    ApcError
+        E935 none above 0, or the lowest above the highest; those of `option_value`.
+    """
+    if listed is not None:
+        texts = [one.strip() for one in listed.split(",") if one.strip()]
+        values = [float(option_value("--frequencies", one, what="frequency", unit="Hz")) for one in texts]
+        return np.array(values)
+    first = float(option_value("--from", low, what="frequency", unit="Hz"))
+    last = min(HIGHEST, _fastest(system) / 2)
+    if high is not None:
+        last = float(option_value("--to", high, what="frequency", unit="Hz"))
+    if not 0 < first < last:
+        what = f"from {first:.6g} Hz to {last:.6g} Hz there is nothing above 0 Hz"
+        hint = '--from "0.1 Hz" --to "60 Hz"'
+        if first > 0 and high is None:
+            what = f"{first:.6g} Hz is not below {last:.6g} Hz, where it ends without --to"
+            hint = f'--from "{first:.6g} Hz" --to "{_fastest(system) / 2:.6g} Hz"'
+        raise ApcError(Mistake("E935", Place("--from"), what, hint=hint))
+    return np.geomspace(first, last, points)
+
+
+def _fastest(system: CompiledSystem) -> float:
+    """Return the rate of the fastest clock in Hz."""
+    return float(1 / _fastest_clock(system)[0])
+
+
+def _fastest_clock(system: CompiledSystem) -> tuple[Fraction, Fraction]:
+    """Return the period and phase of the fastest clock that anything uses, in seconds."""
+    timings = resolve(system).timings
+    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
+    clock = min((one for one in system.clocks if one.name in used), key=lambda one: timings[one.period])
+    return timings[clock.period], timings[clock.phase]
+
+
+def next_peer(system: CompiledSystem, port: Port) -> int:
+    """Return the peer after one, itself if it is alone."""
+    return (port.peer + 1) % sum(group.count for group in system.groups)
+
+
+def check_frequencies(system: CompiledSystem, found: Floats) -> None:
+    """Refuse frequencies that no response is told of: ApcError E935."""
+    most = _fastest(system) / 2
+    place = Place(system.origin.topology)
+    hint = f"{most:.6g} Hz at most"
+    if not found.size or not np.isfinite(found).all() or found.min() <= 0:
+        got = "none" if not found.size else f"{found.min():.6g} Hz"
+        raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, '--from "0.1 Hz"'))
+    if found.max() > most:
+        what = f"{found.max():.6g} Hz is beyond half the fastest clock: samples take it for a slower one"
+        raise ApcError(Mistake("E935", place, what, hint=hint))
+
+
+def ticks_in(system: CompiledSystem, frame: float) -> list[Fraction] | None:
+    """Return when in a frame the fastest clock ticks, None where a frame does not begin with a tick."""
+    period, phase = _fastest_clock(system)
+    if phase % period:
+        return None
+    return [number * period for number in range(round(frame / float(period)))]
