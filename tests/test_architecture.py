@@ -59,7 +59,7 @@ HOUSE = (
         "apc.eigen",
         """
         graph_modes peer_group listening peers closing graph_loops modes
-        rigid dissipation pseudospectrum relative eigenpairs dominant enclosure balls winding bordered
+        eigenpairs dominant rigid dissipation pseudospectrum relative enclosure balls winding bordered
         roots certify ratios spectrum
         """,
     ),
