@@ -1,7 +1,8 @@
 """Tables of named columns as files, written as their rows come: CSV or Parquet, by the suffix.
 
 Takes: columns, and rows block by block.
-Gives: `Column`, `Row`, `Writer` and `WRITERS` of the formats; `check_table_path`, `write_table`, `keep_room`.
+Gives: `Column`, `Row`, `Writer` and `WRITERS` of the formats; `check_table_path`, `write_table`, `blocks_of`,
+`keep_room`.
 Guarantees: a block is in the file whole or not at all; before a block is written, room is kept on the disk
 for it and for the file's end, so that on a full disk the blocks before it can still be finished. The same
 rows give the same bytes; numbers keep every digit; an empty cell is empty, never NaN; at most a block of rows
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target, write_file
@@ -82,7 +84,7 @@ class Writer(ABC):
         self._kept = 0
 
     def rows(self, cells: Sequence[Any]) -> None:
-        """Write some rows, given as columns: arrays, or sequences of cells."""
+        """Write some rows, given as columns: arrays, their NaN empty cells, or sequences of cells."""
         count = len(cells[0])
         self.write(cells, count)
         self.whole_rows += count
@@ -138,7 +140,7 @@ class Csv(Writer):
 
     def write(self, cells: Sequence[Any], count: int) -> None:
         """Keep room for so many rows, then write them."""
-        columns = [one.tolist() if isinstance(one, np.ndarray) else one for one in cells]
+        columns = [_listed(one) if isinstance(one, np.ndarray) else one for one in cells]
         text = _lines(zip(*columns, strict=True))
         self.keep(self.whole + len(text))
         self.file.seek(self.whole)
@@ -150,6 +152,16 @@ class Csv(Writer):
         """Close the file."""
         self.file.seek(self.whole)
         self.cut()
+
+
+def _listed(numbers: NDArray[Any]) -> list[Cell]:
+    """Return an array as cells, NaN as an empty one."""
+    cells = numbers
+    if numbers.dtype.kind == "f" and np.isnan(numbers).any():
+        cells = numbers.astype(object)
+        cells[np.isnan(numbers)] = None
+    found: list[Cell] = cells.tolist()
+    return found
 
 
 def _lines(rows: Iterable[Sequence[Cell]]) -> bytes:
@@ -180,7 +192,8 @@ class Parquet(Writer):
         if not self.written:
             raise OSError(0, "half a row group can't be written on")
         types = [one.type for one in self.schema]
-        arrays = [self.arrow.array(one, type=kind) for one, kind in zip(cells, types, strict=True)]
+        pairs = zip(cells, types, strict=True)
+        arrays = [self.arrow.array(one, type=kind, from_pandas=True) for one, kind in pairs]  # NaN is empty
         block = SWOLLEN * sum(max(8 * count, one.nbytes) for one in arrays) + HEADERS * len(arrays)
         self.keep(self.file.tell() + block + self.end + self.note)
         self.written = False
@@ -224,7 +237,9 @@ def check_table_path(path: Path, option: str) -> None:
     check_target(path)
 
 
-def write_table(path: Path, columns: Sequence[Column], rows: Iterable[Row], about: Mapping[str, Any]) -> None:
+def write_table(
+    path: Path, columns: Sequence[Column], blocks: Iterable[Sequence[Any]], about: Mapping[str, Any]
+) -> None:
     """Write a table.
 
     Parameters
@@ -233,8 +248,8 @@ def write_table(path: Path, columns: Sequence[Column], rows: Iterable[Row], abou
         The file; its suffix says the format, see `check_suffix`.
     columns
         What its columns are.
-    rows
-        The rows, read once; each as long as the columns. None is an empty cell.
+    blocks
+        Some rows at a time, read once, as columns: see `Writer.rows`, `blocks_of`.
     about
         What made the table; kept in a Parquet file, left out of a CSV file, which stays plain.
 
@@ -249,8 +264,8 @@ def write_table(path: Path, columns: Sequence[Column], rows: Iterable[Row], abou
     def write(temporary: Path) -> None:
         writer = WRITERS[suffix](temporary, columns, (METADATA, made))
         try:
-            for block in _blocks(rows):
-                writer.rows(list(zip(*block, strict=True)))
+            for block in blocks:
+                writer.rows(block)
             writer.finish()
         finally:
             writer.close()
@@ -258,7 +273,8 @@ def write_table(path: Path, columns: Sequence[Column], rows: Iterable[Row], abou
     write_file(path, write)
 
 
-def _blocks(rows: Iterable[Row]) -> Iterator[list[Row]]:
+def blocks_of(rows: Iterable[Row]) -> Iterator[list[tuple[Cell, ...]]]:
+    """Yield rows as blocks of columns."""
     every = iter(rows)
     while block := list(islice(every, BLOCK)):
-        yield block
+        yield list(zip(*block, strict=True))

@@ -62,7 +62,7 @@ HOUSE = (
         "apc.eigen",
         """
         graph_modes peer_group listening peers closing graph_loops modes
-        rigid dissipation pseudospectrum dominant relative eigenpairs enclosure balls winding bordered
+        eigenpairs dominant rigid dissipation pseudospectrum relative enclosure balls winding bordered
         roots certify ratios spectrum
         """,
     ),

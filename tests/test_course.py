@@ -119,8 +119,8 @@ def test_a_change_of_sign_is_half_a_turn_whatever_the_zeros_sign() -> None:
 
 
 def test_a_course_over_the_whole_range_of_floats_still_has_its_angle() -> None:
-    """A quarter turn a point for six points, from 1e-250 to 1e250 and back: one and a half turns."""
-    sizes = np.array([1e-250, 1e250, 1e-250, 1e250, 1e-250, 1e250, 1e-250])
+    """A quarter turn a point for six points, from 1e-250 to 1e250: one and a half turns."""
+    sizes = np.array([1e-250, 1e-200, 1e-100, 1.0, 1e100, 1e200, 1e250])
     course = sizes * np.exp(0.5j * np.pi * np.arange(7))
     assert turned_along(course[:, None])[0] == pytest.approx(3 * np.pi)
 
@@ -128,3 +128,11 @@ def test_a_course_over_the_whole_range_of_floats_still_has_its_angle() -> None:
 def test_a_course_that_starts_or_passes_at_zero_keeps_its_direction() -> None:
     course = np.array([0, 1, 1j, 0, -1, 0], np.complex128)
     assert turned_along(course[:, None])[0] == pytest.approx(np.pi)
+
+
+def test_what_rounding_leaves_of_a_course_does_not_turn_it() -> None:
+    """As where a light mass comes to rest between two events, and is pushed the same way again."""
+    course = np.array([-0.5, -2e-7, -4e-14, 3e-17, -1e-17, 3e-17, -0.6, -0.7])
+    assert turned_along(course[:, None])[0] == 0
+    swings = np.exp(-0.5 * np.arange(40)) * np.cos(np.arange(40) * np.pi)
+    assert turned_along(swings[:, None])[0] == pytest.approx(39 * np.pi)

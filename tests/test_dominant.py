@@ -110,6 +110,18 @@ def test_a_matrix_as_far_from_the_rest_as_its_error_allows_is_within_the_bound()
         assert 0.5 * found.error[0] < off <= found.error[0]
 
 
+def test_many_that_are_nearly_as_large_are_told_apart() -> None:
+    """What a high power of the matrix still holds several of: LAPACK gives the largest of them."""
+    random = np.random.default_rng(8)
+    for values in ([0.9, 0.89995 * np.exp(1j), 0.2], [0.97 + 0.1j, -0.9751, 0.975, 0.3], [1.2, -1.1999, 0.1]):
+        matrix = with_spectrum(random, values, 0.1)[None]
+        found = find(matrix, 1e-14 * np.abs(matrix))
+        largest = true_values(matrix[0])[0]
+        sign = 1 if float(largest.imag.mid()) >= 0 else -1
+        value = complex(largest).conjugate() if sign < 0 else complex(largest)
+        assert abs(value - found.value[0]) <= found.error[0] < 1e-11
+
+
 def test_two_that_are_as_large_and_one_that_is_double_are_left_open() -> None:
     random = np.random.default_rng(5)
     for values in ([0.9, -0.9, 0.1], [0.8, 0.8, 0.3], [0.9, 0.9 * np.exp(1j), 0.2]):

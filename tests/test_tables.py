@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.tables import BLOCK, Column, Csv, Writer, check_table_path, keep_room, write_table
+from apc.tables import BLOCK, Column, Csv, Writer, blocks_of, check_table_path, keep_room, write_table
 from tests.topologies import told
 
 COLUMNS = (Column("x", "m"), Column("verdict", kind="text"), Column("modes", kind="count"))
@@ -21,7 +21,7 @@ ROWS = ((0.1 + 0.2, "stable, or so", 1), (5e-324, 'say "no"', None), (None, None
 
 def test_csv_keeps_every_digit_and_leaves_empty_cells_empty(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
-    write_table(path, COLUMNS, ROWS, {})
+    write_table(path, COLUMNS, blocks_of(ROWS), {})
     with path.open(encoding="utf-8", newline="") as file:
         head, *rows = csv.reader(file)
     assert head == ["x [m]", "verdict", "modes"]
@@ -33,11 +33,22 @@ def test_csv_keeps_every_digit_and_leaves_empty_cells_empty(tmp_path: Path) -> N
 def test_parquet_keeps_types_and_what_made_it(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     path = tmp_path / "t.parquet"
-    write_table(path, COLUMNS, ROWS, {"model": "abc"})
+    write_table(path, COLUMNS, blocks_of(ROWS), {"model": "abc"})
     table = parquet.read_table(path)
     assert [tuple(row.values()) for row in table.to_pylist()] == list(ROWS)
     assert [str(kind) for kind in table.schema.types] == ["double", "string", "int64"]
     assert json.loads(table.schema.metadata[b"apc"]) == {"model": "abc"}
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_columns_as_arrays_are_the_same_file_as_their_cells(tmp_path: Path, suffix: str) -> None:
+    pytest.importorskip("pyarrow")
+    numbers = np.array([math.nan if row[0] is None else row[0] for row in ROWS])
+    texts, counts = (np.array([row[place] for row in ROWS], dtype=object) for place in (1, 2))
+    paths = [tmp_path / f"{i}.{suffix}" for i in range(2)]
+    write_table(paths[0], COLUMNS, blocks_of(ROWS), {})
+    write_table(paths[1], COLUMNS, [[numbers, texts, counts]], {})
+    assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
@@ -46,7 +57,7 @@ def test_the_same_rows_give_the_same_bytes_over_many_blocks(tmp_path: Path, suff
     rows = [(math.sqrt(i), "word", i) for i in range(BLOCK + 10)]
     paths = [tmp_path / f"{i}.{suffix}" for i in range(2)]
     for path in paths:
-        write_table(path, COLUMNS, iter(rows), {"a": 1})
+        write_table(path, COLUMNS, blocks_of(rows), {"a": 1})
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
@@ -71,7 +82,7 @@ def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_unwritable_folder_is_told_and_nothing_is_left(tmp_path: Path) -> None:
     path = tmp_path / "not-there" / "t.csv"
-    (message,) = told(write_table, path, COLUMNS, ROWS, {})
+    (message,) = told(write_table, path, COLUMNS, blocks_of(ROWS), {})
     assert message == f"{path}: E601 can't be written: No such file or directory."
 
 
@@ -119,7 +130,7 @@ def test_the_room_kept_holds_texts_as_well(
 
     monkeypatch.setattr(Writer, "cut", cut)
     rows = [(float(i), f'{i} is stable, "so" to say: ρ < 1' * 9, None if i % 3 else i) for i in range(5000)]
-    write_table(tmp_path / f"t{suffix}", COLUMNS, rows, {"model": "a" * 10_000})
+    write_table(tmp_path / f"t{suffix}", COLUMNS, blocks_of(rows), {"model": "a" * 10_000})
     [(written, kept)] = rooms
     assert written <= kept
 

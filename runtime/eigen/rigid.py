@@ -1,7 +1,7 @@
 """The motions that nothing holds back, found in exact arithmetic.
 
 Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
-Gives: `RigidModes`, `find_rigid_modes`; `Standing`, `what_stands`; `stays_rigid`.
+Gives: `RigidModes`, `find_rigid_modes`, `rigid_modes_here`; `Standing`, `what_stands`; `stays_rigid`.
 Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
 a stiffness of exactly zero frees what it held.
 Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Coupling, Loop
+from apc.eigen.dominant import misses_one
 from apc.eigen.graph_modes import QUICK_PRIME
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.frame.schedule import Act, Propagate, Send, Tick, Value
@@ -94,6 +95,17 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
         ),
         exact=tuple(tuple(vector) for vector in (*vectors, *pairs)),
     )
+
+
+def rigid_modes_here(system: ClosedSystem) -> RigidModes:
+    """Return the rigid modes of a system whose matrix is that of its sites' numbers, without drifts.
+
+    Where the matrix tells that 1 is none of its eigenvalues there are none, and none are looked for.
+    """
+    if misses_one(system.matrix[None], system.error[None])[0]:
+        nothing = np.zeros((len(system.names), 0))
+        return RigidModes(nothing, nothing, (), ())
+    return find_rigid_modes(system, with_drifts=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ from apc.eigen.eigenpairs import Eigenpairs
 from apc.eigen.enclosure import SMALL, WIDE, components, discs, enclose_eigenvalues
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, independent_places, relative_bounded, relative_coordinates
-from apc.eigen.rigid import RigidModes, find_rigid_modes
+from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
 from apc.frame.course import turns
 from apc.frame.schedule import Propagate
 
@@ -109,7 +109,7 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
     A drift leaves a second eigenvalue 1 behind when only the rigid direction is removed. So when every error
     disc keeps clear of 1 there is none, and the exact search for one is spared.
     """
-    solved = [_solve(system, find_rigid_modes(system, with_drifts=False)) for system in systems]
+    solved = [_solve(system, rigid_modes_here(system)) for system in systems]
     lowest = max((one.low for one in solved), default=0.0)
     notes: list[str] = []
     for place, system in enumerate(systems):

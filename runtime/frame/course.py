@@ -47,6 +47,10 @@ SAME = 1e-9
 # not the eigenvalue's, as where a vector of a nearly vanishing one is mostly rounding, by any amount.
 OFF = 0.3
 
+# A course this much smaller than it was is rounding of what it was: its sign means nothing. What shrinks as
+# much in a whole frame is no mode any more (`spectrum.DEADBEAT`).
+FADED = 1e-14
+
 # Angles up to here are half a turn the other way, which rounding or the sign of a zero made of a change
 # of sign.
 HALF_TURN_BACK = -np.pi * (1 - 2.0**-40)
@@ -284,8 +288,8 @@ def turned_along(course: Floats | Complexes) -> tuple[Floats, Floats]:
     0 has no angle.
     """
     size = np.abs(course)
-    moving = size > 0
-    # Where a course is exactly 0 it has the direction it came from, or leaves by.
+    moving = size > FADED * np.maximum.accumulate(size, axis=0)
+    # Where a course is 0, to rounding, it has the direction it came from, or leaves by.
     place = np.maximum.accumulate(np.where(moving, np.arange(len(course))[:, None], -1), axis=0)
     place = np.where(place < 0, np.argmax(moving, axis=0), place)
     columns = np.arange(course.shape[1])

@@ -9,18 +9,24 @@ Does not: decide when anything happens (see `scheduling`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import field
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.parameters import exact_numbers
 from apc.frame.site import LinearSite, assemble, cut, matrices_of, with_own_parts
 from apc.frame.start import Listening, start_arguments
+
+# Exact sites that are kept.
+KEPT = 64
 
 
 def linearize(
@@ -59,17 +65,36 @@ def linearize_exact(
     """
     assert listening is not None or not site.edges, "who is heard decides what an edge function does"
     assert site.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
-    _finite_slopes(site, parameters, listening)
-    arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
-    exact = site_of_entries(site, evaluate_exact(site.function, arguments)[0], 0)
     if listening is None:
-        return exact
+        return _exact_alone(_Asked(id(site), parameters.tobytes(), site))
+    exact = _exact(site, parameters, listening)
     rest = iter(listening.own)
     own = [
         [None if (part := next(rest)) is None else np.array(part, dtype=object) for _ in partition.receives]
         for partition in site.kind.clocks
     ]
     return with_own_parts(exact, own, np.add, np.multiply.outer)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What the matrices of a site follow from: `site`, which `known` is the identity of, and its numbers."""
+
+    known: int
+    numbers: bytes
+    site: SiteJacobians = field(compare=False)
+
+
+@lru_cache(maxsize=KEPT)
+def _exact_alone(of: _Asked) -> LinearSite:
+    """Return the exact matrices of a site for its parameters: an analysis and what follows it ask again."""
+    return _exact(of.site, np.frombuffer(of.numbers), None)
+
+
+def _exact(site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None) -> LinearSite:
+    _finite_slopes(site, parameters, listening)
+    arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
+    return site_of_entries(site, evaluate_exact(site.function, arguments)[0], 0)
 
 
 def _finite_slopes(

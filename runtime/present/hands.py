@@ -20,7 +20,7 @@ from apc.optional import need
 from apc.present.forms import document, json_text, note
 from apc.present.pictures import FORMATS, write_figure
 from apc.suffixes import check_suffix
-from apc.tables import SUFFIXES, Column, Row, check_table_path, write_table
+from apc.tables import SUFFIXES, Column, Row, blocks_of, check_table_path, write_table
 
 if TYPE_CHECKING:
     from apc.hands.feel import Extremes, Feel
@@ -282,7 +282,7 @@ def write_feel(path: Path, found: Feel, *, nyquist: bool = False) -> None:
         write_figure(feel_picture(found, "nyquist" if nyquist else "bode"), path)
     elif suffix in SUFFIXES:
         made = {"apc": program_version(), "at": found.at, "left_out": list(found.left_out)}
-        write_table(path, _columns(), _rows(found), made)
+        write_table(path, _columns(), blocks_of(_rows(found)), made)
     else:
         write_text(path, json_text(found.to_dict()))
 

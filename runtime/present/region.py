@@ -27,7 +27,7 @@ from apc.present.forms import MEANT, document, json_text, note
 from apc.present.pictures import FORMATS, write_figure
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
 from apc.suffixes import check_suffix
-from apc.tables import SUFFIXES, Column, Row, check_table_path, write_table
+from apc.tables import SUFFIXES, Column, Row, blocks_of, check_table_path, write_table
 
 if TYPE_CHECKING:
     import pandas
@@ -207,7 +207,7 @@ def write_panels(path: Path, found: Panels) -> None:
             "left_out": {one.topology: list(one.left_out) for panel in found.panels for one in panel.regions},
             "origin": _origins(found),
         }
-        write_table(path, _columns(first), rows, made)
+        write_table(path, _columns(first), blocks_of(rows), made)
     else:
         write_text(path, json_text(found.to_dict()))
 

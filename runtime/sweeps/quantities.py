@@ -122,7 +122,10 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
 
 
 def _finite(numbers: NDArray[np.float64]) -> list[float | None]:
-    return [finite(number) for number in numbers.tolist()]
+    cells = numbers.astype(object)
+    cells[~np.isfinite(numbers)] = None
+    found: list[float | None] = cells.tolist()
+    return found
 
 
 def _growth(system: CompiledSystem, argument: str) -> Quantity:

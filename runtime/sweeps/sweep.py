@@ -10,7 +10,7 @@ Does not: start processes itself (see `processes`, `cluster`), or print.
 from __future__ import annotations
 
 import hashlib
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -34,7 +34,7 @@ from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
 from apc.sweeps.quantities import BEGINNINGS, VERDICT, by_criterion, find_quantity
 from apc.sweeps.store import Parts, open_parts, remove_parts
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
-from apc.tables import Cell, Column, Row, check_table_path, write_table
+from apc.tables import BLOCK, Cell, Column, Row, check_table_path, write_table
 from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 
 if TYPE_CHECKING:
@@ -179,11 +179,11 @@ def sweep(
         columns: tuple[NDArray[Any], ...] = tuple(
             np.empty(grid.points, dtype=np.float64 if kind == "number" else object) for kind in kinds
         )
-        rows = _collected(work, kept, kinds, columns)
-        if out is None:
-            deque(rows, maxlen=0)
-        else:
-            write_table(out, listed, rows, made_of)
+        _collect(work, kept, kinds, columns)
+        if out is not None:
+            starts = range(0, grid.points, BLOCK)
+            blocks = ([column[at : at + BLOCK] for column in columns] for at in starts)
+            write_table(out, listed, blocks, made_of)
             if isinstance(kept, Parts):
                 remove_parts(out)
     headings = tuple(one.heading for one in listed)
@@ -317,10 +317,8 @@ def _other_versions(computed: Computed, cluster: str | None) -> Mistake:
     return Mistake("E888", Place(cluster or "sweep"), what)
 
 
-def _collected(
-    work: Work, kept: _Kept, kinds: Sequence[str], columns: Sequence[NDArray[Any]]
-) -> Iterator[Row]:
-    """Yield every row, the values of the axes, then the results; keep them in columns, too."""
+def _collect(work: Work, kept: _Kept, kinds: Sequence[str], columns: Sequence[NDArray[Any]]) -> None:
+    """Fill in the columns: the values of the axes, then the results."""
     values = [np.array([float(value) for value in axis.values]) for axis in work.grid.axes]
     words: dict[Cell, Cell] = {}  # a verdict that stands in a million rows is held once
     for number in range(work.parts):
@@ -328,11 +326,10 @@ def _collected(
         assert computed is not None, f"part {number} was written and is gone"
         points = work.points_of(number)
         places = work.grid.places(points)
-        listed: list[Sequence[Cell]] = [own[places[:, axis]].tolist() for axis, own in enumerate(values)]
+        listed: list[Any] = [own[places[:, axis]] for axis, own in enumerate(values)]
         listed += list(zip(*computed, strict=True))
         for column, cells, kind in zip(columns, listed, kinds, strict=True):
             if kind == "number":  # None is NaN
                 column[points.start : points.stop] = np.array(cells, dtype=np.float64)
             else:
                 column[points.start : points.stop] = [words.setdefault(cell, cell) for cell in cells]
-        yield from zip(*listed, strict=True)

@@ -17,7 +17,7 @@ from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import eigenpairs
 from apc.eigen.relative import relative, relative_coordinates
-from apc.eigen.rigid import RigidModes, find_rigid_modes
+from apc.eigen.rigid import RigidModes, rigid_modes_here
 from apc.eigen.spectrum import angles_in_frame, whole_vectors
 
 # An eigenvalue of 1 leaves open how far the peers stand aside together; next to the boundary, where it is
@@ -44,7 +44,7 @@ class Marginal:
 
 def with_rigid(systems: Iterable[ClosedSystem]) -> Iterator[tuple[ClosedSystem, RigidModes]]:
     """Yield each closed system with its rigid motions, drifts left where they are."""
-    return ((one, find_rigid_modes(one, with_drifts=False)) for one in systems)
+    return ((one, rigid_modes_here(one)) for one in systems)
 
 
 def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenvalue: complex) -> Marginal:

@@ -22,7 +22,7 @@ from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative, relative_coordinates, relative_places
-from apc.eigen.rigid import RigidModes, find_rigid_modes
+from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
 from apc.frame.lift import FrameMap
 
 Floats = NDArray[np.float64]
@@ -59,7 +59,7 @@ def site_key(group: PeerGroup) -> tuple[int, int]:
 def wire(system: ClosedSystem) -> Wiring:
     """Take down who hears whom in a closed system, and its rigid motions."""
     feedback = tuple(feedback_of(system, system.layout))
-    rigid = find_rigid_modes(system, with_drifts=False)
+    rigid = rigid_modes_here(system)
     wiring = _without(system, feedback, rigid)
     if rigid.names:
         values = np.linalg.eigvals(reduced(wiring, system.matrix[None], 1)[0])

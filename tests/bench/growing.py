@@ -1,7 +1,7 @@
 # ruff: noqa: E501 -- scenes are written by long lines
 """Scenes that grow: more peers, different peers, kinds, equations, masses in a row.
 
-Takes: how many, and a folder for what stands beside a scene. Gives: `flat`, `table`, `kinds`, `equations`, `row`.
+Takes: how many, and a folder for what stands beside a scene. Gives: `plain`, `lossy`, `flat`, `table`, `kinds`, `equations`, `row`.
 Does not: load anything large, so that what measures whole processes can use it.
 """
 
@@ -16,6 +16,16 @@ AVERAGE = (SCENES / "three-users-average.yaml").read_text(encoding="utf-8")
 def flat(peers: int, folder: Path) -> str:
     """Return a scene of equal peers."""
     return _replaced(("count: 3", f"count: {peers}"))
+
+
+def plain(number: int, folder: Path) -> str:
+    """Return the paper's scene: what grows is told to the command."""
+    return AVERAGE
+
+
+def lossy(number: int, folder: Path) -> str:
+    """Return the same scene with a tenth of all packets lost."""
+    return _replaced(("lan: {clock: network, delay: 8 ms", "lan: {clock: network, delay: 8 ms, loss: 10 %"))
 
 
 def table(peers: int, folder: Path) -> str:

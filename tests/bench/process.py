@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from apc.benchmark.timing import spread_of, waited
-from tests.bench.growing import SCENES, equations, kinds, row
+from tests.bench.growing import SCENES, equations, flat, kinds, lossy, plain, row, table
 from tests.bench.judge import Judge, parser_of
 
 RUNS = 7
@@ -41,16 +41,49 @@ GROWTH: tuple[tuple[str, Callable[[int, Path], str], tuple[int, ...], tuple[floa
     ("masses in a row", row, (4, 12, 40, 120, 400), (2.0, 3.0)),
     ("kinds", kinds, (1, 2, 4, 8, 16, 32), (0.1, 0.1)),
 )
+# What one command is asked for more of: how many, the scene of so many, and the command's words.
+Scene, Words = Callable[[int, Path], str], Callable[[int], tuple[str, ...]]
+AMOUNTS: tuple[tuple[str, tuple[int, ...], Scene, Words], ...] = (
+    ("equal peers", (30, 300, 3000, 30_000), flat, lambda number: ("analyze", "scene.apc")),
+    ("different peers", (100, 1000, 10_000, 100_000), table, lambda number: ("analyze", "scene.apc")),
+    (
+        "frames of delay",
+        (1, 3, 10, 30, 100, 300),
+        plain,
+        lambda number: (
+            *("critical", "coordination.stiffness", "scene.apc"),
+            *("--set", f"lan.delay={8 * number} ms"),
+        ),
+    ),
+    (
+        "points",
+        (1000, 10_000, 100_000),
+        plain,
+        lambda number: (
+            *("sweep", "scene.apc", "--jobs", "1", "--out", "points.parquet"),
+            *("--over", "contact.stiffness=10 N/m:3000 N/m:100"),
+            *("--over", f"coordination.stiffness=10 N/m:3000 N/m:{number // 100}"),
+        ),
+    ),
+    (
+        "runs",
+        (10, 100, 1000),
+        lossy,
+        lambda number: ("simulate", "scene.apc", "--duration", "1 s", "--runs", f"{number}"),
+    ),
+)
 MOST_PACKAGES = 8  # listed
 LINE = re.compile(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)")
 
 
-def once(words: tuple[str, ...], folder: Path) -> tuple[float, float, int]:
-    """Return the seconds, those of a processor, and the most bytes of one process."""
+def once(words: tuple[str, ...], folder: Path, where: Path | None = None) -> tuple[float, float, int]:
+    """Return the seconds, those of a processor, and the most bytes of one process, run in `where`."""
     command = [sys.executable, *words]
 
     def run() -> tuple[int, resource.struct_rusage]:
-        process = subprocess.Popen(command, cwd=folder, env=_environment(folder), stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            command, cwd=where or folder, env=_environment(folder), stdout=subprocess.DEVNULL
+        )
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         return process.returncode, used
@@ -112,11 +145,37 @@ def print_growth(
             + f" {radius}"
         )
     for place, (command, target) in enumerate(zip(("compile", "analyze"), targets, strict=True)):
-        first, *_, before, last = (one[place] for one in rows)
-        grown = math.log(numbers[-1] / numbers[-2])
-        exponent = math.log(max(last - first, 0.01) / max(before - first, 0.01)) / grown
-        judged = judge.in_time(f"{command}, {title}", last - first, target)
+        times = [one[place] for one in rows]
+        judged = judge.in_time(f"{command}, {title}", times[-1] - times[0], target)
+        exponent = exponent_of(numbers, times)
         print(f"{command}: exponent {exponent:.1f}; target {target:g} s beyond the first {judged}")
+
+
+def exponent_of(numbers: Sequence[int], times: Sequence[float]) -> float:
+    """Return the exponent of the time beyond the first, over the last step."""
+    first, *_, before, last = times
+    return math.log(max(last - first, 0.01) / max(before - first, 0.01)) / math.log(numbers[-1] / numbers[-2])
+
+
+def print_amounts(
+    title: str,
+    numbers: Sequence[int],
+    write: Scene,
+    words: Words,
+    folder: Path,
+) -> None:
+    """Measure a command that is asked for more and more of something, and print the exponent."""
+    print(f"\n{title:>16}  {words(numbers[0])[0]:>17}")
+    times = []
+    for number in numbers:
+        scene = folder / title.replace(" ", "-") / str(number)
+        scene.mkdir(parents=True)
+        (scene / "scene.yaml").write_text(write(number, scene), encoding="utf-8")
+        once(("-m", "apc", "compile", "scene.yaml"), folder, scene)
+        _, seconds, size = once(("-m", "apc", *words(number)), folder, scene)
+        times.append(seconds)
+        print(f"{number:>16}  {seconds:6.2f} s {size / 2**20:4.0f} MiB")
+    print(f"exponent {exponent_of(numbers, times):.1f}")
 
 
 def main() -> None:
@@ -150,6 +209,8 @@ def main() -> None:
         for title, write, numbers, targets in GROWTH:
             some = numbers[:-1] if given.quick else numbers
             print_growth(title, write, some, targets, judge, folder)
+        for title, numbers, write, command in AMOUNTS:
+            print_amounts(title, numbers[:-1] if given.quick else numbers, write, command, folder)
     judge.end()
 
 
