@@ -115,7 +115,7 @@ def test_energies_played_in_time_say_the_same(apart: bool) -> None:
     system = compiled(users(3, 500))
     loop = port_loops(system, prepare(system), option="")[apart]
     assert not isinstance(loop, str)
-    a, b, c, d, weight = map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight))
+    a, b, c, d, weight = map(value_of, (loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d, loop.maps.weight))
     least, angle = least_real(a, b, c, d, weight)
     given = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
     moved = np.linalg.eigh((given + given.conj().T) / 2 + weight)[1][:, 0] * np.sqrt(loop.seconds)
