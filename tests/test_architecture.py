@@ -88,7 +88,7 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch slopes crossings plane bracket counting loops evaluator leading many bends marginal
+        wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
         delays lags search mean_square critical margins sensitivity over_network
         """,
     ),
@@ -105,7 +105,8 @@ HOUSE = (
     (
         "apc.regions",
         """
-        passivity overlay eigenpairs surrogate cells curves boundary_points boundary axes strips region panels
+        passivity overlay eigenpairs peaks surrogate cells curves boundary_points boundary axes strips region
+        panels
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),

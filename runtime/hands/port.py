@@ -1,7 +1,7 @@
 """What devices are pushed by, while hands move them as they like: one map a mode.
 
 Takes: a `CompiledSystem`.
-Gives: `PortLoop`, `port_loops`; `reciprocal`.
+Gives: `PortLoop`, `Maps`, `port_loops`; `Opened`, `Openings`, `open_ports`; `Cut`, `port_loop`; `reciprocal`.
 Guarantees: exact for any motion of the hands: where nothing samples a device and no force on it switches,
 only how far it went counts, and the least that its damping takes of that. Matrices carry the radius of their
 rounding.
@@ -158,7 +158,7 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     found = open_ports(system, *lifted_groups(system, prepared=prepared), option=option)
     if isinstance(found, str):
         return found
-    return tuple(_port_loop(found, loop, option=option)[0] for loop in found.loops)
+    return tuple(port_loop(found, loop, option=option)[0] for loop in found.loops)
 
 
 def open_ports(
@@ -411,8 +411,21 @@ class Cut:
         )
 
 
-def _port_loop(found: Openings, loop: Loop, *, option: str) -> tuple[PortLoop, Cut]:
-    """Return the map of a loop whose devices are moved from outside, and where it was cut."""
+def port_loop(found: Openings, loop: Loop, *, option: str) -> tuple[PortLoop, Cut]:
+    """Return the map of a loop whose devices are moved from outside, and where it was cut.
+
+    Parameters
+    ----------
+    found, loop
+        The scene, and one of its loops.
+    option
+        What asked for it.
+
+    Raises
+    ------
+    ApcError
+        E933 too many intervals, or a motion that nothing holds back.
+    """
     opened = found.of(loop)
     sites = [one.touched for one in opened]
     counts = [group.count if found.weighted and len(loop.sites) > 1 else 1 for group in loop.sites]
