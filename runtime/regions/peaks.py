@@ -43,6 +43,9 @@ FARTHEST, POLISHED = 0.3, 2
 # Squares of gains nearer to each other than this turn into each other anyhow.
 TWINS = 1e-13
 
+# A peak this high decides: whether another is higher makes no difference.
+BEYOND = 1.05
+
 # Gains are told up to this: a resonance that doesn't die out has none.
 MOST_GAIN = 1e2
 
@@ -150,21 +153,22 @@ class Peaks:
         """
         loops = self._loops(system, matrix)
         values = np.linalg.eigvals(loops.a)
-        angles = np.sort(np.abs(np.angle(values)), axis=1)[:, :: 2 if values.shape[1] > 1 else 1]
+        slowest = np.take_along_axis(values, np.abs(values).argmax(axis=1)[:, None], axis=1)
         ends = np.tile([0.0, np.pi], (len(matrix), 1))
-        best, where = _top(loops, np.concatenate([ends, angles], axis=1))
-        rest = np.arange(len(matrix))
+        best, where = _top(loops, np.concatenate([ends, np.abs(np.angle(slowest))], axis=1))
+        radius = np.abs(values).max(axis=1, initial=0.0)
+        rest = np.flatnonzero(radius < 1)
         for _ in range(LEVELS):
             at = _on_circle(loops.at(rest), best[rest] * (1 + ABOVE))
             crossed = np.isfinite(at).any(axis=1)
             rest, at = rest[crossed], at[crossed]
-            if not len(rest):
-                break
             height, angle = _top(loops.at(rest), _middles(at))
             higher = height > best[rest] * (1 + ABOVE)
-            rest, height, angle = rest[higher], height[higher], angle[higher]
-            best[rest], where[rest] = height, angle
-        radius = np.abs(values).max(axis=1, initial=0.0)
+            rest = rest[higher]
+            if not len(rest):
+                break
+            best[rest], where[rest] = _polished(loops.at(rest), height[higher], angle[higher])
+            rest = rest[best[rest] < BEYOND]
         return np.where(radius < 1, np.minimum(best, MOST_GAIN), np.maximum(radius, best)), where
 
     def _climbed(
@@ -257,11 +261,15 @@ def _at(loops: _Loops, angle: Floats) -> _Height:
 
 
 def _top(loops: _Loops, angles: Floats) -> tuple[Floats, Floats]:
-    """Return the highest gain (k,) at angles (k, q) and next to that, and where it is."""
+    """Return the highest gain (k,) at angles (k, q), and where it is."""
     gains = loops.gains(angles)
     place = np.argmax(gains, axis=1)
     rows = np.arange(len(angles))
-    best, where = gains[rows, place], angles[rows, place]
+    return gains[rows, place], angles[rows, place]
+
+
+def _polished(loops: _Loops, best: Floats, where: Floats) -> tuple[Floats, Floats]:
+    """Return the gain (k,) at the top of the peak next to an angle each, and where it is."""
     angle = where
     for _ in range(POLISHED):
         angle = _folded(angle + _at(loops, angle).step)

@@ -339,13 +339,13 @@ def _surveyed(
 
 def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
-    if isinstance(source, PortEvaluator):
-        return resolve_family(source, rectangle, source.errors, ports=source.ports)
     if isinstance(source, BatchEvaluator):
         return resolve_family(source, rectangle, partial(matrix_errors, source))
-    if isinstance(source, MeanSquareEvaluator):  # a point takes longer than what a series would save
-        errors = source.errors(rectangle.values(np.array([[0.5, 0.5]])))
-        return DirectFamily(source, rectangle, (1,), tuple(one[0] for one in errors))
+    if isinstance(
+        source, MeanSquareEvaluator | PortEvaluator
+    ):  # a series would take more points than it saves
+        errors = tuple(one[0] for one in source.errors(rectangle.values(np.array([[0.5, 0.5]]))))
+        return DirectFamily(source, rectangle, tuple(len(one) for one in errors), errors)
     if timed:  # each point has a schedule of its own: there are no slopes, and no one size
         return DirectFamily(source, rectangle, (), ())
     return resolve_family(source, rectangle, source.errors)

@@ -14,7 +14,7 @@ loses a digit at most (Trefethen, Approximation Theory and Approximation Practic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,7 @@ from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.names import Range
 from apc.regions.eigenpairs import Family
-from apc.vary.batch import MatrixSource
+from apc.vary.batch import Evaluator, MatrixSource
 
 Floats = NDArray[np.float64]
 
@@ -131,9 +131,7 @@ class ChebyshevFamily:
         return found
 
 
-def resolve_family(
-    evaluator: MatrixSource, rectangle: Rectangle, errors: Errors, *, ports: Sequence[int] | None = None
-) -> Family:
+def resolve_family(evaluator: Evaluator, rectangle: Rectangle, errors: Errors) -> Family:
     """Return the matrices over a rectangle as series where these converge, else as the evaluator has them.
 
     Parameters
@@ -144,8 +142,6 @@ def resolve_family(
         Their ranges.
     errors
         Bounds (k, n, n) on the errors of each system's matrices at values (k, 2), entry by entry.
-    ports
-        How many of the last rows and columns of each have units of their own, as they are no states.
     """
     corners = rectangle.values(np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]]))
     wrong = [one.max(axis=0) for one in errors(corners)]
@@ -155,8 +151,7 @@ def resolve_family(
         if series is None:
             break
         # Other units of the states, which no eigenvalue feels, so that no entry is rounded like a larger.
-        sizes = [np.abs(one).max(axis=0) for one in sampled]
-        scales = [_units(one, own) for one, own in zip(sizes, ports or [0] * len(sizes), strict=True)]
+        scales = [balance(np.abs(one).max(axis=0)) for one in sampled]
         series = [
             one * (scale[None, :] / scale[:, None]).ravel() for one, scale in zip(series, scales, strict=True)
         ]
@@ -185,21 +180,8 @@ def resolve_family(
     return DirectFamily(evaluator, rectangle, tuple(one.shape[1] for one in sampled), tuple(wrong))
 
 
-def _units(size: Floats, ports: int) -> Floats:
-    """Return what to divide rows by (n,) and multiply columns by, 1 for the last ones."""
-    states = len(size) - ports
-    # Rows and columns of ports together are one state more, whose unit stays.
-    whole = np.zeros((states + bool(ports),) * 2)
-    whole[:states, :states] = size[:states, :states]
-    if ports:
-        whole[:states, states] = size[:states, states:].max(axis=1)
-        whole[states, :states] = size[states:, :states].max(axis=0)
-    found = balance(whole)
-    return np.concatenate([found[:states] / found[states:] if ports else found, np.ones(ports)])
-
-
 def _sample(
-    evaluator: MatrixSource, rectangle: Rectangle, counts: tuple[int, int]
+    evaluator: Evaluator, rectangle: Rectangle, counts: tuple[int, int]
 ) -> tuple[tuple[Floats, ...], list[Floats] | None]:
     """Return each system's matrices (k, n, n) at Chebyshev points, and their coefficients (n_x, n_y, n²).
 

@@ -90,13 +90,14 @@ class PortEvaluator:
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return the same and their derivatives along directions (k, m), by differences."""
-        here, before, after = (
-            self.matrices(values + share * along) for share in (0.0, -DIFFERENCE, DIFFERENCE)
+        every = self.matrices(
+            np.concatenate([values + share * along for share in (0.0, -DIFFERENCE, DIFFERENCE)])
         )
-        return tuple(
-            (one, (late - early) / (2 * DIFFERENCE))
-            for one, early, late in zip(here, before, after, strict=True)
-        )
+        found = []
+        for one in every:
+            here, before, after = np.split(one, 3)
+            found.append((here, (after - before) / (2 * DIFFERENCE)))
+        return tuple(found)
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, n + m, n + m) on the errors of the maps at values (k, m), entry by entry."""
@@ -185,12 +186,19 @@ def port_evaluator(system: CompiledSystem, free: Sequence[Free], prepared: Prepa
 
 
 def _inertias(opened: Opened) -> Callable[[Floats], Floats]:
-    """Return what gives 1/m of a device (k,) of vectors of parameters (k, n_p)."""
-    function, start = opened.device.symbolic, opened.group.jacobians.kind.derivative
-    x, u, t = (np.zeros(start.numel_in(place)) for place in (0, 1, 3))
-    if not casadi.depends_on(function(*function.sx_in()), function.sx_in()[2]):
-        return lambda vectors: np.full(1, float(opened.device.inverse))
-    return lambda vectors: np.asarray(function.map(len(vectors))(x, u, vectors.T, t), np.float64).ravel()
+    """Return what gives 1/m of a device (k,), or (1,), of vectors of parameters (k, n_p)."""
+    function = opened.device.symbolic
+    x, u, p, t = function.sx_in()
+    followed = casadi.which_depends(function(x, u, p, t), p)
+    zeros = [np.zeros(one.numel()) for one in (x, u, t)]
+
+    def inertias(vectors: Floats) -> Floats:
+        same = (vectors[:, followed] == vectors[:1, followed]).all()
+        used = vectors[:1] if same else vectors
+        found = function.map(len(used))(*zeros[:2], used.T, zeros[2])
+        return np.asarray(found, dtype=np.float64).ravel()
+
+    return inertias
 
 
 def _packed(maps: Maps, seconds: float) -> Matrix:
