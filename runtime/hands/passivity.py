@@ -1,7 +1,7 @@
 """Is a scene stable with every passive hand at every device?
 
 Takes: a `CompiledSystem`.
-Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`.
+Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`; `worst_at`, `frequency_of`.
 Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
 anything that gives back no more energy than it was given, each by itself, or, where devices feel each other
 alike, joined to each other too.
@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem
@@ -27,6 +28,8 @@ from apc.moments.network import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
+
+Complexes = NDArray[np.complex128]
 
 OPTION = "--hands passive"
 STABLE, UNSTABLE = "stable with any passive hands", "unstable with some passive hands"
@@ -209,7 +212,7 @@ def _judge(loop: PortLoop) -> PassiveMode:
         damping=float(dampings.pop()) if len(dampings) == 1 else None,
         more=-least if known else None,
         error=max(high - least, least - low) if known else None,
-        frequency_hz=_frequency(loop, angle) if known else None,
+        frequency_hz=frequency_of(loop, angle) if known else None,
         stiffness=float(loop.maps.static[0, 0, 0]) if loop.maps.static.shape[-1] == 1 else None,
     )
 
@@ -304,15 +307,22 @@ def _draws(loop: PortLoop, angle: float) -> float:
     return top / size + 8 * UNIT * abs(top)
 
 
-def _frequency(loop: PortLoop, angle: float) -> float:
+def frequency_of(loop: PortLoop, angle: float) -> float:
     """Return the frequency of the motion that takes most energy out at an angle, in Hz.
 
+    Parameters
+    ----------
+    loop
+        A mode.
+    angle
+        By how much it turns in a frame, as far as frames see.
+
+    Notes
+    -----
     Frequencies that differ by a multiple of the frame rate have one angle: which of them it is, its course
     within a frame says: the one that most of it is at.
     """
-    a, b, c, d, weight = map(value_of, (loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d, loop.maps.weight))
-    response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
-    moved = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0] * np.sqrt(loop.seconds)
+    moved = worst_at(loop, angle)[1] * np.sqrt(loop.seconds)
     most = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
     found = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
     found.sort(key=abs)  # of two that can't be told apart, the slower
@@ -324,3 +334,18 @@ def _frequency(loop: PortLoop, angle: float) -> float:
     fits = np.linalg.norm((np.exp(-1j * turned) * shares * moved) @ each.T, axis=1)
     best = next(one for one, fit in zip(found, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
     return abs(best) / (2 * np.pi * loop.frame_s)
+
+
+def worst_at(loop: PortLoop, angle: float) -> tuple[float, Complexes]:
+    """Return the least eigenvalue of He H + diag(b/τ) at an angle, in floats, and its vector (m,).
+
+    Parameters
+    ----------
+    loop, angle
+        As for `frequency_of`.
+    """
+    maps = loop.maps
+    a, b, c, d, weight = map(value_of, (maps.a, maps.b, maps.c, maps.d, maps.weight))
+    response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
+    values, vectors = np.linalg.eigh((response + response.conj().T) / 2 + weight)
+    return float(values[0]), vectors[:, 0]

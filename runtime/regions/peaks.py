@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,8 @@ from apc.frame.discretize import UNIT
 from apc.regions.eigenpairs import Family, Pairs, by_system
 
 Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
+# Complex, as they come out of numpy, which forgets of how many digits.
+Complexes = NDArray[Any]
 
 # How far above what is known, relatively, a level is asked for, and how near the axis, relatively, an
 # eigenvalue may be on it.
@@ -45,6 +47,9 @@ TWINS = 1e-13
 
 # A peak this high decides: whether another is higher makes no difference.
 BEYOND = 1.05
+
+# Heights alike to this, relatively, are one: rounding tells them apart.
+ALIKE = 1e-11
 
 # Gains are told up to this: a resonance that doesn't die out has none.
 MOST_GAIN = 1e2
@@ -70,7 +75,7 @@ class _Loops:
 
     def s(self, x: Complexes) -> Complexes:
         """Return S (k, m, m) of X."""
-        return 2 * self.b * (self.f - self.fc @ x) - np.eye(self.f.shape[-1])
+        return np.asarray(2 * self.b * (self.f - self.fc @ x) - np.eye(self.f.shape[-1]))
 
     def gains(self, angles: Floats) -> Floats:
         """Return the largest gain (k, q) at angles (k, q)."""
@@ -78,7 +83,7 @@ class _Loops:
         every = self.at(np.repeat(np.arange(count), many))
         s = every.s(every.x(angles.ravel()))
         largest = np.linalg.eigvalsh(np.swapaxes(s, -1, -2).conj() @ s)[:, -1]
-        return np.sqrt(np.maximum(largest, 0.0)).reshape(count, many)
+        return np.asarray(np.sqrt(np.maximum(largest, 0.0)).reshape(count, many))
 
     def inner(self, angles: Floats) -> Complexes:
         """Return z − A_s at one angle a point (k, n, n)."""
@@ -105,12 +110,13 @@ class Peaks:
         """Return the highest peak of all maps at each point (k, 2)."""
         tops = [self._highest(s, one) for s, one in enumerate(self.family.matrices(points))]
         height, angle = (np.stack([one[place] for one in tops], axis=1) for place in (0, 1))
-        system = np.argmax(height, axis=1)
+        # Of maps that are alike, one all along.
+        system = np.argmax(height >= (1 - ALIKE) * height.max(axis=1, keepdims=True), axis=1)
         rows = np.arange(len(points))
-        value = height[rows, system] * np.exp(1j * angle[rows, system])
+        value = np.asarray(height[rows, system] * np.exp(1j * angle[rows, system]), np.complex128)
         nothing = np.zeros((len(points), max(self.family.sizes)), np.complex128)
         zeros = np.zeros((len(points), 2))
-        return self.follow(points, Pairs(system, value, zeros + 0j, zeros, nothing, nothing))
+        return self.follow(points, Pairs(system, value, zeros.astype(np.complex128), zeros, nothing, nothing))
 
     def follow(self, points: Floats, guess: Pairs) -> Pairs:
         """Return at each point the peak of a map that a guess climbs to."""
@@ -119,8 +125,13 @@ class Peaks:
         for s, rows in by_system(guess.system):
             size = self.family.sizes[s]
             matrix, derivatives = self.family.slopes(s, points[rows])
-            value, slope, w, v = self._climbed(s, matrix, derivatives, np.abs(np.angle(guess.value[rows])))
-            found.value[rows], found.slope[rows] = value, slope
+            angles = np.abs(np.angle(guess.value[rows]))
+            # A guess may lead to where there is no map: below a mass of 0, say.
+            lost = ~(np.isfinite(matrix) & np.isfinite(derivatives).all(axis=0)).all(axis=(1, 2))
+            lost |= ~np.isfinite(angles)
+            matrix[lost], angles[lost] = 0.0, 0.0
+            value, slope, w, v = self._climbed(s, matrix, derivatives, angles)
+            found.value[rows], found.slope[rows] = np.where(lost, np.nan, value), slope
             left[rows, :size], right[rows, :size] = w, v
         gradient = (found.slope / found.value[:, None]).real
         return replace(found, gradient=gradient, right=right, left=left)
@@ -139,8 +150,8 @@ class Peaks:
         """Return the scattering of maps (k, n + m, n + m)."""
         n, m = matrix.shape[-1] - self.ports[system], self.ports[system]
         a, b, c, e = matrix[:, :n, :n], matrix[:, :n, n:], matrix[:, n:, :n], matrix[:, n:, n:]
-        f = np.linalg.inv(e + self.damping * np.eye(m))
-        bf = b @ f
+        f = np.asarray(np.linalg.inv(e + self.damping * np.eye(m)), dtype=np.float64)
+        bf: Floats = b @ f
         return _Loops(a - bf @ c, bf, f @ c, f, self.damping)
 
     def _highest(self, system: int, matrix: Floats) -> tuple[Floats, Floats]:

@@ -98,8 +98,6 @@ class Curve:
     @property
     def mode(self) -> str:
         """The name of the closed system that makes the boundary here, or the criterion that does."""
-        if isinstance(self.source, PortEvaluator):
-            return PASSIVE
         if isinstance(self.source, MeanSquareEvaluator):
             return self.source.criterion
         middle = len(self.knots) // 2
@@ -111,7 +109,7 @@ class Curve:
 
         Both are NaN where it can't be told.
         """
-        if isinstance(self.source, MeanSquareEvaluator | PortEvaluator):
+        if isinstance(self.source, MeanSquareEvaluator):
             return np.nan, np.nan
         angles = np.abs(np.angle(self.eigenvalues))
         middle = len(self.knots) // 2
@@ -394,7 +392,10 @@ def _relative_error(arc: Arc, offset: Floats) -> float:
 
 def _identify(source: Source, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
-    assert isinstance(source, BatchEvaluator | PointEvaluator), "one number has no mode"
+    assert not isinstance(source, MeanSquareEvaluator), "one number has no mode"
+    if isinstance(source, PortEvaluator):
+        name, hertz, frame_s = source.motion_at(value, abs(float(np.angle(eigenvalue))))
+        return name, 2 * np.pi * hertz * frame_s, frame_s
     found = marginal_motion(with_rigid(source.closed_at(value.tolist())), eigenvalue)
     return found.name, found.turn, found.frame_s
 

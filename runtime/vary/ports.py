@@ -10,7 +10,7 @@ Does not: vary a time, or ask what hands can draw (see `regions.peaks`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -25,7 +25,7 @@ from apc.frame.lift import FrameMap, compose, composed_bounded
 from apc.frame.linearize import linearize_rows, sites_of_rows
 from apc.frame.names import Free
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of
-from apc.hands.passivity import OPTION
+from apc.hands.passivity import OPTION, frequency_of, worst_at
 from apc.hands.port import EVEN, Cut, Maps, Opened, Openings, PortLoop, open_ports, port_loop
 from apc.vary.batch import BatchEvaluator, batch_evaluator, is_beyond
 from apc.vary.evaluator import generic
@@ -62,6 +62,11 @@ class PortEvaluator:
     openings: Openings
     inertias: Mapping[int, Callable[[Floats], Floats]]  # 1/m, by the identity of the group
     wired: tuple[_Wired, ...]
+
+    @property
+    def system(self) -> CompiledSystem:
+        """The scene."""
+        return self.batch.system
 
     @property
     def sizes(self) -> tuple[tuple[int, int], ...]:
@@ -107,6 +112,16 @@ class PortEvaluator:
             for listed, size in zip(zip(*rows, strict=True), self.sizes, strict=True)
         )
 
+    def motion_at(self, value: Floats, angle: float) -> tuple[str, float, float]:
+        """Return which mode takes most energy out at a point (m,) and an angle: its name, Hz, s a frame."""
+        loops = [
+            replace(one.port, maps=maps)
+            for one, maps in zip(self.wired, self._maps(value[None], RADII), strict=True)
+            if maps is not None
+        ]
+        worst = min(loops, key=lambda one: worst_at(one, angle)[0])
+        return worst.name, frequency_of(worst, angle), worst.frame_s
+
     def _maps(self, values: Floats, numbers: Arithmetic) -> list[Maps | None]:
         """Return the maps of all modes at values (k, m); with radii, of one value alone."""
         lifted: dict[tuple[int, int], FrameMap] = {}
@@ -115,14 +130,14 @@ class PortEvaluator:
             key = site_key(one.ported)
             lifted[key], dampings[key] = self._lift(one, values, numbers)
         found = []
-        for one in self.wired:
-            keys = [site_key(group) for group in one.loop.sites]
-            feedback = one.feedback if numbers is RADII else [each.plain for each in one.feedback]
-            whole = close([lifted[key] for key in keys], feedback, one.layout, numbers=numbers).matrix
+        for wired in self.wired:
+            keys = [site_key(group) for group in wired.loop.sites]
+            feedback = wired.feedback if numbers is RADII else [one.plain for one in wired.feedback]
+            whole = close([lifted[key] for key in keys], feedback, wired.layout, numbers=numbers).matrix
             dampers = np.stack(np.broadcast_arrays(*(dampings[key] for key in keys)), axis=-1)
             if numbers is RADII:
                 whole, dampers = whole.reshape(whole.shape[-3:]), dampers[0]
-            found.append(one.cut.maps(whole, dampers, numbers))
+            found.append(wired.cut.maps(whole, dampers, numbers))
         return found
 
     def _lift(self, opened: Opened, values: Floats, numbers: Arithmetic) -> tuple[FrameMap, Floats]:
