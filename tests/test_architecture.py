@@ -93,6 +93,8 @@ HOUSE = (
         """
         wiring batch slopes crossings plane bracket counting loops evaluator leading many bends marginal
         delays lags search counts mean_square critical margins sensitivity over_network
+        wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
+        delays lags search mean_square critical margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),
@@ -108,7 +110,8 @@ HOUSE = (
     (
         "apc.regions",
         """
-        passivity overlay eigenpairs surrogate cells curves boundary_points boundary axes strips region panels
+        passivity overlay eigenpairs peaks surrogate cells curves boundary_points boundary axes strips region
+        panels
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from apc.regions.boundary import Arc, trace
 from apc.regions.cells import Survey, survey
 from apc.regions.curves import area_beside, between
-from apc.regions.eigenpairs import leading, log_magnitudes
+from apc.regions.eigenpairs import Eigenvalues, log_magnitudes
 from tests.fields import Fields, cusp, disc, plane
 
 TOLERANCE = 1e-9
@@ -19,7 +19,7 @@ def found(*fields: object, cells: int = 12) -> tuple[Fields, Survey, tuple[Arc, 
     """Return a family, its survey and its boundary; the boundary has been checked against the family."""
     family = Fields(*fields)  # type: ignore[arg-type] # fields
     seen = survey(lambda points: log_magnitudes(family.matrices(points), 4), cells=cells)
-    arcs = trace(family, seen, tolerance=TOLERANCE, offset=np.zeros(2))
+    arcs = trace(Eigenvalues(family), seen, tolerance=TOLERANCE, offset=np.zeros(2))
     for arc in arcs:
         check(family, arc)
     return family, seen, arcs
@@ -30,7 +30,7 @@ def check(family: Fields, arc: Arc) -> None:
     assert np.abs(log_magnitudes(family.matrices(arc.knots), 1)).max() < 1e-12
     ends = (arc.points[:-1], arc.points[1:], arc.tangents[:-1], arc.tangents[1:])
     for share in (0.0, 0.21, 0.5, 0.8):
-        pairs = leading(family, between(*ends, share))
+        pairs = Eigenvalues(family).leading(between(*ends, share))
         off = np.abs(pairs.growth) / np.linalg.norm(pairs.gradient, axis=1)
         assert np.all(off <= arc.errors.max() + 1e-12)
     beside = arc.points[1:-1] + 1e-4 * np.stack([-arc.tangents[1:-1, 1], arc.tangents[1:-1, 0]], axis=1)
@@ -101,7 +101,7 @@ def test_an_island_much_smaller_than_a_cell_is_found_by_what_is_seen_around_it()
 def test_a_cusp_is_followed_as_far_as_it_has_a_tangent() -> None:
     family = Fields(cusp(0.32, 0.47))
     seen = survey(lambda points: log_magnitudes(family.matrices(points), 2), cells=12)
-    arcs = trace(family, seen, tolerance=TOLERANCE, offset=np.zeros(2))
+    arcs = trace(Eigenvalues(family), seen, tolerance=TOLERANCE, offset=np.zeros(2))
     points = np.concatenate([arc.points for arc in arcs])
     assert np.abs(points - [0.32, 0.47]).max(axis=1).min() < 0.02
     assert all(np.abs(log_magnitudes(family.matrices(arc.knots), 1)).max() < 1e-12 for arc in arcs)

@@ -49,21 +49,21 @@ def with_holds(site: LinearSite, columns: Matrix) -> LinearSite:
     Parameters
     ----------
     site
-        The site, of floats or of rationals.
+        The site, of floats or of rationals, or many (k, …).
     columns
-        (n_x, inputs), of the same numbers.
+        (n_x, inputs), of the same numbers, of as many.
     """
-    inputs = columns.shape[1]
+    inputs = columns.shape[-1]
 
     def widened(matrix: Matrix) -> Matrix:
-        zero = np.zeros((len(matrix), inputs), dtype=matrix.dtype)
-        return np.concatenate([matrix, zero], axis=1)
+        zero = np.zeros((*matrix.shape[:-1], inputs), dtype=matrix.dtype)
+        return np.concatenate([matrix, zero], axis=-1)
 
     holds = tuple(Hold(f"input {number + 1}", INPUTS, number, "") for number in range(inputs))
     return replace(
         site,
         kind=replace(site.kind, holds=(*site.kind.holds, *holds)),
-        b=np.concatenate([site.b, columns], axis=1),
+        b=np.concatenate([site.b, columns], axis=-1),
         ticks=tuple(replace(tick, u=widened(tick.u)) for tick in site.ticks),
         sends=tuple(replace(send, u=widened(send.u)) for send in site.sends),
     )
@@ -96,7 +96,7 @@ def with_ports(
     """
     kind = sites[0].kind
     clock, first = len(kind.clocks), len(kind.holds) - inputs
-    outputs = readings[0].shape[0]
+    outputs = readings[0].shape[-2]
     of_inputs = tuple(f"{word} {number + 1}" for word in ("drawn", "acting") for number in range(inputs))
     of_readings = tuple(f"reading {number + 1}" for number in range(outputs))
     kind = replace(
@@ -154,20 +154,22 @@ def with_ports(
 
 def _with_clocks(site: LinearSite, kind: Kind, inputs: int, readings: Matrix) -> LinearSite:
     """Return a site with the clocks of ways in and out."""
-    n_x, n_u = site.b.shape
+    *many, n_x, n_u = site.b.shape
     number = site.b.dtype
-    acting = np.zeros((2 * inputs, n_u), dtype=number)
-    acting[inputs:, n_u - inputs :] += np.eye(inputs, dtype=np.int64)
 
     def nothing(rows: int, columns: int) -> Matrix:
-        return np.zeros((rows, columns), dtype=number)
+        return np.zeros((*many, rows, columns), dtype=number)
 
-    rows = len(readings)
+    acting = nothing(2 * inputs, n_u)
+    acting[..., inputs:, n_u - inputs :] += np.eye(inputs, dtype=np.int64)
+    rows = readings.shape[-2]
     ticks = (
         LinearTick(
             INPUTS, nothing(2 * inputs, n_x), acting, nothing(2 * inputs, 0), nothing(2 * inputs, 0), ()
         ),
-        LinearTick(READINGS, readings[:, :n_x], readings[:, n_x:], nothing(rows, 0), nothing(rows, 0), ()),
+        LinearTick(
+            READINGS, readings[..., :n_x], readings[..., n_x:], nothing(rows, 0), nothing(rows, 0), ()
+        ),
     )
     return replace(site, kind=kind, ticks=(*site.ticks, *ticks))
 

@@ -1,7 +1,7 @@
 """Is a scene stable with every passive hand at every device?
 
 Takes: a `CompiledSystem`.
-Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`.
+Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`; `worst_at`, `frequency_of`.
 Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
 anything that gives back no more energy than it was given, each by itself, or, where devices feel each other
 alike, joined to each other too.
@@ -11,6 +11,7 @@ Does not: say with which hand it shakes: which motion of the devices takes energ
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem
@@ -26,6 +27,8 @@ from apc.moments.network import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
+
+Complexes = NDArray[np.complex128]
 
 OPTION = "--hands passive"
 STABLE, UNSTABLE = "stable with any passive hands", "unstable with some passive hands"
@@ -134,7 +137,7 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
         why = loops if isinstance(loops, str) else CIRCULATES if any(map(_circulates, loops)) else ""
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     stable: bool | None = None
-    joined = not isinstance(loops, str) and all(loop.joined for loop in loops)
+    joined = not isinstance(loops, str) and all(loop.maps.joined for loop in loops)
     drawn = [one.passive is False and (joined or one.more is None) for one in modes]
     if isinstance(loops, str) or fixed.stable is False or any(drawn):
         stable = False
@@ -208,8 +211,8 @@ def _judge(loop: PortLoop) -> PassiveMode:
         damping=float(dampings.pop()) if len(dampings) == 1 else None,
         more=-least if known else None,
         error=max(high - least, least - low) if known else None,
-        frequency_hz=_frequency(loop, angle) if known else None,
-        stiffness=float(loop.static[0, 0, 0]) if loop.static.shape[-1] == 1 else None,
+        frequency_hz=frequency_of(loop, angle) if known else None,
+        stiffness=float(loop.maps.static[0, 0, 0]) if loop.maps.static.shape[-1] == 1 else None,
     )
 
 
@@ -221,27 +224,27 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     """
     if _circulates(loop):
         return -np.inf, -np.inf, -np.inf, 0.0
-    matrices = loop.a, loop.b, loop.c, loop.d
+    matrices = loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d
     least, angle = _least(loop)
     if not np.isfinite(least):
         return least, -np.inf, np.inf, angle
-    scale = max(abs(least), float(np.abs(value_of(loop.weight)).max()))
+    scale = max(abs(least), float(np.abs(value_of(loop.maps.weight)).max()))
     low = -np.inf
     for width in WIDTHS:
         shift = least - width * scale
-        less = RADII.subtract(loop.weight, RADII.exact(shift * np.eye(len(loop.weight[0]))))
+        less = RADII.subtract(loop.maps.weight, RADII.exact(shift * np.eye(len(loop.maps.weight[0]))))
         if proves_positive(*matrices, less, spared=[share * width for share in SPARED]):
             low = shift
             break
     else:
-        if least > 0 and proves_positive(*matrices, loop.weight):
+        if least > 0 and proves_positive(*matrices, loop.maps.weight):
             low = 0.0
     return least, low, _draws(loop, angle), angle
 
 
 def _least(loop: PortLoop) -> tuple[float, float]:
     """Return the least eigenvalue of He H + diag(b/τ) over all angles, and its angle, in floats."""
-    return least_real(*map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight)))
+    return least_real(*map(value_of, (loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d, loop.maps.weight)))
 
 
 def _circulates(loop: PortLoop) -> bool:
@@ -252,7 +255,7 @@ def _circulates(loop: PortLoop) -> bool:
     The residue at z = 1 has to be symmetric and not negative, or hands that move devices slowly round draw
     energy from it. What rounding leaves of one that vanishes counts as none.
     """
-    value, off = value_of(loop.static), radius_of(loop.static)
+    value, off = value_of(loop.maps.static), radius_of(loop.maps.static)
     turned = np.abs(value - value.T) > off + off.T
     least = float(np.linalg.eigvalsh((value + value.T) / 2).min())
     return bool(turned.any()) or least < -2 * float((off + off.T).sum())
@@ -265,7 +268,7 @@ def _draws(loop: PortLoop, angle: float) -> float:
     -----
     e^{jθ} is a rational point of the circle; complex numbers are pairs of real ones.
     """
-    n = len(loop.b[0])
+    n = len(loop.maps.b[0])
     tangent = np.tan(angle / 2) if angle < 3.0 else None
     cosine, sine = (
         ((1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2))
@@ -273,7 +276,7 @@ def _draws(loop: PortLoop, angle: float) -> float:
         else (-1.0, 0.0)
     )
     z = complex(cosine, sine)
-    a, b, c, d, weight = map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight))
+    a, b, c, d, weight = map(value_of, (loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d, loop.maps.weight))
     response = c @ np.linalg.solve(z * np.eye(n) - a, b + 0j) + d
     direction = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0]
     turned = np.zeros((2, 2 * n, 2 * n))
@@ -281,7 +284,7 @@ def _draws(loop: PortLoop, angle: float) -> float:
     # Sine and cosine are quotients of sums about 1: off by roundings of 1, however small they are themselves.
     turned[1] = 8 * UNIT * np.kron(np.ones((2, 2)), np.eye(n))
     twice = np.zeros((2, 2 * n, 2 * n))
-    twice[:, :n, :n] = twice[:, n:, n:] = loop.a
+    twice[:, :n, :n] = twice[:, n:, n:] = loop.maps.a
     v = RADII.exact(np.concatenate([direction.real, direction.imag])[:, None])
 
     def both(matrix: np.ndarray) -> np.ndarray:
@@ -290,11 +293,12 @@ def _draws(loop: PortLoop, angle: float) -> float:
         found[:, :rows, :columns] = found[:, rows:, columns:] = matrix
         return found
 
-    states = solve(RADII.subtract(turned, twice), RADII.multiply(both(loop.b), v))
+    states = solve(RADII.subtract(turned, twice), RADII.multiply(both(loop.maps.b), v))
     if states is None:
         return np.inf
     pushed = RADII.add(
-        RADII.multiply(both(loop.c), states), RADII.multiply(both(RADII.add(loop.d, loop.weight)), v)
+        RADII.multiply(both(loop.maps.c), states),
+        RADII.multiply(both(RADII.add(loop.maps.d, loop.maps.weight)), v),
     )
     drawn = RADII.multiply(np.swapaxes(v, -1, -2), pushed)
     size = float((direction.real**2 + direction.imag**2).sum())
@@ -302,15 +306,22 @@ def _draws(loop: PortLoop, angle: float) -> float:
     return top / size + 8 * UNIT * abs(top)
 
 
-def _frequency(loop: PortLoop, angle: float) -> float:
+def frequency_of(loop: PortLoop, angle: float) -> float:
     """Return the frequency of the motion that takes most energy out at an angle, in Hz.
 
+    Parameters
+    ----------
+    loop
+        A mode.
+    angle
+        By how much it turns in a frame, as far as frames see.
+
+    Notes
+    -----
     Frequencies that differ by a multiple of the frame rate have one angle: which of them it is, its course
     within a frame says: the one that most of it is at.
     """
-    a, b, c, d, weight = map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight))
-    response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
-    moved = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0] * np.sqrt(loop.seconds)
+    moved = worst_at(loop, angle)[1] * np.sqrt(loop.seconds)
     most = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
     found = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
     found.sort(key=abs)  # of two that can't be told apart, the slower
@@ -322,3 +333,18 @@ def _frequency(loop: PortLoop, angle: float) -> float:
     fits = np.linalg.norm((np.exp(-1j * turned) * shares * moved) @ each.T, axis=1)
     best = next(one for one, fit in zip(found, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
     return abs(best) / (2 * np.pi * loop.frame_s)
+
+
+def worst_at(loop: PortLoop, angle: float) -> tuple[float, Complexes]:
+    """Return the least eigenvalue of He H + diag(b/τ) at an angle, in floats, and its vector (m,).
+
+    Parameters
+    ----------
+    loop, angle
+        As for `frequency_of`.
+    """
+    maps = loop.maps
+    a, b, c, d, weight = map(value_of, (maps.a, maps.b, maps.c, maps.d, maps.weight))
+    response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
+    values, vectors = np.linalg.eigh((response + response.conj().T) / 2 + weight)
+    return float(values[0]), vectors[:, 0]

@@ -1,7 +1,7 @@
 """What devices are pushed by, while hands move them as they like: one map a mode.
 
 Takes: a `CompiledSystem`.
-Gives: `PortLoop`, `port_loops`; `reciprocal`.
+Gives: `PortLoop`, `Maps`, `port_loops`; `Opened`, `Openings`, `open_ports`; `Cut`, `port_loop`; `reciprocal`.
 Guarantees: exact for any motion of the hands: where nothing samples a device and no force on it switches,
 only how far it went counts, and the least that its damping takes of that. Matrices carry the radius of their
 rounding.
@@ -40,7 +40,7 @@ from apc.frame.devices import OWN_MASS, Device, find_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.ports import Ports, with_holds, with_ports
-from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
+from apc.frame.radius import RADII, Arithmetic, radius_of, solve, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
 from apc.frame.site import LinearSite
 
@@ -68,19 +68,17 @@ class Touched:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PortLoop:
-    """A mode's map from how far devices move to what pushes them back, less its pole at rest.
+class Maps:
+    """A map from how far devices move to what pushes them back, less its pole at rest.
 
     `a`, `b`, `c`, `d` (2, …) are over the states of the scene with clamped devices; `weight` (2, m, m) is
     what is added to the Hermitian part: dampers, and the pole's. Inputs and outputs are scaled: 1 more on the
     diagonal of `weight` is 1 N·s/m more at each device. `static` (2, k, k) is the stiffness of the pole
     between the k kinds of devices, of all peers together. `joined` says that the energies of all devices
-    count alike, so that hands may be joined to each other. `seconds` are the intervals', `starts` when they
-    begin.
+    count alike, so that hands may be joined to each other. Of many points in floats, all begin with (k, …)
+    instead.
     """
 
-    name: str
-    multiplicity: int
     a: Matrix
     b: Matrix
     c: Matrix
@@ -88,10 +86,59 @@ class PortLoop:
     weight: Matrix
     static: Matrix
     joined: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PortLoop:
+    """A mode of devices that hands move: its `maps`, the devices' dampings in N·s/m, and its intervals.
+
+    `seconds` are how long those are, `starts` when they begin in the frame.
+    """
+
+    name: str
+    multiplicity: int
+    maps: Maps
     dampings: tuple[Fraction, ...]
     starts: Floats
     seconds: Floats
     frame_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opened:
+    """A peer group whose device is moved from outside: the group that it was, its device and what is touched.
+
+    `ported` is the group with ways in and out, `at` the instants at which its intervals begin, in quanta.
+    """
+
+    group: PeerGroup
+    device: Device
+    ported: PeerGroup
+    touched: Touched
+    at: tuple[int, ...]
+
+    def site(self, site: LinearSite, inverse: Matrix) -> LinearSite:
+        """Return a site, or many (k, …), of the group with the ways in and out; 1/m is `inverse` (k,)."""
+        (found,), _, _ = _with_ways([site], [inverse], self.group.schedule, self.device, self.at)
+        return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Openings:
+    """A scene whose devices are moved from outside, all of them: groups, and loops that share no energy.
+
+    `weighted` says that a site of a loop stands for as many peers as it counts.
+    """
+
+    scene: str
+    groups: tuple[Opened, ...]
+    loops: tuple[Loop, ...]
+    weighted: bool
+
+    def of(self, loop: Loop) -> list[Opened]:
+        """Return the groups of a loop's sites."""
+        known = {id(one.ported.schedule): one for one in self.groups}
+        return [known[id(group.schedule)] for group in loop.sites]
 
 
 def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tuple[PortLoop, ...] | str:
@@ -109,9 +156,33 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
     ApcError
         E931 no device, or none that can be cut out; E933 too many intervals or states.
     """
-    groups, exchange = lifted_groups(system, prepared=prepared)
+    found = open_ports(system, *lifted_groups(system, prepared=prepared), option=option)
+    if isinstance(found, str):
+        return found
+    return tuple(port_loop(found, loop, option=option)[0] for loop in found.loops)
+
+
+def open_ports(
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, option: str
+) -> Openings | str:
+    """Let the devices of all groups be moved from outside; or say why no device is ever passive.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    groups, exchange
+        From `analysis.lifted_groups`.
+    option
+        What asked for it.
+
+    Raises
+    ------
+    ApcError
+        As `port_loops`.
+    """
     unit_of = {one.name: one.unit for one in system.parameters}
-    ported, touched = [], {}
+    opened = []
     for group in groups:
         device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
         if not isinstance(device, Device):
@@ -123,11 +194,9 @@ def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tu
         if touch := _other_touch(group, device):
             why, hint = touch
             raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {why}", hint=hint))
-        own, one = _ported(group, device)
-        ported.append(own)
-        touched[id(own.schedule)] = one
-    loops, weighted = _loops(system, ported, exchange, option=option)
-    return tuple(_port_loop(system, loop, touched, weighted=weighted, option=option) for loop in loops)
+        opened.append(_opened(group, device))
+    loops, weighted = _loops(system, [one.ported for one in opened], exchange, option=option)
+    return Openings(system.origin.topology, tuple(opened), loops, weighted)
 
 
 def _felt_velocity(group: PeerGroup, device: Device) -> str:
@@ -162,23 +231,35 @@ def _other_touch(group: PeerGroup, device: Device) -> tuple[str, str] | None:
     return None
 
 
-def _ported(group: PeerGroup, device: Device) -> tuple[PeerGroup, Touched]:
-    """Return a group whose device is moved from outside, and what of it is touched."""
+def _opened(group: PeerGroup, device: Device) -> Opened:
+    """Return a group whose device is moved from outside."""
     schedule = group.schedule
-    at = _boundaries(group.exact, schedule, device)
-    sites, readings = [], []
-    for one in (group.site, group.exact):
-        exact = one.b.dtype == object
-        inverse = device.inverse if exact else float(device.inverse)
-        sites.append(_driven(one, device))
-        push = -one.b[device.velocity] / inverse
-        zeros = np.zeros(len(sites[-1].a), dtype=one.b.dtype)
-        readings.append(np.concatenate([zeros, push, np.zeros(1, dtype=one.b.dtype)])[None])
-    (site, exact_site), full, ports = with_ports(sites, schedule, 1, at, readings, at)
-    own = group.with_site(site, exact_site, full)
+    at = tuple(_boundaries(group.exact, schedule, device))
+    inverses = [np.array(float(device.inverse)), np.array(device.inverse)]
+    (site, exact), full, ports = _with_ways([group.site, group.exact], inverses, schedule, device, at)
     ends = np.diff([*at, schedule.frame]).tolist()
     damping = -group.exact.a[device.velocity, device.velocity] / device.inverse
-    return own, Touched(damping, tuple(end * schedule.quantum for end in ends), ports)
+    touched = Touched(damping, tuple(end * schedule.quantum for end in ends), ports)
+    return Opened(group, device, group.with_site(site, exact, full), touched, at)
+
+
+def _with_ways(
+    sites: Sequence[LinearSite],
+    inverses: Sequence[Matrix],
+    schedule: Schedule,
+    device: Device,
+    at: Sequence[int],
+) -> tuple[list[LinearSite], Schedule, Ports]:
+    """Return a site in several kinds of number whose device is moved from outside, by 1/m in each."""
+    driven, readings = [], []
+    for one, inverse in zip(sites, inverses, strict=True):
+        driven.append(_driven(one, device))
+        push = -one.b[..., device.velocity, :] / inverse[..., None]
+        *many, states, _ = driven[-1].b.shape
+        zeros = [np.zeros((*many, size), dtype=one.b.dtype) for size in (states, 1)]
+        push = np.broadcast_to(push, (*many, push.shape[-1]))
+        readings.append(np.concatenate([zeros[0], push, zeros[1]], axis=-1)[..., None, :])
+    return with_ports(driven, schedule, 1, at, readings, at)
 
 
 def _boundaries(site: LinearSite, schedule: Schedule, device: Device) -> list[int]:
@@ -200,23 +281,22 @@ def _boundaries(site: LinearSite, schedule: Schedule, device: Device) -> list[in
 
 
 def _driven(site: LinearSite, device: Device) -> LinearSite:
-    """Return a site without a device's states: a hold, the last, says where the device is."""
+    """Return a site, or many, without a device's states: a hold, the last, says where the device is."""
     own = (device.position, device.velocity)
-    kept = [place for place in range(len(site.a)) if place not in own]
-    number = site.b.dtype
+    kept = np.array([place for place in range(site.a.shape[-1]) if place not in own], dtype=np.intp)
     smaller = replace(
         site,
         kind=replace(site.kind, states=tuple(site.kind.states[place] for place in kept)),
-        a=site.a[np.ix_(kept, kept)],
-        b=site.b[kept],
-        ticks=tuple(replace(tick, x=tick.x[:, kept]) for tick in site.ticks),
-        sends=tuple(replace(send, x=send.x[:, kept]) for send in site.sends),
+        a=site.a[..., kept[:, None], kept],
+        b=site.b[..., kept, :],
+        ticks=tuple(replace(tick, x=tick.x[..., kept]) for tick in site.ticks),
+        sends=tuple(replace(send, x=send.x[..., kept]) for send in site.sends),
     )
-    found = with_holds(smaller, np.zeros((len(kept), 1), dtype=number))
+    found = with_holds(smaller, np.zeros((*smaller.b.shape[:-1], 1), dtype=site.b.dtype))
     for tick, whole in zip(found.ticks, site.ticks, strict=True):
-        tick.u[:, -1] = whole.x[:, device.position]
+        tick.u[..., -1] = whole.x[..., device.position]
     for send, sent in zip(found.sends, site.sends, strict=True):
-        send.u[:, -1] = sent.x[:, device.position]
+        send.u[..., -1] = sent.x[..., device.position]
     return found
 
 
@@ -272,64 +352,125 @@ def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched]) -> _Wire
     )
 
 
-def _port_loop(
-    system: CompiledSystem, loop: Loop, touched: dict[int, Touched], *, weighted: bool, option: str
-) -> PortLoop:
-    """Return the map of a loop whose devices are moved from outside."""
-    sites = [touched[id(group.schedule)] for group in loop.sites]
-    counts = [group.count if weighted and len(loop.sites) > 1 else 1 for group in loop.sites]
+@dataclass(frozen=True, slots=True, eq=False)
+class Cut:
+    """Where a loop of an opened scene is cut, of a layout that many values share.
+
+    `counts` are what the energies of each site's devices count at first, `rigid` (n, d) the motions that no
+    device feels and nothing holds back.
+    """
+
+    at: _Wires
+    counts: tuple[int, ...]
+    rigid: Floats
+
+    def maps(self, whole: Matrix, dampings: Matrix, numbers: Arithmetic) -> Maps | None:
+        """Return the map of a closed matrix, or of many (k, …); None where others' motions can't be told.
+
+        Parameters
+        ----------
+        whole
+            The matrix of the loop, its devices moved from outside.
+        dampings
+            Of each site's device (…, sites), N·s/m.
+        numbers
+            What the matrix is of.
+        """
+        at, exact, multiply = self.at, numbers.exact, numbers.multiply
+        of, across = exact(at.of), exact(at.of.T.copy())
+        a, placed, felt = _moving(whole, at, self.rigid, numbers)
+        aside = _aside(a, placed, of, numbers)
+        if aside is None:
+            return None
+        # A device is where it was as the frame began, and the intervals before have moved it since.
+        at_once = whole[..., at.out[:, None], at.into]
+        forces = numbers.add(multiply(felt, aside), multiply(at_once, of))
+        first = np.argmax(at.of, axis=0)
+        many = _weights(forces[..., first, :], self.counts, numbers)
+        each = many @ at.of.T
+        peers = exact(_diagonal(each))
+        felt, at_once, forces = (multiply(peers, one) for one in (felt, at_once, forces))
+        static = forces[..., first, :]
+        b = numbers.subtract(multiply(placed, exact(at.sums)), multiply(aside, across))
+        pole = multiply(multiply(of, static), across)
+        half = multiply(numbers.add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(len(at.into)) / 4))
+        dampers = _diagonal((many * dampings) @ at.of.T / at.seconds)
+        units = exact(_diagonal(np.sqrt(at.seconds / each)))
+        damping = with_radius(dampers, 4 * UNIT * dampers) if numbers is RADII else dampers
+
+        def scaled(matrix: Matrix) -> Matrix:
+            return multiply(multiply(units, matrix), units)
+
+        return Maps(
+            a=a,
+            b=multiply(b, units),
+            c=multiply(units, felt),
+            d=scaled(multiply(at_once, exact(at.sums))),
+            weight=scaled(numbers.subtract(damping, half)),
+            static=static,
+            joined=bool((many == self.counts).all()),
+        )
+
+
+def port_loop(found: Openings, loop: Loop, *, option: str) -> tuple[PortLoop, Cut]:
+    """Return the map of a loop whose devices are moved from outside, and where it was cut.
+
+    Parameters
+    ----------
+    found, loop
+        The scene, and one of its loops.
+    option
+        What asked for it.
+
+    Raises
+    ------
+    ApcError
+        E933 too many intervals, or a motion that nothing holds back.
+    """
+    opened = found.of(loop)
+    sites = [one.touched for one in opened]
+    counts = [group.count if found.weighted and len(loop.sites) > 1 else 1 for group in loop.sites]
     if (intervals := sum(len(one.seconds) for one in sites)) > MOST_INTERVALS:
         what = f"devices that differ are sampled and pushed over {intervals:,} intervals of a frame"
         hint = f"fewer peers that differ: {MOST_INTERVALS:,} intervals at most"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
+        raise ApcError(Mistake("E933", Place(found.scene), f"{option}: {what}", hint=hint))
     closed = close_loop(loop)
     at = _wires(closed.offsets, len(closed.matrix), sites)
-    whole, exact = with_radius(closed.matrix, closed.error), RADII.exact
-    of, across = exact(at.of), exact(at.of.T.copy())
-    a, placed, felt = _moving(whole, at, np.zeros((len(at.rest), 0)))
-    aside = _aside(a, placed, of)
-    if aside is None:
+    whole = with_radius(closed.matrix, closed.error)
+    dampings = np.array([float(one.damping) for one in sites])
+    cut = Cut(at, tuple(counts), np.zeros((len(closed.matrix), 0)))
+    maps = cut.maps(whole, dampings, RADII)
+    if maps is None:
         rigid = find_rigid_modes(loop).basis
         if rigid.size and not rigid[at.out].any():  # a motion that no device feels
-            a, placed, felt = _moving(whole, at, rigid[at.rest])
-            aside = _aside(a, placed, of)
-    if aside is None:
+            cut = replace(cut, rigid=rigid)
+            maps = cut.maps(whole, dampings, RADII)
+    if maps is None:
         what = "with its devices clamped the scene has a motion that nothing holds back"
         hint = "couplers that hold each object to a device"
-        raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {what}", hint=hint))
-    # A device is where it was as the frame began, and the intervals before have moved it since.
-    at_once = whole[:, at.out[:, None], at.into]
-    forces = RADII.add(RADII.multiply(felt, aside), RADII.multiply(at_once, of))
-    first = np.argmax(at.of, axis=0)
-    many = reciprocal(forces[:, first], counts)
-    peers = exact(np.diag(at.of @ many))
-    felt, at_once, forces = (RADII.multiply(peers, one) for one in (felt, at_once, forces))
-    static = forces[:, first]
-    b = RADII.subtract(RADII.multiply(placed, exact(at.sums)), RADII.multiply(aside, across))
-    pole = RADII.multiply(RADII.multiply(of, static), across)
-    half = RADII.multiply(RADII.add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(len(at.into)) / 4))
-    dampings = [float(one.damping) for one in sites]
-    dampers = np.diag(at.of @ (many * dampings) / at.seconds)
-    units = exact(np.diag(np.sqrt(at.seconds / (at.of @ many))))
-
-    def scaled(matrix: Matrix) -> Matrix:
-        return RADII.multiply(RADII.multiply(units, matrix), units)
-
-    return PortLoop(
+        raise ApcError(Mistake("E933", Place(found.scene), f"{option}: {what}", hint=hint))
+    of_loop = PortLoop(
         name=loop.name,
         multiplicity=loop.multiplicity,
-        a=a,
-        b=RADII.multiply(b, units),
-        c=RADII.multiply(units, felt),
-        d=scaled(RADII.multiply(at_once, exact(at.sums))),
-        weight=scaled(RADII.subtract(with_radius(dampers, 4 * UNIT * dampers), half)),
-        static=static,
-        joined=bool((many == counts).all()),
+        maps=maps,
         dampings=tuple(one.damping for one in sites),
         starts=at.starts,
         seconds=at.seconds,
         frame_s=closed.frame_s,
     )
+    return of_loop, cut
+
+
+def _diagonal(values: Floats) -> Floats:
+    """Return diagonal matrices (…, m, m) of their diagonals (…, m)."""
+    return np.asarray(values[..., None] * np.eye(values.shape[-1]))
+
+
+def _weights(static: Matrix, counts: Sequence[int], numbers: Arithmetic) -> Floats:
+    """Return `reciprocal`, of one matrix with its radii or of many in floats (k, …)."""
+    if numbers is RADII or len(counts) == 1:
+        return reciprocal(static, counts) if numbers is RADII else np.array(counts, dtype=np.float64)
+    return np.stack([reciprocal(with_radius(one, EVEN * np.abs(one).max()), counts) for one in static])
 
 
 def reciprocal(static: Matrix, counts: Sequence[int]) -> Floats:
@@ -364,17 +505,26 @@ def reciprocal(static: Matrix, counts: Sequence[int]) -> Floats:
     return np.array(counts, dtype=np.float64) if np.abs(even - 1).max() <= EVEN else found
 
 
-def _moving(whole: Matrix, at: _Wires, rigid: Floats) -> tuple[Matrix, Matrix, Matrix]:
+def _moving(whole: Matrix, at: _Wires, rigid: Floats, numbers: Arithmetic) -> tuple[Matrix, Matrix, Matrix]:
     """Return what moves by itself, what moves it, and what is felt of it, less rigid motions (n, d)."""
     rest, into, out = at.rest, at.into, at.out
-    a, placed, felt = (whole[:, rows[:, None], of] for rows, of in ((rest, rest), (rest, into), (out, rest)))
+    a, placed, felt = (
+        whole[..., rows[:, None], of] for rows, of in ((rest, rest), (rest, into), (out, rest))
+    )
     if not rigid.size:
         return a, placed, felt
-    to = with_doubt(relative_coordinates(rigid))
-    less = relative_rows(np.concatenate([a, placed], axis=-1), to, RADII)
+    to = relative_coordinates(rigid[rest])
+    to = with_doubt(to) if numbers is RADII else to
+    less = relative_rows(np.concatenate([a, placed], axis=-1), to, numbers)
     return less[..., to.rest], less[..., len(rest) :], felt[..., to.rest]
 
 
-def _aside(a: Matrix, placed: Matrix, of: Matrix) -> Matrix | None:
+def _aside(a: Matrix, placed: Matrix, of: Matrix, numbers: Arithmetic) -> Matrix | None:
     """Return where all else is while devices stand aside by 1, site by site; None where it can't be said."""
-    return solve(RADII.subtract(RADII.exact(np.eye(a.shape[-1])), a), RADII.multiply(placed, of))
+    still, pushed = numbers.subtract(numbers.exact(np.eye(a.shape[-1])), a), numbers.multiply(placed, of)
+    if numbers is RADII:
+        return solve(still, pushed)
+    try:
+        return np.asarray(np.linalg.solve(still, pushed))
+    except np.linalg.LinAlgError:
+        return None

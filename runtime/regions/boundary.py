@@ -1,6 +1,6 @@
 """Boundary curves of a stable region in the unit square, to a stated accuracy.
 
-Takes: a `Family` of closed systems and the `Survey` of its cells.
+Takes: a `Deciding` and the `Survey` of its cells.
 Gives: `Arc`, `trace`; `trace_steps` for a boundary that has steps; `stable_area`, `relative_to`.
 Guarantees: every point lies on the boundary to rounding; between its points a curve is the cubic Hermite
 interpolant through points and tangents, and that has been measured against the true boundary in the middle
@@ -30,7 +30,7 @@ from apc.frame.discretize import UNIT
 from apc.regions.boundary_points import MOST_STEPS, SHORT, clear, cross, just_inside, moved, polish
 from apc.regions.cells import Survey
 from apc.regions.curves import area_beside, between, fill, off_an_arc, stencils, through_four
-from apc.regions.eigenpairs import Family, Pairs, follow, join, log_magnitudes, value_errors
+from apc.regions.eigenpairs import Deciding, Pairs, join
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -117,13 +117,13 @@ class _Knots:
         return _tangents(self.pairs.gradient[knots])
 
 
-def trace(family: Family, found: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
+def trace(deciding: Deciding, found: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
     """Follow the boundary through all crossings of a survey.
 
     Parameters
     ----------
-    family
-        The closed systems over the unit square.
+    deciding
+        What decides over the unit square.
     found
         Where the boundary crosses the cells' edges, and in what order.
     tolerance
@@ -135,7 +135,7 @@ def trace(family: Family, found: Survey, *, tolerance: float, offset: Floats) ->
     if not found.crossings:
         return ()
     points, pairs = cross(
-        family,
+        deciding,
         np.array([one.stable for one in found.crossings]),
         np.array([one.unstable for one in found.crossings]),
         np.array([one.growth for one in found.crossings]),
@@ -156,10 +156,10 @@ def trace(family: Family, found: Survey, *, tolerance: float, offset: Floats) ->
         intervals = _apart(knots, intervals)
         if not len(intervals):
             break
-        intervals = _halve(family, knots, intervals, tolerance, offset, guarded=halving == 0)
+        intervals = _halve(deciding, knots, intervals, tolerance, offset, guarded=halving == 0)
     for a, b in intervals.tolist():  # given up: the chord is all that is known
         knots.error[a] = max(knots.error[a], float(np.linalg.norm(knots.points[b] - knots.points[a])))
-    return _arcs(family, knots, found.closed, tolerance, offset)
+    return _arcs(deciding, knots, found.closed, tolerance, offset)
 
 
 def _apart(knots: _Knots, intervals: Integers) -> Integers:
@@ -181,7 +181,7 @@ def _tangents(gradient: Floats) -> Floats:
 
 
 def _halve(
-    family: Family, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats, *, guarded: bool
+    deciding: Deciding, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats, *, guarded: bool
 ) -> Integers:
     """Put a knot into every interval, or a corner; return the intervals that are not good enough yet.
 
@@ -191,18 +191,18 @@ def _halve(
     lost = intervals[~same]
     left = []
     if len(lost):
-        cornered, lost = _corners(family, knots, lost)
+        cornered, lost = _corners(deciding, knots, lost)
         left.append(cornered)
     a, b = intervals[same].T
     if len(a):
         chord = knots.points[b] - knots.points[a]
         length = np.linalg.norm(chord, axis=1)
         expected, unseen, gain = _expected(knots, a, b)
-        place, pairs = polish(family, expected, _halfway(knots, a, b, chord))
+        place, pairs = polish(deciding, expected, _halfway(knots, a, b, chord))
         off = np.linalg.norm(place - expected, axis=1)
         good = off <= ASTRAY * length
         if guarded:
-            good &= clear(family, place, pairs)
+            good &= clear(deciding, place, pairs)
         lost = np.concatenate([lost, np.stack([a[~good], b[~good]], axis=1)])
         a, b, place, pairs = a[good], b[good], place[good], pairs.at(good)
         off = off[good] / gain[good] + unseen[good]
@@ -211,7 +211,7 @@ def _halve(
         fine = off <= FILLED / 2 * tolerance * relative_to(place, pairs.gradient, offset)
         left += [np.stack([a, middle], axis=1)[~fine], np.stack([middle, b], axis=1)[~fine]]
     if len(lost):
-        left.append(_search(family, knots, lost))
+        left.append(_search(deciding, knots, lost))
     return np.concatenate(left) if left else intervals[:0]
 
 
@@ -273,7 +273,7 @@ def _halfway(knots: _Knots, a: Integers, b: Integers, chord: Floats) -> Pairs:
     return replace(start, value=(start.value + end.value) / 2 + slopes / 8)
 
 
-def _corners(family: Family, knots: _Knots, intervals: Integers) -> tuple[Integers, Integers]:
+def _corners(deciding: Deciding, knots: _Knots, intervals: Integers) -> tuple[Integers, Integers]:
     """Solve for the corner in each interval; return the intervals beside corners, and those without one."""
     a, b = intervals.T
     count = len(a)
@@ -284,7 +284,7 @@ def _corners(family: Family, knots: _Knots, intervals: Integers) -> tuple[Intege
     before = np.concatenate([knots.points[a], knots.points[b]])
     for _ in range(MOST_STEPS):
         both = np.concatenate([place, place])
-        pairs = follow(family, both, moved(pairs, both - before))
+        pairs = deciding.follow(both, moved(pairs, both - before))
         before = both
         rows = np.stack([pairs.gradient[:count], pairs.gradient[count:]], axis=1)
         growth = np.stack([pairs.growth[:count], pairs.growth[count:]], axis=1)
@@ -299,7 +299,7 @@ def _corners(family: Family, knots: _Knots, intervals: Integers) -> tuple[Intege
             break
     off = np.linalg.norm(place - (knots.points[a] + knots.points[b]) / 2, axis=1)
     good = regular & (size <= SHORT) & (off <= length)
-    good &= clear(family, place, pairs.at(np.arange(count)))
+    good &= clear(deciding, place, pairs.at(np.arange(count)))
     a, b, place = a[good], b[good], place[good]
     own = pairs.at(np.concatenate([good, good]))
     third = (knots.key[b] - knots.key[a]) / 3
@@ -310,7 +310,7 @@ def _corners(family: Family, knots: _Knots, intervals: Integers) -> tuple[Intege
     return beside, intervals[~good]
 
 
-def _search(family: Family, knots: _Knots, intervals: Integers) -> Integers:
+def _search(deciding: Deciding, knots: _Knots, intervals: Integers) -> Integers:
     """Put a knot into intervals nothing is known about, where a line across their middle meets the boundary.
 
     Returns the halves; an interval without such a crossing keeps the chord as its error.
@@ -320,19 +320,23 @@ def _search(family: Family, knots: _Knots, intervals: Integers) -> Integers:
     middle = (knots.points[a] + knots.points[b]) / 2
     across = np.stack([chord[:, 1], -chord[:, 0]], axis=1) / 2  # to the right, where it is unstable
     stable, unstable = just_inside(middle - across), just_inside(middle + across)
-    ends = log_magnitudes(family.matrices(np.concatenate([stable, unstable])), 1)[:, 0].reshape(2, -1).T
+    ends = (
+        deciding.log_magnitudes(deciding.family.matrices(np.concatenate([stable, unstable])), 1)[:, 0]
+        .reshape(2, -1)
+        .T
+    )
     found = (ends[:, 0] < 0) & (ends[:, 1] >= 0)
     knots.error[a[~found]] = np.linalg.norm(chord[~found], axis=1)
     a, b = a[found], b[found]
     if not len(a):
         return intervals[:0]
-    place, pairs = cross(family, stable[found], unstable[found], ends[found])
+    place, pairs = cross(deciding, stable[found], unstable[found], ends[found])
     new = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
     return np.concatenate([np.stack([a, new], axis=1), np.stack([new, b], axis=1)])
 
 
 def _arcs(
-    family: Family, knots: _Knots, closed: tuple[bool, ...], tolerance: float, offset: Floats
+    deciding: Deciding, knots: _Knots, closed: tuple[bool, ...], tolerance: float, offset: Floats
 ) -> tuple[Arc, ...]:
     """Return each chain's knots in order, cut at its corners."""
     arcs = []
@@ -345,7 +349,7 @@ def _arcs(
         for piece in pieces:
             kept = _without_copies(knots.points[piece])
             if len(kept) > 1:
-                arcs.append(_arc(family, knots, piece[kept], chain, tolerance, offset))
+                arcs.append(_arc(deciding, knots, piece[kept], chain, tolerance, offset))
     return tuple(arcs)
 
 
@@ -358,7 +362,9 @@ def _without_copies(points: Floats) -> Integers:
     return kept
 
 
-def _arc(family: Family, knots: _Knots, piece: Integers, chain: int, tolerance: float, offset: Floats) -> Arc:
+def _arc(
+    deciding: Deciding, knots: _Knots, piece: Integers, chain: int, tolerance: float, offset: Floats
+) -> Arc:
     """Return some knots as an arc."""
     pairs = knots.pairs.at(piece)
     system = int(pairs.system[0])
@@ -371,7 +377,7 @@ def _arc(family: Family, knots: _Knots, piece: Integers, chain: int, tolerance: 
         knots.error[piece[:-1]],
         np.minimum(allowed[:-1], allowed[1:]),
     )
-    rounding = value_errors(family, pairs) / np.maximum(steepness, np.finfo(np.float64).tiny)
+    rounding = deciding.value_errors(pairs) / np.maximum(steepness, np.finfo(np.float64).tiny)
     return Arc(
         points=points,
         tangents=tangents,

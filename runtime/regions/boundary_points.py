@@ -1,6 +1,6 @@
 """Newton's method onto the boundary, for many points at once.
 
-Takes: a `Family` of closed systems, and guesses of points and eigenvalues.
+Takes: a `Deciding`, and guesses of points and eigenvalues.
 Gives: `cross`, `polish`, `moved`, `clear`, `just_inside`; `SHORT`.
 Guarantees: a point is on the curve log|λ| = 0 of its eigenvalue to rounding, or NaN; one of `cross` is where
 the spectral radius is 1.
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.regions.cells import INSIDE_RIM
-from apc.regions.eigenpairs import Family, Pairs, follow, join, leading, log_magnitudes
+from apc.regions.eigenpairs import Deciding, Pairs, join
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -33,13 +33,13 @@ MOST_BRACKETS = 50
 OUTSIDE = 1e-9
 
 
-def cross(family: Family, stable: Floats, unstable: Floats, growth: Floats) -> tuple[Floats, Pairs]:
+def cross(deciding: Deciding, stable: Floats, unstable: Floats, growth: Floats) -> tuple[Floats, Pairs]:
     """Return where the boundary lies on stretches from stable to unstable points, and who decides there.
 
     Parameters
     ----------
-    family
-        The closed systems.
+    deciding
+        What decides.
     stable, unstable
         The ends of the stretches (k, 2).
     growth
@@ -55,19 +55,19 @@ def cross(family: Family, stable: Floats, unstable: Floats, growth: Floats) -> t
     low, high = np.zeros(count), np.ones(count)
     along = unstable - stable
     points = unstable.copy()
-    pairs = leading(family, just_inside(unstable))
+    pairs = deciding.leading(just_inside(unstable))
     guess = _quadratic_root(growth, (pairs.gradient * along).sum(axis=1))
     rest = np.arange(count)
     for _ in range(MOST_BRACKETS):
         start = stable[rest] + guess[rest, None] * along[rest]
-        place, found = polish(family, start, moved(pairs.at(rest), start - points[rest]), along[rest])
+        place, found = polish(deciding, start, moved(pairs.at(rest), start - points[rest]), along[rest])
         length = np.square(along[rest]).sum(axis=1)
         reached = ((place - stable[rest]) * along[rest]).sum(axis=1) / length
         arrived = np.isfinite(reached) & (reached >= low[rest]) & (reached <= high[rest])
         middle = (low[rest] + high[rest]) / 2
         looked_at = np.where(arrived, reached, middle)
         spots = stable[rest] + looked_at[:, None] * along[rest]
-        top = log_magnitudes(family.matrices(just_inside(spots)), 1)[:, 0]
+        top = deciding.log_magnitudes(deciding.family.matrices(just_inside(spots)), 1)[:, 0]
         good = arrived & (top <= rounded_growth(spots, found.gradient))
         done = rest[good]
         points[done] = place[good]
@@ -78,7 +78,7 @@ def cross(family: Family, stable: Floats, unstable: Floats, growth: Floats) -> t
         again = rest[out]
         if len(again):
             points[again] = spots[out]
-            _put(pairs, again, leading(family, points[again]))
+            _put(pairs, again, deciding.leading(points[again]))
         rest = rest[~good]
         if not len(rest):
             break
@@ -119,11 +119,11 @@ def rounded_growth(points: Floats, gradient: Floats) -> Floats:
     return limit
 
 
-def clear(family: Family, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
+def clear(deciding: Deciding, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
     """Say of each point of the boundary whether no other eigenvalue has left the unit circle there."""
     alone: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
     if alone.any():
-        top = log_magnitudes(family.matrices(just_inside(points[alone])), 1)[:, 0]
+        top = deciding.log_magnitudes(deciding.family.matrices(just_inside(points[alone])), 1)[:, 0]
         alone[alone] = top <= rounded_growth(points[alone], pairs.gradient[alone])
     return alone
 
@@ -133,13 +133,15 @@ def moved(pairs: Pairs, by: Floats) -> Pairs:
     return replace(pairs, value=pairs.value + (pairs.slope * by).sum(axis=1))
 
 
-def polish(family: Family, points: Floats, guess: Pairs, along: Floats | None = None) -> tuple[Floats, Pairs]:
+def polish(
+    deciding: Deciding, points: Floats, guess: Pairs, along: Floats | None = None
+) -> tuple[Floats, Pairs]:
     """Move points onto the curve log|λ| = 0 of the eigenvalues guessed; NaN where that leads nowhere.
 
     Parameters
     ----------
-    family
-        The closed systems.
+    deciding
+        What decides.
     points
         Where to begin (k, 2).
     guess
@@ -150,7 +152,7 @@ def polish(family: Family, points: Floats, guess: Pairs, along: Floats | None = 
     found, parts = np.full(points.shape, np.nan), [guess.at(slice(0))]
     rest, order = np.arange(len(points)), np.arange(0)
     for _ in range(MOST_STEPS):
-        guess = follow(family, points, guess)
+        guess = deciding.follow(points, guess)
         way = guess.gradient if along is None else along
         rise = (guess.gradient * way).sum(axis=1)
         step = -(guess.growth / np.where(rise == 0, np.nan, rise))[:, None] * way

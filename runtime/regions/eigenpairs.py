@@ -1,7 +1,7 @@
 """The eigenvalues that decide, of families of matrices over a plane, with their slopes.
 
 Takes: a `Family`: the closed systems of a scene as matrices over the unit square, with their derivatives.
-Gives: `Family`, `Pairs`, `log_magnitudes`, `largest`, `leading`, `follow`, `value_errors`.
+Gives: `Family`, `Deciding`, `Pairs`, `join`; `Eigenvalues`; `log_magnitudes`, `largest`, `by_system`.
 Guarantees: all points at once; what is small is computed in few calls. A complex pair is stood for by its
 eigenvalue of positive imaginary part.
 Does not: know what the two coordinates are.
@@ -44,6 +44,29 @@ class Family(Protocol):
 
     def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
         """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
+
+
+class Deciding(Protocol):
+    """What decides at points of the unit square: complex numbers, stable inside the circle.
+
+    Of several that decide in parts of the square, each is followed as if it were alone.
+    """
+
+    @property
+    def family(self) -> Family:
+        """The matrices that it follows from."""
+
+    def log_magnitudes(self, matrices: Sequence[Floats], count: int) -> Floats:
+        """Return the logarithms of the `count` largest magnitudes (k, count) of such matrices, descending."""
+
+    def leading(self, points: Floats) -> Pairs:
+        """Return the one of largest magnitude at each point (k, 2)."""
+
+    def follow(self, points: Floats, guess: Pairs) -> Pairs:
+        """Return at each point the one that a guess leads to."""
+
+    def value_errors(self, pairs: Pairs) -> Floats:
+        """Return by how much the numbers (k,) may be off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,66 +113,73 @@ def largest(matrices: Sequence[Floats]) -> complex:
     return complex(values[np.argmax(np.abs(values))])
 
 
-def leading(family: Family, points: Floats) -> Pairs:
-    """Return the eigenvalue of largest magnitude of all systems at each point (k, 2)."""
-    matrices = family.matrices(points)
-    values = [np.linalg.eigvals(one) for one in matrices]
-    best = np.stack([np.abs(one).max(axis=1) for one in values], axis=1)
-    system = np.argmax(best, axis=1)
-    k, widest = len(points), max(family.sizes)
-    value = np.zeros(k, np.complex128)
-    start = np.zeros((k, widest), np.complex128)
-    for s, own in enumerate(values):
-        rows = np.flatnonzero(system == s)
-        if len(rows):
-            found = own[rows, np.argmax(np.abs(own[rows]) + 1e-12 * (own[rows].imag > 0), axis=1)]
-            value[rows] = found.real + 1j * np.abs(found.imag)
-            # Any start will do that has a share of the vector wanted, and nearly every one has.
-            start[rows, : family.sizes[s]] = 1 / (1 + np.arange(family.sizes[s])) + 0.5j
-    guess = Pairs(system, value, np.zeros((k, 2), complex), np.zeros((k, 2)), start, start.copy())
-    return follow(family, points, guess)
-
-
-def follow(family: Family, points: Floats, guess: Pairs) -> Pairs:
-    """Return at each point the eigenvalue of a system nearest to a guess, by inverse iteration.
-
-    Parameters
-    ----------
-    family
-        The closed systems.
-    points
-        Where (k, 2).
-    guess
-        System, eigenvalue and vectors to start from, one a point.
-    """
-    k = len(points)
-    system = guess.system
-    value, slope = np.zeros(k, np.complex128), np.zeros((k, 2), np.complex128)
-    right, left = np.zeros_like(guess.right), np.zeros_like(guess.left)
-    for s, rows in _by_system(system):
-        n = family.sizes[s]
-        matrix, derivatives = family.slopes(s, points[rows])
-        pair = refined(
-            matrix,
-            Eigenpairs(guess.value[rows, None], guess.right[rows, :n, None], guess.left[rows, None, :n]),
-        )
-        value[rows], slope[rows] = pair.values[:, 0], pair.slopes(derivatives)[..., 0].T
-        right[rows, :n], left[rows, :n] = pair.right[..., 0], pair.left[:, 0]
-    gradient = (slope / value[:, None]).real
-    return Pairs(system, value, slope, gradient, right, left)
-
-
-def _by_system(system: Integers) -> list[tuple[int, Integers | slice]]:
+def by_system(system: Integers) -> list[tuple[int, Integers | slice]]:
     """Return each system with its points, all of them as a slice."""
     used = sorted(set(system.tolist()))
     return [(s, np.flatnonzero(system == s) if len(used) > 1 else slice(None)) for s in used]
 
 
-def value_errors(family: Family, pairs: Pairs) -> Floats:
-    """Return by how much the eigenvalues (k,) may be off for what their matrices are off: |w| E |v|/|w v|."""
-    found = np.zeros(len(pairs.value))
-    for s, rows in _by_system(pairs.system):
-        n = family.sizes[s]
-        pair = Eigenpairs(pairs.value[rows, None], pairs.right[rows, :n, None], pairs.left[rows, None, :n])
-        found[rows] = pair.errors(family.errors[s])[:, 0]
-    return found
+@dataclass(frozen=True, slots=True, eq=False)
+class Eigenvalues:
+    """A `Deciding` of closed systems: their eigenvalues."""
+
+    family: Family
+
+    def log_magnitudes(self, matrices: Sequence[Floats], count: int) -> Floats:
+        """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""
+        return log_magnitudes(matrices, count)
+
+    def leading(self, points: Floats) -> Pairs:
+        """Return the eigenvalue of largest magnitude of all systems at each point (k, 2)."""
+        matrices = self.family.matrices(points)
+        values = [np.linalg.eigvals(one) for one in matrices]
+        best = np.stack([np.abs(one).max(axis=1) for one in values], axis=1)
+        system = np.argmax(best, axis=1)
+        k, widest = len(points), max(self.family.sizes)
+        value = np.zeros(k, np.complex128)
+        start = np.zeros((k, widest), np.complex128)
+        for s, own in enumerate(values):
+            rows = np.flatnonzero(system == s)
+            if len(rows):
+                found = own[rows, np.argmax(np.abs(own[rows]) + 1e-12 * (own[rows].imag > 0), axis=1)]
+                value[rows] = found.real + 1j * np.abs(found.imag)
+                # Any start will do that has a share of the vector wanted, and nearly every one has.
+                start[rows, : self.family.sizes[s]] = 1 / (1 + np.arange(self.family.sizes[s])) + 0.5j
+        guess = Pairs(system, value, np.zeros((k, 2), complex), np.zeros((k, 2)), start, start.copy())
+        return self.follow(points, guess)
+
+    def follow(self, points: Floats, guess: Pairs) -> Pairs:
+        """Return at each point the eigenvalue of a system nearest to a guess, by inverse iteration.
+
+        Parameters
+        ----------
+        points
+            Where (k, 2).
+        guess
+            System, eigenvalue and vectors to start from, one a point.
+        """
+        k = len(points)
+        system = guess.system
+        value, slope = np.zeros(k, np.complex128), np.zeros((k, 2), np.complex128)
+        right, left = np.zeros_like(guess.right), np.zeros_like(guess.left)
+        for s, rows in by_system(system):
+            n = self.family.sizes[s]
+            matrix, derivatives = self.family.slopes(s, points[rows])
+            pair = refined(
+                matrix,
+                Eigenpairs(guess.value[rows, None], guess.right[rows, :n, None], guess.left[rows, None, :n]),
+            )
+            value[rows], slope[rows] = pair.values[:, 0], pair.slopes(derivatives)[..., 0].T
+            right[rows, :n], left[rows, :n] = pair.right[..., 0], pair.left[:, 0]
+        gradient = (slope / value[:, None]).real
+        return Pairs(system, value, slope, gradient, right, left)
+
+    def value_errors(self, pairs: Pairs) -> Floats:
+        """Return by how much the eigenvalues (k,) may be off for what matrices are off: |w| E |v|/|w v|."""
+        found = np.zeros(len(pairs.value))
+        for s, rows in by_system(pairs.system):
+            n = self.family.sizes[s]
+            right, left = pairs.right[rows, :n, None], pairs.left[rows, None, :n]
+            pair = Eigenpairs(pairs.value[rows, None], right, left)
+            found[rows] = pair.errors(self.family.errors[s])[:, 0]
+        return found

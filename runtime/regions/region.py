@@ -30,7 +30,8 @@ from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace, trace_steps
 from apc.regions.cells import survey
 from apc.regions.curves import between
-from apc.regions.eigenpairs import Family, largest, log_magnitudes
+from apc.regions.eigenpairs import Deciding, Eigenvalues, Family, largest
+from apc.regions.peaks import Peaks
 from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
 from apc.result import Result
@@ -54,6 +55,7 @@ from apc.vary.mean_square import (
     growth_at,
     refuse_time,
 )
+from apc.vary.ports import PortEvaluator, port_evaluator
 from apc.vary.search import Told
 
 if TYPE_CHECKING:
@@ -74,7 +76,7 @@ FOLD = 0.1
 CHUNK = 1024
 
 
-Source = BatchEvaluator | PointEvaluator | MeanSquareEvaluator
+Source = BatchEvaluator | PointEvaluator | MeanSquareEvaluator | PortEvaluator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -271,7 +273,10 @@ def region(
             raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {label}"))
         times += counts
         source: Source
-        if meant in BY_GROWTH:
+        ports = port_evaluator(system, free, prepared) if meant == PASSIVE else None
+        if ports is not None:
+            source = ports
+        elif meant in BY_GROWTH:
             times = []
             source = MeanSquareEvaluator(system, free, prepared, PLACE, meant)
         elif times:
@@ -282,8 +287,8 @@ def region(
         start = prepare_at_start(system, prepared) if len(times) == 1 else None
         if start is not None:
             found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
-        # What hands can draw grows without end within a hair of where clamped devices shake.
-        stepped = (bool(times) or meant == PASSIVE) and found is None
+        # Of one point at a time what hands can draw is known as the damping needed, which jumps.
+        stepped = (bool(times) or (meant == PASSIVE and ports is None)) and found is None
         if found is None:
             found = _surveyed(source, rectangle, stepped, cells, tolerance, told)
         curves = tuple(_curve(source, rectangle, arc) for arc in found.arcs)
@@ -319,6 +324,9 @@ def _surveyed(
 ) -> Striped:
     """Survey the whole rectangle and follow the boundary through it, or go by steps from cell to cell."""
     family = _family(source, rectangle, timed=stepped)
+    deciding: Deciding = Eigenvalues(family)
+    if isinstance(source, PortEvaluator):
+        deciding = Peaks(family, source.ports, source.damping)
     looked = 0
 
     def samples(points: Floats) -> Floats:
@@ -326,7 +334,7 @@ def _surveyed(
         looked += len(points)
         if told:
             told(f"looking at {counted(looked, 'point')}")
-        return _samples(family, source, rectangle, points)
+        return _samples(deciding, source, rectangle, points)
 
     found = survey(samples, cells=cells)
     if stepped:
@@ -336,7 +344,7 @@ def _surveyed(
             found,
         )
     else:
-        arcs = trace(family, found, tolerance=tolerance, offset=rectangle.offset)
+        arcs = trace(deciding, found, tolerance=tolerance, offset=rectangle.offset)
     area, off = stable_area(arcs, found)
     return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
 
@@ -345,28 +353,30 @@ def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
     if isinstance(source, BatchEvaluator):
         return resolve_family(source, rectangle, partial(matrix_errors, source))
-    if isinstance(source, MeanSquareEvaluator):  # a point takes longer than what a series would save
-        errors = source.errors(rectangle.values(np.array([[0.5, 0.5]])))
-        return DirectFamily(source, rectangle, (1,), tuple(one[0] for one in errors))
+    if isinstance(
+        source, MeanSquareEvaluator | PortEvaluator
+    ):  # a series would take more points than it saves
+        errors = tuple(one[0] for one in source.errors(rectangle.values(np.array([[0.5, 0.5]]))))
+        return DirectFamily(source, rectangle, tuple(len(one) for one in errors), errors)
     if timed:  # each point has a schedule of its own: there are no slopes, and no one size
         return DirectFamily(source, rectangle, (), ())
     return resolve_family(source, rectangle, source.errors)
 
 
-def _samples(family: Family, source: Source, rectangle: Rectangle, points: Floats) -> Floats:
+def _samples(deciding: Deciding, source: Source, rectangle: Rectangle, points: Floats) -> Floats:
     """Return the logarithms of the largest magnitudes, or raise what is wrong with a point."""
-    matrices = family.matrices(points)
+    matrices = deciding.family.matrices(points)
     for one in matrices:
         wrong = np.flatnonzero(~np.isfinite(one).all(axis=(1, 2)))
         if len(wrong):
             value = rectangle.values(points[wrong[:1]])[0].tolist()
             overrides = overrides_at(source.system, source.free, value)
             apply(source.system, overrides)  # says so itself if the value can't be
-            if not isinstance(source, MeanSquareEvaluator):
+            if isinstance(source, BatchEvaluator | PointEvaluator):
                 source.closed_at(value)
             what = "the scene's frame leaves the range of floating point numbers in part of the rectangle"
             raise ApcError(Mistake("E905", PLACE, what, hint="a smaller range"))
-    return log_magnitudes(matrices, BRANCHES)
+    return deciding.log_magnitudes(matrices, BRANCHES)
 
 
 def _curve(source: Source, rectangle: Rectangle, arc: Arc) -> Curve:
@@ -394,7 +404,10 @@ def _relative_error(arc: Arc, offset: Floats) -> float:
 
 def _identify(source: Source, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
-    assert not isinstance(source, MeanSquareEvaluator), "second moments have no mode"
+    assert not isinstance(source, MeanSquareEvaluator), "one number has no mode"
+    if isinstance(source, PortEvaluator):
+        name, hertz, frame_s = source.motion_at(value, abs(float(np.angle(eigenvalue))))
+        return name, 2 * np.pi * hertz * frame_s, frame_s
     found = marginal_motion(with_rigid(source.closed_at(value.tolist())), eigenvalue)
     return found.name, found.turn, found.frame_s
 

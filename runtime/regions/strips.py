@@ -27,7 +27,7 @@ from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace
 from apc.regions.cells import HALVINGS, survey
 from apc.regions.curves import between, refined
-from apc.regions.eigenpairs import largest, log_magnitudes
+from apc.regions.eigenpairs import Eigenvalues, largest, log_magnitudes
 from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
 from apc.vary.counts import count_pieces
 from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
@@ -246,7 +246,7 @@ def _moving(
     if isinstance(family, DirectFamily):
         return None
     found = survey(lambda points: log_magnitudes(family.matrices(points), BRANCHES), cells=cells)
-    arcs = trace(family, found, tolerance=tolerance * (1 - RESTATED), offset=rectangle.offset)
+    arcs = trace(Eigenvalues(family), found, tolerance=tolerance * (1 - RESTATED), offset=rectangle.offset)
     area, off = stable_area(arcs, found)
     offset = rectangle_of(delay, other).offset
     restated = [_restated(arc, ends, tolerance, offset) for arc in arcs]
