@@ -91,10 +91,8 @@ HOUSE = (
     (
         "apc.vary",
         """
-        wiring batch slopes crossings plane bracket counting loops evaluator leading many bends marginal
-        delays lags search counts mean_square critical margins sensitivity over_network
         wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
-        delays lags search mean_square critical margins sensitivity over_network
+        delays lags search counts mean_square critical margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),
