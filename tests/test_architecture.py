@@ -87,7 +87,7 @@ HOUSE = (
         hands errors network box
         """,
     ),
-    ("apc.hands", "port passivity response norms asked answers feel"),
+    ("apc.hands", "port passivity response norms asked answers viscosity feel"),
     (
         "apc.vary",
         """

@@ -14,6 +14,7 @@ import apc
 from apc.__main__ import run
 from apc.analysis.analysis import prepare
 from apc.compiler.errors import ApcError
+from apc.compiler.pipeline import compile_topology
 from apc.hands.feel import feel
 from tests.handled import Users, response
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
@@ -350,3 +351,34 @@ def test_lost_packets_are_left_out_and_that_is_said_first() -> None:
     found = feel(system, [1.0], quick=True)
     assert "packet loss" in str(found).splitlines()[1]
     assert prepare(system) is not None
+
+
+RING = replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
+
+
+@pytest.mark.parametrize(("text", "share"), [(AVERAGE, 1), (MESH, 2), (RING, 2)])
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_what_the_network_adds_to_damping_is_what_dampers_lack(text: str, share: int, count: int) -> None:
+    """Each user has 5 N·s/m at the device and 5 at the copy; K follows from who is heard: 150 N/m each.
+
+    The formula is the first order in the age of what is heard; the rest is the order beyond, some 0.3 %.
+    """
+    system = compiled(replaced(text, ("count: 3", f"count: {count}"), ("stiffness: 500", "stiffness: 150")))
+    found = feel(system, [1.0])
+    assert found.low_frequency is not None
+    assert found.network_viscosity is not None
+    network, off = found.network_viscosity.network, found.network_viscosity.error
+    assert abs(found.low_frequency.damping - 10.0 * count - network) <= off + found.low_frequency.errors[1]
+    heard = 1 if share == 1 else min(2, count - 1) if text == RING else count - 1
+    formula = count * 150.0 * heard * ((0.008 - 0.001) / 2 + 0.008)
+    assert found.network_viscosity.formula == pytest.approx(formula, rel=1e-12)
+    assert network == pytest.approx(formula, rel=0.02)
+
+
+def test_what_arms_hold_has_no_viscosity_by_the_formula() -> None:
+    star = compile_topology(SCENES / "star-lecture.yaml")
+    found = feel(star, [1.0]).network_viscosity
+    assert found is not None
+    assert found.formula is None
+    mixed = compile_topology(SCENES / "mixed-clocks.yaml")
+    assert feel(mixed, [1.0]).network_viscosity is None

@@ -26,6 +26,7 @@ from apc.frame.discretize import UNIT
 from apc.hands.answers import AROUND, Modes, Responses, Weights, open_modes
 from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks_in
 from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
+from apc.hands.viscosity import Viscosity, network_viscosity
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
@@ -96,6 +97,7 @@ class Feel(Result):
     in m/s/N is the other device's velocity by the force here, `error_per_force` in m/N how far the copy of
     the object here is from the mean of the others'. All are complex, the fundamental's. `alias` is the
     largest of what else comes at the device, at frequencies a frame rate apart, beside the fundamental.
+    `network_viscosity` is what of the damping felt comes of the network.
     `bound` is what the impedance may be off by, relatively; `transmitted_bound` and `error_bound` the others.
     """
 
@@ -114,6 +116,7 @@ class Feel(Result):
     transmitted_bound: Floats
     error_bound: Floats
     low_frequency: Slow | None
+    network_viscosity: Viscosity | None
     hinf: tuple[Extremes, ...]
     h2: tuple[Noise, ...]
     stable: bool | None
@@ -176,7 +179,17 @@ def feel(
             1.01 * off / np.where(value == 0, np.inf, np.abs(value)) for value, off in (own, across, error)
         ]
         steady = verdict.stable is not False and not quick
+        viscosity = None
         slow = _slow(responses) if not quick else None
+
+        def damping_of(other_scene: CompiledSystem) -> tuple[float, float] | None:
+            there, _ = open_modes(other_scene, prepare(other_scene), port, other)
+            own = _slow(Responses(there, port.peer, other.peer))
+            return None if own is None else (own.damping, own.errors[1])
+
+        if slow is not None:
+            together = abs(slow.stiffness) <= slow.errors[2]
+            viscosity = network_viscosity(system, (slow.damping, slow.errors[1]), together, damping_of)
         hinf = _extremes(modes, responses) if steady else ()
         h2 = _noise(system, modes, responses) if steady else ()
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
@@ -203,6 +216,7 @@ def feel(
         transmitted_bound=bounds[1],
         error_bound=bounds[2],
         low_frequency=slow,
+        network_viscosity=viscosity,
         hinf=hinf,
         h2=h2,
         stable=verdict.stable,
