@@ -137,9 +137,9 @@ def feel_text(found: Feel) -> str:
             f"  stiffness        {measured(slow.stiffness, slow.errors[2], 'N/m')}",
         ]
         if (network := found.network_viscosity) is not None:
-            told = f"  of the network   {measured(network.network, network.error, 'N*s/m')}"
+            share = f"  of the network   {measured(network.network, network.error, 'N*s/m')}"
             by = "" if network.formula is None else f"; K ((T_n − T_c)/2 + T_d): {network.formula:.5g}"
-            lines.append(told + by)
+            lines.append(share + by)
         lines.append("")
     rows = [("frequency", "impedance", "phase", "arrives", "copies apart", "alias"), *_rows_shown(found)]
     rows.insert(1, ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", ""))
