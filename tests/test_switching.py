@@ -57,11 +57,11 @@ def stiff(text: str, stiffness: float) -> CompiledSystem:
     return apc.set_parameters(compiled(text), {"contact.stiffness": f"{stiffness!r} N/m"})
 
 
-def tick(cube: float = 0.2) -> Floats:
+def tick(cube: float = 0.2, arm: tuple[float, float] = (100.0, 3.0)) -> Floats:
     """Return what a tick makes of (x, v, x_O, v_O) under a held contact force f and coordination force q."""
     rates = np.zeros((6, 6))
     rates[0, 1] = rates[2, 3] = 1.0
-    rates[1, 0], rates[1, 1], rates[1, 4] = -100 / 0.1, -(5 + 3) / 0.1, -1 / 0.1
+    rates[1, 0], rates[1, 1], rates[1, 4] = -arm[0] / 0.1, -(5 + arm[1]) / 0.1, -1 / 0.1
     rates[3, 3], rates[3, 4], rates[3, 5] = -5 / cube, 1 / cube, -1 / cube
     return np.asarray(expm(rates * TICK)[:4])
 
@@ -309,9 +309,9 @@ def test_what_is_proved_to_settle_comes_to_rest_though_a_pattern_at_will_may_gro
     assert found.settles
     assert found.stable is (False if stiffness > 300 else None)
     generator = np.random.default_rng(2)
-    for _ in range(3):
+    for _ in range(2):
         start = generator.normal(size=7 * count) * np.tile([0.05, 0.5, 0.05, 0.5, 0, 0, 0], count)
-        assert settled(count, stiffness, start, 6000, tie=TIES[count]) < 1e-9
+        assert settled(count, stiffness, start, 3000, tie=TIES[count]) < 1e-9
 
 
 @pytest.mark.parametrize("part", [0.5, 0.95, 0.98])
