@@ -284,6 +284,15 @@ def test_the_boundary_for_passive_hands_is_where_an_independent_program_finds_no
             assert min(truth.least(one) for one in np.linspace(1e-3, np.pi, 60)) > -2e-7
 
 
+@pytest.mark.parametrize(("count", "limit"), [(2, 233.1357), (3, 458.242), (5, 895.643)])
+def test_a_critical_stiffness_is_bounded_to_nine_digits(count: int, limit: float) -> None:
+    found = critical(compiled(users(count, 200)), "coordination.stiffness", criterion="passive")
+    (crossing,) = found.crossings
+    assert crossing.value == pytest.approx(limit, rel=5e-7)
+    assert crossing.error < 3e-9 * limit
+    assert crossing.proof == "what hands can draw bounded on either side"
+
+
 def test_region_and_sweep_say_what_critical_does(tmp_path: Path) -> None:
     """At 1000 N/m of contact 458.24 N/m are borne, by an independent program."""
     scene = tmp_path / "three.yaml"

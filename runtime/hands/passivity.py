@@ -41,7 +41,7 @@ CIRCULATES = (
 
 # How far below the least that is found, relatively, what is proved may lie, the first that can be proved; and
 # what part of that a proof may leave over for rounding.
-WIDTHS, SPARED = (1e-9, 1e-7, 1e-5), (0.03, 1e-3)
+WIDTHS, SPARED = (1e-9, 3e-9, 1e-8, 1e-7, 1e-5), (1e-2, 1e-3)
 
 # Two frequencies fit a motion alike, relatively.
 ALIKE = 1e-6

@@ -156,7 +156,9 @@ def trace(deciding: Deciding, found: Survey, *, tolerance: float, offset: Floats
         intervals = _apart(knots, intervals)
         if not len(intervals):
             break
-        intervals = _halve(deciding, knots, intervals, tolerance, offset, guarded=halving == 0)
+        intervals = _halve(
+            deciding, knots, intervals, tolerance, offset, guarded=not halving or deciding.strays
+        )
     for a, b in intervals.tolist():  # given up: the chord is all that is known
         knots.error[a] = max(knots.error[a], float(np.linalg.norm(knots.points[b] - knots.points[a])))
     return _arcs(deciding, knots, found.closed, tolerance, offset)

@@ -56,6 +56,10 @@ class Deciding(Protocol):
     def family(self) -> Family:
         """The matrices that it follows from."""
 
+    @property
+    def strays(self) -> bool:
+        """Whether a good guess may lead to another than it meant."""
+
     def log_magnitudes(self, matrices: Sequence[Floats], count: int) -> Floats:
         """Return the logarithms of the `count` largest magnitudes (k, count) of such matrices, descending."""
 
@@ -124,6 +128,7 @@ class Eigenvalues:
     """A `Deciding` of closed systems: their eigenvalues."""
 
     family: Family
+    strays: bool = False
 
     def log_magnitudes(self, matrices: Sequence[Floats], count: int) -> Floats:
         """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""

@@ -88,7 +88,7 @@ class _Loops:
 
     def inner(self, angles: Floats) -> Complexes:
         """Return z − A_s at one angle a point (k, n, n)."""
-        return np.exp(1j * angles)[:, None, None] * np.eye(self.a.shape[-1]) - self.a
+        return np.asarray(np.exp(1j * angles)[:, None, None] * np.eye(self.a.shape[-1]) - self.a)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +101,7 @@ class Peaks:
     family: Family
     ports: tuple[int, ...]
     damping: float
+    strays: bool = True
 
     def log_magnitudes(self, matrices: Sequence[Floats], count: int) -> Floats:
         """Return the logarithms of the `count` highest peaks (k, count) of maps, one of each, descending."""
@@ -167,14 +168,18 @@ class Peaks:
         values = np.linalg.eigvals(loops.a)
         slowest = np.take_along_axis(values, np.abs(values).argmax(axis=1)[:, None], axis=1)
         ends = np.tile([0.0, np.pi], (len(matrix), 1))
-        best, where = _top(loops, np.concatenate([ends, np.abs(np.angle(slowest))], axis=1))
+        angles = np.concatenate([ends, np.abs(np.angle(slowest))], axis=1)
+        gains = loops.gains(angles)
+        best, where = _largest(gains, angles)
+        turn = gains[:, 0] < gains[:, 1]
         radius = np.abs(values).max(axis=1, initial=0.0)
         rest = np.flatnonzero(radius < 1)
         for _ in range(LEVELS):
-            at = _on_circle(loops.at(rest), best[rest] * (1 + ABOVE))
+            at = _on_circle(loops.at(rest), turn[rest], best[rest] * (1 + ABOVE))
             crossed = np.isfinite(at).any(axis=1)
             rest, at = rest[crossed], at[crossed]
-            height, angle = _top(loops.at(rest), _middles(at))
+            angles = _middles(at)
+            height, angle = _largest(loops.at(rest).gains(angles), angles)
             higher = height > best[rest] * (1 + ABOVE)
             rest = rest[higher]
             if not len(rest):
@@ -272,11 +277,10 @@ def _at(loops: _Loops, angle: Floats) -> _Height:
     return _Height(x, x_angle, s, s_angle, squares, vectors, mixing, others[:, -1].real, bend)
 
 
-def _top(loops: _Loops, angles: Floats) -> tuple[Floats, Floats]:
-    """Return the highest gain (k,) at angles (k, q), and where it is."""
-    gains = loops.gains(angles)
+def _largest(gains: Floats, angles: Floats) -> tuple[Floats, Floats]:
+    """Return the largest of each row (k, q), and its angle."""
     place = np.argmax(gains, axis=1)
-    rows = np.arange(len(angles))
+    rows = np.arange(len(gains))
     return gains[rows, place], angles[rows, place]
 
 
@@ -295,16 +299,25 @@ def _folded(angle: Floats) -> Floats:
     return np.asarray(np.abs((angle + np.pi) % (2 * np.pi) - np.pi))
 
 
-def _on_circle(loops: _Loops, level: Floats) -> Floats:
-    """Return the angles (k, q), in order, at which the gain of each map is a level (k,), NaN behind them."""
+def _on_circle(loops: _Loops, turn: NDArray[np.bool_], level: Floats) -> Floats:
+    """Return the angles (k, q), in order, at which the gain of each map is a level (k,), NaN behind them.
+
+    The level is larger than the gain at π, or at 0 of those to `turn`.
+
+    Notes
+    -----
+    With z = (1 + s)/(1 − s), or of −A and −B, that end becomes the point at infinity.
+    """
     count, n = loops.a.shape[:2]
     if not n:
         return np.full((count, 1), np.nan)
     unit = np.eye(n)
-    inverse = np.linalg.inv(unit + loops.a)
+    sign = np.where(turn, -1.0, 1.0)[:, None, None]
+    a, b = sign * loops.a, sign * loops.bf
+    inverse = np.linalg.inv(unit + a)
     c, d = -2 * loops.b * loops.fc, 2 * loops.b * loops.f - np.eye(loops.f.shape[-1])
-    a_c, b_c, c_c = inverse @ (loops.a - unit), np.sqrt(2) * inverse @ loops.bf, np.sqrt(2) * c @ inverse
-    d_c = d - c @ inverse @ loops.bf
+    a_c, b_c, c_c = inverse @ (a - unit), np.sqrt(2) * inverse @ b, np.sqrt(2) * c @ inverse
+    d_c = d - c @ inverse @ b
     across = np.swapaxes(d_c, -1, -2)
     r = np.linalg.inv(level[:, None, None] ** 2 * np.eye(d_c.shape[-1]) - across @ d_c)
     a_h = a_c + b_c @ r @ across @ c_c
@@ -318,7 +331,8 @@ def _on_circle(loops: _Loops, level: Floats) -> Floats:
     )
     at = np.linalg.eigvals(whole)
     on = (np.abs(at.real) <= ON_AXIS * np.abs(at)) & (at.imag >= 0)
-    found = np.sort(np.where(on, 2 * np.arctan(at.imag), np.nan), axis=1)
+    angles = 2 * np.arctan(at.imag)
+    found = np.sort(np.where(on, np.where(turn[:, None], np.pi - angles, angles), np.nan), axis=1)
     return found[:, : max(int(on.sum(axis=1).max(initial=0)), 1)]
 
 
