@@ -337,31 +337,36 @@ def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) ->
     """Return the slopes of an affine function as balls; they must be what it multiplies its inputs by."""
     import flint
 
-    whole = np.hstack(slopes)
+    whole, given = np.hstack(slopes), [_rational(one) for one in p]
 
-    def values(probe: NDArray[np.int64]) -> list[Fraction]:
+    def values(probe: NDArray[np.int64]) -> list[Any]:
         arguments, first = [], 0
         for size in (one.shape[1] for one in slopes):
-            arguments.append([Fraction(one) for one in probe[first : first + size].tolist()])
+            arguments.append([flint.fmpq(one) for one in probe[first : first + size].tolist()])
             first += size
-        return evaluate_exact(function, [*arguments, p, [Fraction(0)]])[0]
+        return evaluate_exact(function, [*arguments, given, [flint.fmpq(0)]], number=_rational)[0]
 
-    filled: list[list[tuple[int, Fraction]]] = [[] for _ in whole]
+    filled: list[list[tuple[int, Any]]] = [[] for _ in whole]
     for row, column in np.argwhere(whole.astype(np.bool_)).tolist():
-        filled[row].append((column, whole[row, column]))
+        filled[row].append((column, _rational(whole[row, column])))
     still = values(np.zeros(whole.shape[1], np.int64))
-    sizes = [max((abs(one) for _, one in row), default=Fraction(0)) for row in filled]
+    sizes = [max((abs(one) for _, one in row), default=flint.fmpq(0)) for row in filled]
+    rounding = _rational(COEFFICIENT_ROUNDINGS * UNIT)
     for probe in _probes(whole.shape[1]):
         many, inputs = int(probe.sum()), probe.tolist()
         for terms, size, before, after in zip(filled, sizes, still, values(probe), strict=True):
-            expected = sum((one * inputs[column] for column, one in terms if inputs[column]), Fraction(0))
-            assert abs(after - before - expected) <= COEFFICIENT_ROUNDINGS * Fraction(UNIT) * many * size, (
+            expected = sum((one * inputs[column] for column, one in terms if inputs[column]), flint.fmpq(0))
+            assert abs(after - before - expected) <= rounding * many * size, (
                 f"the slopes of {function.name()} are not what it multiplies its inputs by"
             )
-    return [
-        [(column, flint.arb(flint.fmpq(one.numerator, one.denominator))) for column, one in row]
-        for row in filled
-    ]
+    return [[(column, flint.arb(one)) for column, one in row] for row in filled]
+
+
+def _rational(value: Fraction | float) -> Any:
+    """Return a number as FLINT's rational, which computes ten times as fast as Python's."""
+    import flint
+
+    return flint.fmpq(*value.as_integer_ratio())
 
 
 def _sums(rows: Rows, vector: list[Any]) -> list[Any]:
