@@ -80,8 +80,8 @@ def feel_command(
     start_single_threaded()
     from apc.hands.feel import feel, read_frequencies
     from apc.inputs import open_scene
-    from apc.present.hands import check_feel_path, write_feel
-    from apc.present.pictures import FORMATS
+    from apc.present.hands import write_feel
+    from apc.present.pictures import FORMATS, check_result_path
 
     first, colon, second = between.partition(":")
     if at and colon and at != first:
@@ -89,7 +89,7 @@ def feel_command(
     if nyquist and (out is None or out.suffix.lower() not in FORMATS):
         raise click.UsageError(f"--nyquist is for a picture: --out with {', '.join(FORMATS)}")
     if out is not None:
-        check_feel_path(out)
+        check_result_path(out)
     system = open_scene(file, settings, {"--out": out})
     found = feel(
         system,
