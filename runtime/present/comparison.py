@@ -96,7 +96,7 @@ def _table(headings: tuple[str, ...], cells: Sequence[tuple[str, ...]]) -> list[
     for row in rows:
         first = "  " + "".join(f"{cell:<{width}}  " for cell, width in zip(row[:-1], widths, strict=True))
         if row[-1] and len(first) + len(row[-1]) > WIDTH:
-            lines += wrapped(row[-1], first, " " * min(len(first), WIDTH // 2))
+            lines += wrapped(row[-1], first, " " * 5)
         elif any(row):
             lines.append(f"{first}{row[-1]}".rstrip())
     return lines
