@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 FREQUENCIES = (1.0, 10.0)  # Hz, at which is told what a hand feels
 
+NO_DEVICE = "E931"
+
 _Found = TypeVar("_Found")
 
 
@@ -42,8 +44,8 @@ class Scheme:
 
     `analysis` and `network` (None where all packets are on time, or are taken to be) are those of `analyze`;
     `passive` that of `analyze --hands passive`, where stable means that. `stiffness`, `delay` and `loss` are
-    those of `critical`; `feel` that of `feel` at `FREQUENCIES`, at the first peer's device. `missing` says
-    why a part is None, by its name.
+    those of `critical`; `feel` that of `feel` at `FREQUENCIES`, at the device of the first peer that has one.
+    `missing` says why a part is None, by its name.
     """
 
     topology: str
@@ -181,10 +183,24 @@ def _scheme(
         stiffness=crossing(STIFFNESS),
         delay=crossing(DELAY),
         loss=crossing(LOSS),
-        feel=had("feel", "apc feel", lambda: feel(system, FREQUENCIES, quick=True, prepared=prepared)),
+        feel=had("feel", "apc feel", lambda: _feel(system, prepared)),
         effort=effort(system),
         missing=tuple(missing.items()),
     )
+
+
+def _feel(system: CompiledSystem, prepared: Prepared) -> Feel:
+    """Return what is felt at the first device there is: a server has none."""
+    refused: ApcError | None = None
+    for group in system.groups:
+        try:
+            return feel(system, FREQUENCIES, at=f"{group.name}[1]", quick=True, prepared=prepared)
+        except ApcError as error:
+            if error.mistakes[0].code != NO_DEVICE:
+                raise
+            refused = refused or error
+    assert refused is not None
+    raise refused
 
 
 def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:
