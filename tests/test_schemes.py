@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
+import casadi
 import pytest
 
 import apc
@@ -207,7 +207,7 @@ def test_power_into_the_line_is_half_the_outgoing_square_less_half_the_incoming(
         r = [heard if one.name.endswith("wave)") else 0.0 for one in clock.receives]
         p = [value[name] for name in kind.parameters]
         y = clock.tick(x, [0.0] * len(kind.holds), [point], r, p, 0)
-        found = dict(zip(clock.outputs, map(float, np.ravel(y)), strict=True))
+        found = dict(zip(clock.outputs, casadi.DM(y).full().ravel().tolist(), strict=True))
         f, out = found["coordination.f"], found["coordination.out"]
         v = (found["coordination.p"] - point) / 1e-3
         assert (out**2 - heard**2) / 2 == pytest.approx(f * v, rel=1e-9, abs=1e-12)
@@ -288,7 +288,7 @@ def test_a_scaled_device_is_one_of_another_mass() -> None:
 
 
 def test_weight_and_gravity_compensation_let_a_box_hang_where_springs_hold_it() -> None:
-    """`Weight` and `GravityCompensation`: each arm carries its copy, and what the motor leaves of its device."""
+    """`Weight` and `GravityCompensation`: each arm carries its copy and what a motor leaves of a device."""
     weight = 9.80665 * (0.3 + 0.3 - 0.27)
     run = apc.simulate(compiled(scene("lifted-box")), signals=["*.x"], jit=False)
     below = -weight / 200

@@ -19,6 +19,8 @@ from apc.comparison.effort import Effort, effort
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
+from apc.frame.devices import find_device
+from apc.frame.parameters import resolve
 from apc.hands.feel import Feel, feel
 from apc.moments.network import NetworkVerdict, judge_network
 from apc.result import Result
@@ -33,7 +35,6 @@ if TYPE_CHECKING:
 
 FREQUENCIES = (1.0, 10.0)  # Hz, at which is told what a hand feels
 
-NO_DEVICE = "E931"
 
 _Found = TypeVar("_Found")
 
@@ -191,16 +192,14 @@ def _scheme(
 
 def _feel(system: CompiledSystem, prepared: Prepared) -> Feel:
     """Return what is felt at the first device there is: a server has none."""
-    refused: ApcError | None = None
-    for group in system.groups:
-        try:
-            return feel(system, FREQUENCIES, at=f"{group.name}[1]", quick=True, prepared=prepared)
-        except ApcError as error:
-            if error.mistakes[0].code != NO_DEVICE:
-                raise
-            refused = refused or error
-    assert refused is not None
-    raise refused
+    unit_of, numbers = {one.name: one.unit for one in system.parameters}, resolve(system)
+    holding = [
+        group.name
+        for place, group in enumerate(system.groups)
+        if find_device(prepared.jacobians[group.kind], numbers.parameters[place][0], unit_of) is not None
+    ]
+    at = f"{holding[0]}[1]" if holding else ""
+    return feel(system, FREQUENCIES, at=at, quick=True, prepared=prepared)
 
 
 def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:
