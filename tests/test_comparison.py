@@ -18,7 +18,7 @@ from apc.comparison.comparison import FREQUENCIES, Comparison, compare
 from apc.comparison.effort import effort
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
 
 LOSSLESS = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 0 %}"))
 LOSSY = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 10 %}"))
@@ -317,6 +317,16 @@ def test_a_table_has_a_row_a_scheme_and_a_picture_is_the_same_each_time(
     assert texts[4] == "> 64"
     assert texts[6:8] == ["–", "–"]
     capsys.readouterr()
+
+
+def test_a_bar_without_end_leaves_room_for_the_others() -> None:
+    pytest.importorskip("matplotlib")
+    waves = compiled((SCENES / "two-users-waves.yaml").read_text(encoding="utf-8"))
+    figure = compare([compiled(MESH), waves]).plot()
+    stiffness = figure.axes[1]
+    mesh, endless = (bar.get_width() for bar in stiffness.patches)
+    assert 1.1 < endless / mesh < 1.5
+    assert [text.get_text() for text in stiffness.texts] == ["548.2", "> 5e+05"]
 
 
 def test_one_file_at_fault_is_told_as_everywhere(

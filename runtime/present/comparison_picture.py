@@ -25,12 +25,13 @@ STYLES = (
     ("#000000", ""),
     ("#0072B2", "////"),
     ("#D55E00", "\\\\\\\\"),
-    ("#009E73", "...."),
+    ("#009E73", "||||"),
     ("#CC79A7", "xxxx"),
     ("#E69F00", "----"),
 )
 COLUMNS = 4  # panels beside each other
 PANEL, BAR = 2.4, 0.28  # inches: the width of a panel, the height of a bar
+FURTHER = 1.25  # times the longest bar that ends, to which one that doesn't is drawn at most
 LABEL = 24  # letters of a scheme's name in a line
 
 # A bar: its length, and whether it goes on beyond that; or a word where there is none.
@@ -96,7 +97,10 @@ def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
     ax.tick_params(labelsize=8)
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(axis="y", length=0)
-    longest = max((bar[0] for bar in bars if not isinstance(bar, str)), default=0.0)
+    known = [bar for bar in bars if not isinstance(bar, str)]
+    ended = max((length for length, on in known if not on), default=0.0)
+    # What ends nowhere may be looked at a thousand times as far, and would leave no room for the others.
+    longest = max((min(one, FURTHER * ended or one) if on else one for one, on in known), default=0.0)
     ax.set_xlim(0, 1.3 * longest if longest else 1.0)
     ax.set_ylim(-0.6, len(bars) - 0.4)
     ax.locator_params(axis="x", nbins=4)
@@ -107,8 +111,9 @@ def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
             continue
         length, on = bar
         face = colour if not hatch else "white"
-        ax.barh(place, length, height=0.6, facecolor=face, edgecolor=colour, hatch=hatch, linewidth=0.8)
-        _write(ax, f"{'> ' if on else ''}{length:.4g}", length, place)
+        drawn = min(length, longest)
+        ax.barh(place, drawn, height=0.6, facecolor=face, edgecolor=colour, hatch=hatch, linewidth=0.8)
+        _write(ax, f"{'> ' if on else ''}{length:.4g}", drawn, place)
 
 
 def _write(ax: Any, text: str, x: float, y: int) -> None:
