@@ -18,6 +18,9 @@ from .api import (
     buzz as buzz,
 )
 from .api import (
+    compare as compare,
+)
+from .api import (
     compile as compile,
 )
 from .api import (
@@ -81,6 +84,7 @@ from .api import (
     with_hands as with_hands,
 )
 from .benchmark.bench import Bench as Bench
+from .comparison.comparison import Comparison as Comparison
 from .compiler.compiled import CompiledSystem as CompiledSystem
 from .compiler.errors import ApcError as ApcError
 from .hands.feel import Feel as Feel

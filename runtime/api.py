@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from apc.analysis.paper import PaperRoute
     from apc.analysis.switching import Switching
     from apc.benchmark.bench import Bench
+    from apc.comparison.comparison import Comparison
     from apc.hands.feel import Feel
     from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
@@ -220,6 +221,42 @@ def critical(
     from apc.vary import critical as crossings
 
     return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper, criterion=criterion)
+
+
+def compare(
+    models: Sequence[CompiledSystem | str | Path],
+    *,
+    set: Mapping[str, str] | None = None,
+    over: Sequence[str] = (),
+    criterion: Criterion | None = None,
+) -> Comparison:
+    """Put schemes side by side: verdicts, largest stable stiffness, delay, loss, what is felt, what it costs.
+
+    Parameters
+    ----------
+    models
+        Several of what `analyze` takes.
+    set
+        As for `analyze`, of all of them.
+    over
+        Which stiffness, delay or loss is looked at, where a model has several; each takes those it has.
+    criterion
+        As for `critical`.
+
+    Returns
+    -------
+    Comparison
+        Its `.schemes`, each with the results of `analyze`, `critical` and `feel` that it is made of;
+        `.to_dataframe()`, `.plot()`.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.comparison import comparison
+
+    return comparison.compare([_model(one, set) for one in models], over=over, criterion=criterion)
 
 
 def passive_hands(

@@ -105,6 +105,7 @@ HOUSE = (
         """,
     ),
     ("apc", "answer"),
+    ("apc.comparison", "effort choice comparison"),
     (
         "apc.regions",
         """
@@ -115,14 +116,17 @@ HOUSE = (
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",
-        "forms pictures network hands analysis vary region_picture region simulation still recording bench",
+        """
+        forms pictures network hands analysis vary comparison_picture comparison region_picture region
+        simulation still recording bench
+        """,
     ),
     # what a person calls
     (
         "apc",
         "inputs api",
     ),
-    ("apc.cli", "options progress region simulate sweep critical feel bench analyze commands"),
+    ("apc.cli", "options progress region simulate sweep compare critical feel bench analyze commands"),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())

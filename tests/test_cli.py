@@ -23,6 +23,7 @@ COMMANDS = (
         "compile",
         "show",
         "analyze",
+        "compare",
         "critical",
         "region",
         "simulate",

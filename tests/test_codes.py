@@ -179,8 +179,10 @@ E931 runtime/frame runtime/hands: a peer has no device, or several that a hand m
 E932 runtime/frame: a scene has hands already
 E933 runtime/hands: a device can't be cut out of its scene, or the scene is too large for it
 E934 runtime/hands: an unstable scene has no response in time
-E935 runtime/hands: a frequency is none that a response is told of
+E935 runtime/hands: a frequency is none that a response is told of, or nothing ticks
 E936 runtime/hands: a device is named that is not there
+E940 runtime/comparison: what is to be compared is no stiffness, delay or loss
+E941 runtime/comparison: a scene has several stiffnesses, delays or losses to compare
 """
 
 

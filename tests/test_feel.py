@@ -280,6 +280,15 @@ def test_what_can_t_be_felt_is_refused(options: dict[str, object], code: str) ->
         feel(compiled(AVERAGE), **options)  # type: ignore[arg-type] # of several kinds
 
 
+def test_a_scene_in_which_nothing_ticks_is_refused_by_name() -> None:
+    with pytest.raises(ApcError) as caught:
+        feel(compiled(ONE_MASS), [1.0])
+    assert str(caught.value) == (
+        "scene.yaml: E935 has nothing that ticks, and what is felt is told of samples and held forces. "
+        "Write: a coupler with a clock, as SampledSpringDamper"
+    )
+
+
 def test_a_peer_without_a_device_is_told_so() -> None:
     text = "topology: bare\nclocks: {tick: 8 ms, fast: 1 ms}\npeers: {user: {count: 2}}\n" + (
         "masses: {cube: {mass: 1 kg, damping: 1 N*s/m, shared: true}}\n"

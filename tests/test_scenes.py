@@ -17,11 +17,18 @@ COMMON = "stable up to a common translation"
 # Verdict and rigid modes of the scenes on a complete graph; at their start values, where they are not linear.
 VERDICTS = {
     "finger": ("stable", 0),
+    "lifted-box": ("stable", 0),
     "lossy-average": (COMMON, 1),
     "mixed-clocks": (COMMON, 1),
     "template": (COMMON, 1),
     "three-users-average": (COMMON, 1),
+    "three-users-predicted": (COMMON, 1),
     "three-users-mesh": (COMMON, 1),
+    "two-handed-tool": (COMMON, 3),  # and at each user the hands apart from each other
+    "two-users-damped": (COMMON, 1),
+    "two-users-filtered-waves": (COMMON, 1),
+    "two-users-waves": (COMMON, 2),  # positions drift apart
+    "unlike-devices": (COMMON, 1),
     "users-table": ("stable", 0),
 }
 

@@ -15,6 +15,7 @@ import click
 
 from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
+from apc.cli.compare import compare_command
 from apc.cli.critical import critical_command
 from apc.cli.feel import feel_command
 from apc.cli.options import Group, beside, file_argument, file_option, tell
@@ -64,6 +65,7 @@ def apc() -> None:
         apc compile        check it and turn it into topology.apc
         apc analyze        stable or not, by how much, in which modes
         apc critical       the largest stable value of a parameter
+        apc compare        schemes side by side: the same asked of several files
         apc feel           what a hand feels at its device, at each frequency
         apc simulate       what happens over time, as rows and a picture
         apc region         where it is stable over two parameters: curves, areas
@@ -76,6 +78,7 @@ def apc() -> None:
 
 apc.add_command(analyze_command)
 apc.add_command(bench_command)
+apc.add_command(compare_command)
 apc.add_command(critical_command)
 apc.add_command(feel_command)
 apc.add_command(simulate_command)

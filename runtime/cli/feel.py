@@ -88,8 +88,8 @@ def feel_command(
     from apc.hands.asked import read_frequencies
     from apc.hands.feel import feel
     from apc.inputs import open_scene
-    from apc.present.hands import check_feel_path, write_feel
-    from apc.present.pictures import FORMATS
+    from apc.present.hands import write_feel
+    from apc.present.pictures import FORMATS, check_result_path
 
     given = [name for name in _SPANNED if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
     if frequencies is not None and given:
@@ -101,7 +101,7 @@ def feel_command(
     if nyquist and (out is None or out.suffix.lower() not in FORMATS):
         raise click.UsageError(f"--nyquist is for a picture: --out with {', '.join(FORMATS)}")
     if out is not None:
-        check_feel_path(out)
+        check_result_path(out)
     system = open_scene(file, settings, {"--out": out}, told=note_aside)
     found = feel(
         system,

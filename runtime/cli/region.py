@@ -100,11 +100,12 @@ def region_command(
     """
     start_single_threaded()
     from apc.inputs import open_scene
-    from apc.present.region import check_region_path, write_panels
+    from apc.present.pictures import check_result_path
+    from apc.present.region import write_panels
     from apc.regions.panels import compare_regions, parse_panel, parse_vary
 
     if out is not None:
-        check_region_path(out)
+        check_result_path(out)
     if vary and panels:
         what = "--vary and --panel both say what the panels are: one of them is enough"
         raise ApcError(Mistake("E907", Place("region"), what))

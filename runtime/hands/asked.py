@@ -100,7 +100,7 @@ def read_frequencies(
     Raises
     ------
     ApcError
-        E935 none above 0, or the lowest above the highest; those of `option_value`.
+        E935 none above 0, the lowest above the highest, or nothing that ticks; those of `option_value`.
     """
     if listed is not None:
         texts = [one.strip() for one in listed.split(",") if one.strip()]
@@ -129,7 +129,12 @@ def _fastest_clock(system: CompiledSystem) -> tuple[Fraction, Fraction]:
     """Return the period and phase of the fastest clock that anything uses, in seconds."""
     timings = resolve(system).timings
     used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
-    clock = min((one for one in system.clocks if one.name in used), key=lambda one: timings[one.period])
+    clocks = [one for one in system.clocks if one.name in used]
+    if not clocks:
+        what = "has nothing that ticks, and what is felt is told of samples and held forces"
+        hint = "a coupler with a clock, as SampledSpringDamper"
+        raise ApcError(Mistake("E935", Place(system.origin.topology), what, hint=hint))
+    clock = min(clocks, key=lambda one: timings[one.period])
     return timings[clock.period], timings[clock.phase]
 
 

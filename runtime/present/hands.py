@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.files import check_target, write_text
+from apc.compiler.files import write_text
 from apc.compiler.words import known_digits, measured, wrapped
 from apc.distribution import program_version
 from apc.optional import need
 from apc.present.forms import document, json_text, note
-from apc.present.pictures import FORMATS, write_figure
-from apc.suffixes import check_suffix
-from apc.tables import SUFFIXES, Column, Row, blocks_of, check_table_path, write_table
+from apc.present.pictures import FORMATS, check_result_path, write_figure
+from apc.tables import SUFFIXES, Column, Row, blocks_of, write_table
 
 if TYPE_CHECKING:
     from apc.hands.feel import Extremes, Feel
@@ -268,20 +267,9 @@ def feel_picture(found: Feel, kind: str = "bode") -> Any:
     return figure
 
 
-def check_feel_path(path: Path) -> str:
-    """Refuse a file that can't be written, or of no known format; return its suffix."""
-    suffix = check_suffix(path, (*FORMATS, *SUFFIXES, ".json"), "--out")
-    check_target(path)
-    if suffix in SUFFIXES:
-        check_table_path(path, "--out")
-    elif suffix in FORMATS:
-        need("matplotlib.figure", "plot")
-    return suffix
-
-
 def write_feel(path: Path, found: Feel, *, nyquist: bool = False) -> None:
     """Write responses to a picture, a table or JSON, by the suffix."""
-    suffix = check_feel_path(path)
+    suffix = check_result_path(path)
     if suffix in FORMATS:
         write_figure(feel_picture(found, "nyquist" if nyquist else "bode"), path)
     elif suffix in SUFFIXES:

@@ -1,6 +1,6 @@
 """What all pictures share: their formats, and how a figure becomes a file.
 
-Takes: a matplotlib Figure and a path. Gives: `FORMATS`, `check_format`, `write_figure`.
+Takes: a matplotlib Figure and a path. Gives: `FORMATS`, `check_format`, `check_result_path`, `write_figure`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all.
 Does not: draw, or need a display.
 
@@ -12,9 +12,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.files import write_file
+from apc.compiler.files import check_target, write_file
 from apc.optional import need
 from apc.suffixes import check_suffix
+from apc.tables import SUFFIXES, check_table_path
 
 FORMATS = (".png", ".svg", ".pdf")
 DPI = 150
@@ -24,6 +25,23 @@ def check_format(path: Path, option: str = "--plot") -> None:
     """Refuse a picture that can't be drawn: E878 no such format, E875 matplotlib is not installed."""
     check_suffix(path, FORMATS, option)
     need("matplotlib", "plot")
+
+
+def check_result_path(path: Path) -> str:
+    """Refuse a file that can be no picture, table or JSON, or not be written here; return its suffix.
+
+    Raises
+    ------
+    ApcError
+        E878 the suffix, E601 the place, E887 or E875 a library that is missing.
+    """
+    suffix = check_suffix(path, (*FORMATS, *SUFFIXES, ".json"), "--out")
+    check_target(path)
+    if suffix in SUFFIXES:
+        check_table_path(path, "--out")
+    elif suffix in FORMATS:
+        need("matplotlib.figure", "plot")
+    return suffix
 
 
 def write_figure(figure: Any, path: Path) -> None:

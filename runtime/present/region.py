@@ -1,7 +1,7 @@
 """Stable regions as text, plain data, tables and files.
 
 Takes: a `Region`, or `Panels` of them, and a path.
-Gives: their texts, documents, tables and pictures; `check_region_path`, `write_panels`.
+Gives: their texts, documents, tables and pictures; `write_panels`.
 Guarantees: a text says what was not looked for. A file that can't be written is refused before anything is
 computed, as far as that can be known, and written whole or not at all.
 Does not: compute, or draw itself (see `region_picture`).
@@ -17,17 +17,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.files import check_target, write_text
+from apc.compiler.files import write_text
 from apc.compiler.timings import part
 from apc.compiler.words import known_digits, measured, with_unit
 from apc.distribution import program_version
 from apc.optional import need
 from apc.present.analysis import range_document
 from apc.present.forms import MEANT, document, json_text, note
-from apc.present.pictures import FORMATS, write_figure
+from apc.present.pictures import FORMATS, check_result_path, write_figure
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
-from apc.suffixes import check_suffix
-from apc.tables import SUFFIXES, Column, Row, blocks_of, check_table_path, write_table
+from apc.tables import SUFFIXES, Column, Row, blocks_of, write_table
 
 if TYPE_CHECKING:
     import pandas
@@ -175,27 +174,10 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
     }
 
 
-def check_region_path(path: Path) -> str:
-    """Refuse a file that can't be written here, or of no known format; return the suffix of its format.
-
-    Raises
-    ------
-    ApcError
-        E878 the suffix, E601 the place, E887 or E875 a library that is missing.
-    """
-    suffix = check_suffix(path, (*FORMATS, *SUFFIXES, ".json"), "--out")
-    check_target(path)
-    if suffix in SUFFIXES:
-        check_table_path(path, "--out")
-    elif suffix in FORMATS:
-        need("matplotlib.figure", "plot")
-    return suffix
-
-
 @part("draw")
 def write_panels(path: Path, found: Panels) -> None:
     """Write regions to a file, its format chosen by the suffix. Raises ApcError E601 if it can't."""
-    suffix = check_region_path(path)
+    suffix = check_result_path(path)
     if suffix in FORMATS:
         write_figure(found.plot(), path)
     elif suffix in SUFFIXES:

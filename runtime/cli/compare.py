@@ -1,0 +1,84 @@
+"""The command `apc compare`.
+
+Takes: words of a command line. Gives: text on stdout.
+Guarantees: with --json, stdout holds one JSON document and nothing else; a file that can't be written is
+refused before anything is computed; how far the work is goes to a terminal only.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from apc.cli.options import (
+    Command,
+    beside,
+    criterion_with,
+    file_option,
+    hands_option,
+    in_option,
+    json_option,
+    print_result,
+    set_option,
+    tell,
+)
+from apc.cli.progress import status_line
+from apc.threads import start_single_threaded
+
+
+@click.command("compare", cls=Command)
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option(
+    "--over",
+    multiple=True,
+    metavar="PATH",
+    help="Which stiffness, delay or loss is looked at, where a scene has several. May be repeated; a scene "
+    "takes those it has.",
+)
+@set_option
+@in_option
+@hands_option
+@file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
+@json_option
+def compare_command(
+    files: tuple[str, ...],
+    over: tuple[str, ...],
+    settings: tuple[str, ...],
+    criterion: str | None,
+    hands: str,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Put schemes side by side: the same questions asked of several scenes.
+
+    Of each FILE, a topology or a compiled model: the verdict and spectral
+    radius of `apc analyze`; the largest stable stiffness of what couples it
+    to others, and the delay and loss of the link that break it, as `apc
+    critical` finds them; what the first peer's hand feels at 1 and 10 Hz, of
+    `apc feel`; how much a tick computes and how many numbers are sent. --set,
+    --in and --hands hold for all files. (To lay the stable regions of scenes
+    over each other: apc region --compare.)
+
+    \b
+        apc compare average.yaml mesh.yaml --set "lan.delay=16 ms" \\
+                    --out schemes.svg
+    """
+    start_single_threaded()
+    from apc.comparison.comparison import compare
+    from apc.inputs import open_scene
+    from apc.present.comparison import write_comparison
+    from apc.present.pictures import check_result_path
+
+    if out is not None:
+        check_result_path(out)
+    asked = criterion_with(hands, criterion)
+    systems = [open_scene(file, settings, {"--out": out}, hands=hands) for file in files]
+    with status_line() as told:
+        found = compare(systems, over=over, criterion=asked, told=told)
+    if out is not None:
+        write_comparison(out, found)
+    print_result(found, as_json=as_json, err=beside(out))
+    if out is not None and not as_json:
+        tell(f"\n{out} is written", err=beside(out))

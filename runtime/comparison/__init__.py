@@ -1,0 +1,1 @@
+"""Schemes beside each other: the same questions asked of several scenes."""

@@ -1,0 +1,154 @@
+"""Which stiffness, delay and loss of a scene a comparison looks at.
+
+Takes: a `CompiledSystem`, and names that a person gave.
+Gives: `Choice`, `choose`, `check_over`; `STIFFNESS`, `DELAY`, `LOSS`.
+Guarantees: found by structure (units, and who hears whom), never by what a part is called; where several
+could be meant, none is taken.
+Does not: vary them (see `vary.critical`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
+from apc.frame.names import Free, find, named_times, unit_of
+from apc.frame.parameters import scope_of
+from apc.network.nominal import channel_numbers
+
+STIFFNESS, DELAY, LOSS = "stiffness", "delay", "loss"
+
+# Units of a stiffness, as components write them.
+UNITS = ("N/m", "kg/s^2")
+
+_PLACE = Place("--over")
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What is varied, under the name that a command takes; "" where nothing is, and then `why`."""
+
+    name: str
+    why: str = ""
+
+
+def check_over(systems: Sequence[CompiledSystem], over: Iterable[str]) -> None:
+    """Refuse a name that no scene knows, or that is no stiffness, delay or loss.
+
+    Parameters
+    ----------
+    systems
+        The compiled scenes.
+    over
+        The names given.
+
+    Raises
+    ------
+    ApcError
+        E622 no scene has such a parameter, E940 it is another quantity.
+    """
+    for name in over:
+        refused: list[ApcError] = []
+        for system in systems:
+            try:
+                _axis(system, find(system, name, _PLACE))
+            except ApcError as error:
+                refused.append(error)
+        if len(refused) == len(systems):
+            raise refused[0]
+
+
+def choose(system: CompiledSystem, over: Sequence[str]) -> dict[str, Choice]:
+    """Return which stiffness, delay and loss of a scene are varied.
+
+    Those that are named; else the stiffness of the coupler that hears others, the delay of the link over
+    which it does, and the loss of that; the numbers that these follow from, where they follow from others.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    over
+        Names of what is to be varied; those that this scene has not are left aside.
+
+    Raises
+    ------
+    ApcError
+        E941 several could be meant.
+    """
+    named: dict[str, list[str]] = {STIFFNESS: [], DELAY: [], LOSS: []}
+    for name in over:
+        try:
+            free = find(system, name, _PLACE)
+            named[_axis(system, free)].append(free.label)
+        except ApcError:
+            continue  # it is another scene's, see `check_over`
+    return {axis: _only(system, axis, named[axis] or _found(system, axis)) for axis in named}
+
+
+def _axis(system: CompiledSystem, free: Free) -> str:
+    """Return what a parameter is. Raises ApcError E940 if it is nothing that is compared."""
+    if free.name in {timing.name for timing in named_times(system)}:
+        return DELAY
+    if free.name in channel_numbers(system):
+        return LOSS
+    unit = unit_of(system, free.name)
+    if unit in UNITS:
+        return STIFFNESS
+    if unit == "s":
+        return DELAY
+    what = f"{free.label} of {system.name}"
+    raise ApcError(Mistake("E940", _PLACE, what, "a stiffness, a delay or a loss", f"a quantity in {unit}"))
+
+
+def _found(system: CompiledSystem, axis: str) -> list[str]:
+    """Return the names that could be meant."""
+    heard = {one.link for kind in system.kinds for clock in kind.clocks for one in clock.receives}
+    links = [link for link in system.links if link.name in heard]
+    if axis == DELAY:
+        return _roots(system, [link.delay for link in links], ("s",))
+    if axis == LOSS:
+        losses = [link.channel.loss for link in links if link.channel is not None]
+        return _roots(system, [one.p for one in losses if one is not None], ("1",))
+    hearing = {
+        channel.rpartition(".")[0]
+        for kind in system.kinds
+        for send in kind.sends
+        if send.link in heard
+        for channel in send.channels
+    }
+    stiff = [one.name for one in system.parameters if one.unit in UNITS]
+    return _roots(system, [name for name in stiff if name.rpartition(".")[0] in hearing], UNITS)
+
+
+def _roots(system: CompiledSystem, names: Iterable[str], units: Sequence[str]) -> list[str]:
+    """Return the numbers of a unit that some follow from, themselves where they follow from nothing."""
+    scope = scope_of(system)
+    needed = scope.needed(list(names))
+    return [
+        name
+        for name in scope.holder
+        if name in needed - set(scope.formulas) and unit_of(system, name) in units
+    ]
+
+
+def _only(system: CompiledSystem, axis: str, names: Sequence[str]) -> Choice:
+    """Return the one of some names. Raises ApcError E941 if there are several."""
+    if len(names) > 1:
+        what = f"has {len(names)} numbers that could be compared as its {axis}: {', '.join(names)}"
+        raise ApcError(Mistake("E941", Place(system.origin.topology), what, hint=f"--over {names[0]}"))
+    return Choice(names[0]) if names else Choice("", _nothing(system, axis))
+
+
+def _nothing(system: CompiledSystem, axis: str) -> str:
+    """Say why nothing of a scene is varied."""
+    if axis == STIFFNESS:
+        return "no stiffness is that of a coupler which hears others (--over NAME takes another)"
+    if not system.links:
+        return "there is no link"
+    if axis == DELAY:
+        return "nobody hears others over a link"
+    names = " and ".join(link.name for link in system.links)
+    return f"no packet can get lost; loss: 0 % written to {names} lets its loss be varied"

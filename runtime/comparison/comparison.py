@@ -1,0 +1,226 @@
+"""Schemes side by side: of several scenes the same numbers, each as its own command gives it.
+
+Takes: `CompiledSystem`s.
+Gives: `Comparison`, `Scheme`, `compare`; `FREQUENCIES`.
+Guarantees: every number is that of `analysis`, `vary.critical`, `hands.feel` or `effort`; what can't be had
+says why and keeps nothing else from being told.
+Does not: compute any of it itself, or say which scheme is the better one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.comparison.choice import DELAY, LOSS, STIFFNESS, check_over, choose
+from apc.comparison.effort import Effort, effort
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Place
+from apc.compiler.frozen import dataclass
+from apc.compiler.timings import part
+from apc.frame.devices import find_device
+from apc.frame.parameters import resolve
+from apc.hands.feel import Feel, feel
+from apc.moments.network import NetworkVerdict, judge_network
+from apc.result import Result
+from apc.vary.critical import Critical, critical
+from apc.vary.mean_square import NOMINAL, PASSIVE, criterion_of
+from apc.vary.search import Told
+
+if TYPE_CHECKING:
+    import pandas
+
+    from apc.hands.passivity import PassiveHands
+
+FREQUENCIES = (1.0, 10.0)  # Hz, at which is told what a hand feels
+
+
+_Found = TypeVar("_Found")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scheme:
+    """One scene of a comparison, each part as the command gives it that is named.
+
+    `analysis` and `network` (None where all packets are on time, or are taken to be) are those of `analyze`;
+    `passive` that of `analyze --hands passive`, where stable means that. `stiffness`, `delay` and `loss` are
+    those of `critical`; `feel` that of `feel` at `FREQUENCIES`, at the device of the first peer that has one.
+    `missing` says why a part is None, by its name.
+    """
+
+    topology: str
+    peers: int
+    analysis: Analysis
+    network: NetworkVerdict | None
+    passive: PassiveHands | None
+    stiffness: Critical | None
+    delay: Critical | None
+    loss: Critical | None
+    feel: Feel | None
+    effort: Effort
+    missing: tuple[tuple[str, str], ...]
+
+    @property
+    def verdict(self) -> str:
+        """The verdict by what stable means: with passive hands, over the network as it is, or nominal."""
+        return (self.passive or self.network or self.analysis).verdict
+
+    @property
+    def stable(self) -> bool | None:
+        """Whether it is stable, in the same sense."""
+        return (self.passive or self.network or self.analysis).stable
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """What of the scene some of its numbers don't look at."""
+        parts = (self.analysis, self.stiffness, self.delay, self.loss, self.feel)
+        return tuple(dict.fromkeys(text for one in parts if one is not None for text in one.left_out))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison(Result):
+    """Schemes side by side, in the order asked for; `notes` say in what they can't be compared."""
+
+    shown_by = "comparison:comparison"
+
+    schemes: tuple[Scheme, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """What some numbers don't look at, with the places (from 1) of the schemes it is said of."""
+        said: dict[str, list[str]] = {}
+        for place, one in enumerate(self.schemes):
+            for text in one.left_out:
+                said.setdefault(text, []).append(str(place + 1))
+        every = len(self.schemes)
+        return tuple(f"{', '.join(on)}: {text}" if len(on) < every else text for text, on in said.items())
+
+    def plot(self) -> Any:
+        """Draw all schemes beside each other; return the matplotlib Figure."""
+        return self._shown("picture")
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return a table with a row a scheme, in SI."""
+        found: pandas.DataFrame = self._shown("table")
+        return found
+
+
+@part("compare")
+def compare(
+    systems: Sequence[CompiledSystem],
+    *,
+    over: Sequence[str] = (),
+    criterion: str | None = None,
+    told: Told | None = None,
+) -> Comparison:
+    """Ask the same of several scenes.
+
+    Parameters
+    ----------
+    systems
+        The compiled scenes, with the numbers to analyse.
+    over
+        Which stiffness, delay and loss are varied, in the scenes that have them: see `choice.choose`.
+    criterion
+        What stable means, as for `vary.critical.critical`.
+    told
+        Is told how far the work is.
+
+    Raises
+    ------
+    ApcError
+        E940, E941 and E622, as `choice`; E898 no such criterion; those of `analysis.analyze` and
+        `passivity.passive_hands`.
+    """
+    check_over(systems, over)
+    for system in systems:
+        criterion_of(system, criterion, Place("criterion"))
+    chosen = [choose(system, over) for system in systems]
+    schemes = []
+    for system, axes in zip(systems, chosen, strict=True):
+        names = {axis: one.name for axis, one in axes.items()}
+        missing = {axis: one.why for axis, one in axes.items() if one.why}
+        schemes.append(_scheme(system, names, missing, criterion, told))
+    return Comparison(tuple(schemes), _notes(schemes))
+
+
+def _scheme(
+    system: CompiledSystem,
+    names: dict[str, str],
+    missing: dict[str, str],
+    criterion: str | None,
+    told: Told | None,
+) -> Scheme:
+    """Return what is told of one scene."""
+    say = told or (lambda _: None)
+
+    def had(key: str, command: str, compute: Callable[[], _Found]) -> _Found | None:
+        try:
+            return compute()
+        except ApcError as error:  # what it says to write is for the command
+            missing[key] = f"{command}: {error.mistakes[0].sentence}"
+            return None
+
+    def crossing(axis: str) -> Critical | None:
+        if not names[axis]:
+            return None
+        command = f"apc critical {names[axis]}"
+        say(f"{system.name}: {command}")
+        return had(axis, command, lambda: critical(system, names[axis], criterion=criterion, told=told))
+
+    say(f"{system.name}: its verdict")
+    prepared = prepare(system)
+    network = judge_network(system, prepared) if criterion not in (NOMINAL, PASSIVE) else None
+    if network is not None and network.mean_square_radius is None:
+        missing["verdict"] = "; ".join(network.notes)
+    return Scheme(
+        topology=system.name,
+        peers=system.peers,
+        analysis=analyze(system, prepared=prepared),
+        network=network,
+        passive=_passive(system, prepared) if criterion == PASSIVE else None,
+        stiffness=crossing(STIFFNESS),
+        delay=crossing(DELAY),
+        loss=crossing(LOSS),
+        feel=had("feel", "apc feel", lambda: _feel(system, prepared)),
+        effort=effort(system),
+        missing=tuple(missing.items()),
+    )
+
+
+def _feel(system: CompiledSystem, prepared: Prepared) -> Feel:
+    """Return what is felt at the first device there is: a server has none."""
+    unit_of, numbers = {one.name: one.unit for one in system.parameters}, resolve(system)
+    holding = [
+        group.name
+        for place, group in enumerate(system.groups)
+        if find_device(prepared.jacobians[group.kind], numbers.parameters[place][0], unit_of) is not None
+    ]
+    at = f"{holding[0]}[1]" if holding else ""
+    return feel(system, FREQUENCIES, at=at, quick=True, prepared=prepared)
+
+
+def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:
+    """Return the verdict with all passive hands; imported here, as few comparisons ask for it."""
+    from apc.hands.passivity import passive_hands
+
+    return passive_hands(system, prepared)
+
+
+def _notes(schemes: Sequence[Scheme]) -> tuple[str, ...]:
+    """Say in what the schemes differ beside their couplings."""
+    peers = dict.fromkeys(one.peers for one in schemes)
+    frames = dict.fromkeys(one.analysis.frame_s for one in schemes)
+    judged = dict.fromkeys(one.network is None for one in schemes)
+    notes = {
+        f"they have different numbers of peers: {', '.join(f'{one:,}' for one in peers)}": len(peers) > 1,
+        "their frames differ, and with them what a spectral radius is of: "
+        f"{', '.join(f'{one * 1e3:.6g} ms' for one in frames)}": len(frames) > 1,
+        "some are judged in mean square over the network as it is, some with every packet on time": len(
+            judged
+        )
+        > 1,
+    }
+    return tuple(text for text, applies in notes.items() if applies)
