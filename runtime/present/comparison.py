@@ -24,7 +24,7 @@ from apc.optional import need
 from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
 from apc.present.forms import MEANT, document, json_text, note
 from apc.present.pictures import FORMATS, check_result_path, write_figure
-from apc.tables import SUFFIXES, Column, Row, write_table
+from apc.tables import SUFFIXES, Column, Row, blocks_of, write_table
 
 if TYPE_CHECKING:
     import pandas
@@ -208,7 +208,7 @@ def write_comparison(path: Path, found: Comparison) -> None:
             "left_out": {one.topology: list(one.left_out) for one in found.schemes},
             "notes": list(found.notes),
         }
-        write_table(path, _columns(), (_row(one) for one in found.schemes), made)
+        write_table(path, _columns(), blocks_of(_row(one) for one in found.schemes), made)
     else:
         write_text(path, json_text(found.to_dict()))
 
