@@ -400,7 +400,7 @@ def contact_modes(
 
 
 def switching(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Switching:
-    """Say whether a scene is proved stable however its contacts open and close, tick by tick.
+    """Say whether a scene is proved stable however its contacts open and close, or as they do by themselves.
 
     Parameters
     ----------
