@@ -774,7 +774,7 @@ COMPONENT = [
     (
         "b.f = -a.f",
         "b.f = -stiffness*a.x[1]",
-        "16:22: E303 Pad has no a.x[1]; the nearest is a.x. Write: a.x",
+        "16:22: E408 a.x[1] wants a vector before the index, got a.x, which is a number. Write: a.x",
     ),
     (
         "b.f = -a.f",

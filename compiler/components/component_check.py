@@ -12,7 +12,7 @@ scene give the rest.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from itertools import count
@@ -42,6 +42,14 @@ from apc.compiler.language.expression import (
 from apc.compiler.language.expression import Number as Literal
 from apc.compiler.language.unit_check import ANY, check_equation, dimension_of
 from apc.compiler.language.values import PEERS
+from apc.compiler.language.vectors import (
+    entries,
+    entry,
+    sizes_of,
+    whole_and_index,
+    written_equation,
+    written_out,
+)
 from apc.compiler.source.reading import (
     add_unknown,
     brief,
@@ -71,16 +79,40 @@ class ComponentNames:
         self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
         for send in component.sends:
             self.dimensions[(OTHERS, send.name)] = send.dimension
+        # The vectors of these names, and the entries of those found later; None while a size isn't known.
+        self.sizes: dict[tuple[str, ...], int | None] = {}
+        for vector, size in sizes_of(self.dimensions).items():
+            self._add_vector(vector, size, self.dimensions[(*vector[:-1], entry(vector[-1], 1))])
         for table in component.parameters:
             if isinstance(table, Reference) and table.role == "table" and table.unit is not None:
                 self.dimensions[(table.name,)] = table.unit.dimension
+
+    def _add_vector(self, parts: tuple[str, ...], size: int, dimension: Dimension | None) -> None:
+        """Know a vector, and each of its entries."""
+        self.sizes[parts] = size
+        self.dimensions |= {(*parts[:-1], one): dimension for one in entries(parts[-1], size)}
+        self.dimensions[parts] = dimension
+
+    def size_of(self, parts: tuple[str, ...]) -> int | None:
+        """Return the size of a name: 0 for a number, None for what is to be inferred."""
+        return self.sizes.get(parts, 0)
 
     def infer_sends(self, sends: Sends, mistakes: Mistakes) -> tuple[Send, ...]:
         """Return the sends with the dimension of what they send."""
         return tuple(
             Send(name, expression, text, place, _known(self._dimension(expression, text, place, mistakes)))
             for name, expression, text, place in sends
+            if self._is_sized(expression, text, place, mistakes)
         )
+
+    def _is_sized(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
+        """Record sizes that do not fit."""
+        try:
+            written_out(expression, self.size_of, text, place)
+        except ApcError as error:
+            mistakes.take(error)
+            return False
+        return True
 
     def infer_locals(self, sends: Sends) -> tuple[tuple[str, Dimension], ...]:
         """Return the undeclared names that stand alone on the left of an equation.
@@ -95,20 +127,62 @@ class ComponentNames:
             and equation.left.parts not in self.dimensions
         }
         # An unknown name on the right is reported once, by `check`.
+        open_: dict[tuple[str, ...], tuple[Expr, str, Place]]
         open_ = {(OTHERS, name): (expression, text, place) for name, expression, text, place in sends} | {
             name: (equation.right, equation.text, equation.place) for name, equation in equations.items()
         }
         self.dimensions |= dict.fromkeys(open_)
+        self._infer_sizes(open_)
         settled = list(open_)
         while settled:
             found = {name: self._dimension(*one, Mistakes()) for name, one in open_.items()}
             settled = [name for name, dimension in found.items() if dimension is not None]
-            self.dimensions |= {name: found[name] for name in settled}
+            for name in settled:
+                self._add_vector(name, self.sizes[name] or 0, found[name])
             open_ = {name: one for name, one in open_.items() if name not in settled}
+        for name in open_:
+            self._add_vector(name, self.sizes[name] or 0, None)
         return tuple((name[0], _known(self.dimensions[name])) for name in reversed(equations))
 
+    def _infer_sizes(self, undeclared: Mapping[tuple[str, ...], tuple[Expr, str, Place]]) -> None:
+        """Find the sizes of names that are not declared; what hangs on itself alone is a number."""
+
+        def size(expression: Expr, text: str, place: Place) -> int | None:
+            try:
+                found = written_out(expression, self.size_of, text, place)
+            except ApcError:
+                return 0  # told of by `check`
+            return len(found) if isinstance(found, tuple) else None if found is None else 0
+
+        self.sizes |= dict.fromkeys(undeclared)
+        settled: dict[tuple[str, ...], int | None] = {}
+        while settled != (settled := {name: size(*one) for name, one in undeclared.items()}):
+            self.sizes |= settled
+        self.sizes |= {name: found or 0 for name, found in settled.items()}
+
+    def written_out(self, component: Component) -> Component:
+        """Return a checked component without vectors: everything in terms of their entries."""
+        sends = []
+        for send in component.sends:
+            found = written_out(send.expression, self.size_of, send.text, send.place)
+            its = found if isinstance(found, tuple) else (send.expression if found is None else found,)
+            names_ = entries(send.name, self.size_of((OTHERS, send.name)) or 0)
+            sends += [replace(send, name=n, expression=e) for n, e in zip(names_, its, strict=True)]
+        return replace(
+            component,
+            locals=tuple(
+                (one, dimension)
+                for name, dimension in component.locals
+                for one in entries(name, self.size_of((name,)) or 0)
+            ),
+            sends=tuple(sends),
+            equations=tuple(
+                one for equation in component.equations for one in written_equation(equation, self.size_of)
+            ),
+        )
+
     def check(self, component: Component, mistakes: Mistakes) -> None:
-        """Check the names, then the units, of every equation, and that what is sent is no reduction."""
+        """Check names, then units and sizes, of every equation, and that what is sent is no reduction."""
         for send in component.sends:
             self._check_sent(send, mistakes)
         for equation in component.equations:
@@ -123,6 +197,10 @@ class ComponentNames:
                         Equation(left, right, equation.text, equation.place),
                         lambda name: self.dimensions.get(name.parts),
                     )
+                except ApcError as error:
+                    mistakes.take(error)
+                try:
+                    written_equation(equation, self.size_of)
                 except ApcError as error:
                     mistakes.take(error)
 
@@ -197,10 +275,26 @@ class ComponentNames:
                         "E303", place_in(place, text, node.start), what, hint="sends: {x: sample(object.x)}"
                     )
                     continue
+                if self._is_bad_index(node.parts, place_in(place, text, node.start), mistakes):
+                    continue
                 known = sorted(".".join(parts) for parts in self.dimensions)
                 what = f"{self.component.name} has no {brief(shown)}"
                 add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)
         return wrong
+
+    def _is_bad_index(self, parts: tuple[str, ...], place: Place, mistakes: Mistakes) -> bool:
+        """Record an entry that a vector hasn't got, or an index behind a number."""
+        name, index = whole_and_index(parts[-1])
+        whole = (*parts[:-1], name)
+        if not index or whole not in self.dimensions:
+            return False
+        shown, size = ".".join(whole), self.size_of(whole) or 0
+        if size:
+            expected, got, hint = f"an index from 1 to {size}", f"{index}", entry(shown, size)
+        else:
+            expected, got, hint = "a vector before the index", f"{shown}, which is a number", shown
+        mistakes.add("E408", place, entry(shown, index), expected=expected, got=got, hint=hint)
+        return True
 
 
 def _visible_names(component: Component) -> Iterator[tuple[tuple[str, ...], Dimension]]:

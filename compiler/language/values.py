@@ -21,6 +21,7 @@ from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.unit_check import ANY, dimension_of
 from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import parse_quantity, parse_unit, quantity
+from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import add_unknown, brief, read_text
 
@@ -193,7 +194,7 @@ def _expression(
         its = "has no unit" if found == DIMENSIONLESS else f"is in {format_dimension(found or dimension)}"
         got = f"{brief(text)}, which {its}"
         raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: 1 {unit}"))
-    return tree
+    return number_of(tree, text, place)
 
 
 def check_names(
@@ -249,7 +250,8 @@ def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | Non
         if is_quantity(text):
             found = parse_quantity(text, node.place)
             return Binding(found.value, None, found.unit.dimension, node.place)
-        return Binding(None, parse_expression(text, text_place(node)), DIMENSIONLESS, text_place(node))
+        place = text_place(node)
+        return Binding(None, number_of(parse_expression(text, place), text, place), DIMENSIONLESS, place)
     except ApcError as error:
         mistakes.take(error)
         return None
