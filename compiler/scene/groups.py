@@ -218,7 +218,7 @@ def _entry_by_entry(
         values = [listed(row, key.text, size, one, mistakes) for row in rows]
         if not nested and group.table is None and group.body.get("count") is None:
             what = f"{key.text} is a vector of {size}, and its list doesn't tell how many peers there are"
-            mistakes.add("E201", node.place, what, hint=f"{group.name}: {{count: {group.count}, set: …}}")
+            mistakes.add("E201", node.place, what, hint="count: 3")
         for k, name in enumerate(vector_entries(key.text, size)):
             column = tuple(value[k] for value in values if value is not None)
             if len(column) == len(values):
