@@ -22,7 +22,7 @@ HOUSE = (
         "apc.compiler.language",
         """
         expression lexer grammar evaluation dimensions unit_grammar unit_names units unit_text
-        unit_check values tables recordings
+        unit_check vectors values tables recordings
         """,
     ),
     ("apc.compiler.components", "component parts declarations component_check definitions library"),

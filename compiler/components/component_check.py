@@ -277,7 +277,9 @@ class ComponentNames:
                     continue
                 if self._is_bad_index(node.parts, place_in(place, text, node.start), mistakes):
                     continue
-                known = sorted(".".join(parts) for parts in self.dimensions)
+                known = sorted(
+                    ".".join(parts) for parts in self.dimensions if not whole_and_index(parts[-1])[1]
+                )
                 what = f"{self.component.name} has no {brief(shown)}"
                 add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)
         return wrong

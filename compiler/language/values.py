@@ -187,14 +187,14 @@ def _expression(
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
 ) -> Expr:
-    tree = parse_expression(text, place)
+    tree = number_of(parse_expression(text, place), text, place)
     check_names(tree, text, place, what, known, names_known)
     found = dimension_of(tree, lambda name: known(name.parts), text, place)
     if found not in (None, ANY, dimension):
         its = "has no unit" if found == DIMENSIONLESS else f"is in {format_dimension(found or dimension)}"
         got = f"{brief(text)}, which {its}"
         raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: 1 {unit}"))
-    return number_of(tree, text, place)
+    return tree
 
 
 def check_names(

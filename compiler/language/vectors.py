@@ -43,6 +43,7 @@ from apc.compiler.language.expression import (
 from apc.compiler.language.grammar import MAX_LENGTH
 
 SIZES = (2, 3)
+LONGEST_REPEATED = 20  # characters of a number that a message writes once for each entry
 
 # An expression written out: a number, a vector's entries, or None where a name's size isn't known yet.
 Written = Expr | tuple[Expr, ...] | None
@@ -243,9 +244,9 @@ class _Writer:
             if _length(one) == _length(first):
                 continue
             hint = ""
-            if not isinstance(one, tuple):
+            if not isinstance(one, tuple) and len(format_expression(part)) <= LONGEST_REPEATED:
                 hint = "{" + ", ".join([format_expression(part)] * _length(first)) + "}"
-            elif not isinstance(first, tuple):
+            elif isinstance(one, tuple) and not isinstance(first, tuple):
                 hint = self.of_vector(part)
             self.fail(
                 "E406", part, self.said(part), f"{_size(first)} like {self.said(like)}", _size(one), hint
