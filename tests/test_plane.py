@@ -1,4 +1,4 @@
-"""Parts that move in a plane and in space, each against its closed form; vectors in groups, tables, arrays."""
+"""Parts that move in a plane and in space against their closed forms; vectors in groups, tables, arrays."""
 
 from __future__ import annotations
 

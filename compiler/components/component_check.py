@@ -43,6 +43,7 @@ from apc.compiler.language.expression import Number as Literal
 from apc.compiler.language.unit_check import ANY, check_equation, dimension_of
 from apc.compiler.language.values import PEERS
 from apc.compiler.language.vectors import (
+    VECTOR_WORDS,
     entries,
     entry,
     sizes_of,
@@ -93,6 +94,10 @@ class ComponentNames:
         self.dimensions |= {(*parts[:-1], one): dimension for one in entries(parts[-1], size)}
         self.dimensions[parts] = dimension
 
+    def _is_of_numbers(self, text: str) -> bool:
+        """Return whether a text can hold no vector: it is written out as it is."""
+        return not any(self.sizes.values()) and not any(word in text for word in VECTOR_WORDS)
+
     def size_of(self, parts: tuple[str, ...]) -> int | None:
         """Return the size of a name: 0 for a number, None for what is to be inferred."""
         return self.sizes.get(parts, 0)
@@ -102,7 +107,7 @@ class ComponentNames:
         return tuple(
             Send(name, expression, text, place, _known(self._dimension(expression, text, place, mistakes)))
             for name, expression, text, place in sends
-            if self._is_sized(expression, text, place, mistakes)
+            if self._is_of_numbers(text) or self._is_sized(expression, text, place, mistakes)
         )
 
     def _is_sized(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
@@ -160,31 +165,14 @@ class ComponentNames:
             self.sizes |= settled
         self.sizes |= {name: found or 0 for name, found in settled.items()}
 
-    def written_out(self, component: Component) -> Component:
-        """Return a checked component without vectors: everything in terms of their entries."""
-        sends = []
-        for send in component.sends:
-            found = written_out(send.expression, self.size_of, send.text, send.place)
-            its = found if isinstance(found, tuple) else (send.expression if found is None else found,)
-            names_ = entries(send.name, self.size_of((OTHERS, send.name)) or 0)
-            sends += [replace(send, name=n, expression=e) for n, e in zip(names_, its, strict=True)]
-        return replace(
-            component,
-            locals=tuple(
-                (one, dimension)
-                for name, dimension in component.locals
-                for one in entries(name, self.size_of((name,)) or 0)
-            ),
-            sends=tuple(sends),
-            equations=tuple(
-                one for equation in component.equations for one in written_equation(equation, self.size_of)
-            ),
-        )
+    def check(self, component: Component, mistakes: Mistakes) -> Component:
+        """Check names, then units and sizes, of every equation, and that what is sent is no reduction.
 
-    def check(self, component: Component, mistakes: Mistakes) -> None:
-        """Check names, then units and sizes, of every equation, and that what is sent is no reduction."""
+        Return the component without vectors, everything in terms of their entries.
+        """
         for send in component.sends:
             self._check_sent(send, mistakes)
+        written: list[Equation] = []
         for equation in component.equations:
             unknown = False
             left, right = self._decided(equation.left), self._decided(equation.right)
@@ -199,10 +187,30 @@ class ComponentNames:
                     )
                 except ApcError as error:
                     mistakes.take(error)
+                if self._is_of_numbers(equation.text):
+                    written.append(equation)
+                    continue
                 try:
-                    written_equation(equation, self.size_of)
+                    written += written_equation(equation, self.size_of)
                 except ApcError as error:
                     mistakes.take(error)
+        locals_ = (
+            (one, dimension)
+            for name, dimension in component.locals
+            for one in entries(name, self.size_of((name,)) or 0)
+        )
+        sends = (one for send in component.sends for one in self._sent_entries(send))
+        return replace(component, locals=tuple(locals_), sends=tuple(sends), equations=tuple(written))
+
+    def _sent_entries(self, send: Send) -> Iterator[Send]:
+        """Yield what is sent of each entry of a vector."""
+        if self._is_of_numbers(send.text):
+            yield send
+            return
+        found = written_out(send.expression, self.size_of, send.text, send.place)
+        each = found if isinstance(found, tuple) else (found or send.expression,)
+        for name, one in zip(entries(send.name, len(each) if each is found else 0), each, strict=True):
+            yield replace(send, name=name, expression=one)
 
     def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
         """Record a reduction that doesn't run over the other peers."""

@@ -113,9 +113,8 @@ def read_component(source: Source, library: Definitions) -> Component:
     locals_, found = names.infer_locals(sends), names.infer_sends(sends, mistakes)
     component = replace(draft, locals=(*draft.locals, *locals_), sends=(*draft.sends, *found))
     mistakes.raise_if_any()
-    names.check(component, mistakes)
+    component = names.check(component, mistakes)
     mistakes.raise_if_any()
-    component = names.written_out(component)
     check_balance(component, mistakes)
     mistakes.raise_if_any()
     return component

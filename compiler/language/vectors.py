@@ -43,6 +43,7 @@ from apc.compiler.language.expression import (
 from apc.compiler.language.grammar import MAX_LENGTH
 
 SIZES = (2, 3)
+VECTOR_WORDS = ("{", "dot", "norm", "cross")  # what makes or takes vectors is written with one of these
 LONGEST_REPEATED = 20  # characters of a number that a message writes once for each entry
 
 # An expression written out: a number, a vector's entries, or None where a name's size isn't known yet.
