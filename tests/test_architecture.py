@@ -111,7 +111,10 @@ HOUSE = (
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",
-        "forms pictures network hands analysis vary region_picture region simulation still recording bench",
+        """
+        forms pictures network hands analysis vary region_picture region plane simulation still recording
+        bench
+        """,
     ),
     # what a person calls
     (
