@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import random
+import re
+import subprocess
+import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,6 +20,7 @@ from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.vectors import sizes_of, whole_and_index, written_equation, written_out
 from apc.compiler.pipeline import run_stages
 from tests.test_messages import told
+from tests.topologies import ROOT
 
 HERE = Place("a.yaml")
 SIZES = {("a", "x"): 2, ("b", "x"): 2, ("r",): 3, ("s",): 3, ("open",): None}
@@ -301,3 +305,15 @@ def test_the_scene_they_slip_in_is_right(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "scene.yaml").write_text(SCENE, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     run_stages(Path("scene.yaml"), until="compiled")
+
+
+def test_scenes_of_vectors_compile_or_are_told_what_is_wrong(tmp_path: Path) -> None:
+    """Here a hundred; thousands are `python -m tests.fuzz --inputs 10000 --sort vectors`."""
+    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "100", "--sort", "vectors", "--seed", "7"]
+    ran = subprocess.run(
+        [*command, "--out", str(tmp_path / "failures")], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    outcomes = {sort: int(count) for count, sort in re.findall(r"(\d+)  vectors: (\w+)", ran.stdout)}
+    assert outcomes["compiled"] > 20
+    assert sum(outcomes.values()) == 100
