@@ -74,7 +74,7 @@ couplers:
   contact: {type: DiscContact, a: device, b: puck, radius: 20 mm, stiffness: 1000 N/m, clock: tick}
   post: {type: DiscContact, a: puck, b: peg.b, radius: 12 mm, stiffness: 9 N/m, damping: 3 N*s/m, clock: tick}
   peg: {type: Peg, b: post.b, at_: [70 mm, -50 mm]}
-  edge: {type: LineContact, flange: puck, normal: [3, 4], point: [-4 cm, -4 cm], stiffness: 9 N/m, clock: tick}
+  rim: {type: LineContact, flange: puck, normal: [3, 4], point: [-4 cm, -4 cm], stiffness: 9 N/m, clock: tick}
 """
 PEG = """\
 component: Peg
