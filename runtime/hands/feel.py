@@ -400,8 +400,8 @@ def _modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) 
         for one in (other, port):
             if one.peer not in group.peers:
                 continue
-            alike = port.peer in group.peers or whole_and_index(port.part)[1]
-            named = one.part or (port.part if alike else "")
+            along = port.peer in group.peers or whole_and_index(port.part)[1]
+            named = one.part or (port.part if along else "")
             device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=named)
             if not isinstance(device, Device):
                 what = device or f"{group.name} has no device"
