@@ -25,7 +25,7 @@ HOUSE = (
         "apc.compiler.language",
         """
         expression lexer grammar evaluation dimensions unit_grammar unit_names units unit_text
-        unit_check values tables recordings
+        unit_check vectors values tables recordings
         """,
     ),
     ("apc.compiler.components", "component parts declarations component_check definitions library"),
@@ -118,7 +118,7 @@ HOUSE = (
         "apc.present",
         """
         forms pictures network hands analysis vary comparison_picture comparison region_picture region
-        simulation still recording bench
+        plane simulation still recording bench
         """,
     ),
     # what a person calls

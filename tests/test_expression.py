@@ -103,7 +103,10 @@ def test_every_node_knows_its_part_of_the_text() -> None:
         ("a b", "1:3: E322 an operator was expected here, not b."),
         ("a)", "1:2: E322 this ) closes nothing."),
         ("(a", "1:3: E322 an opened ( wants ), got the end of the text."),
-        ("a,b", "1:2: E322 a comma stands between the arguments of a function only."),
+        (
+            "a,b",
+            "1:2: E322 commas stand between arguments, or entries of a vector, only.",
+        ),
         ("a = b", "1:3: E322 an expression wants one value, got an equation."),
         ("a < b < c", "1:7: E322 a comparison has two sides. Write: a < b and b < c"),
         ("1 + if a < b then 1 else 2", "1:5: E322 if … needs parentheses here."),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import mpmath
@@ -15,6 +16,7 @@ from apc.__main__ import run
 from apc.analysis.analysis import prepare
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
+from apc.frame.devices import devices_of
 from apc.hands.feel import feel
 from tests.handled import Users, response
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
@@ -391,3 +393,21 @@ def test_what_arms_hold_has_no_viscosity_by_the_formula() -> None:
     assert found.formula is None
     mixed = compile_topology(SCENES / "mixed-clocks.yaml")
     assert feel(mixed, [1.0]).network_viscosity is None
+
+
+def test_in_a_plane_a_hand_is_along_an_axis_and_feels_what_it_feels_on_a_line() -> None:
+    """Along each axis the scene is that on the line: the same impedance, arrival and error of copies."""
+    plane = compiled((SCENES / "planar-users.yaml").read_text(encoding="utf-8").partition("\n")[2])
+    line, at = feel(compiled(AVERAGE), [1.0, 10.0], quick=True), "user[1].device"
+    for axis in ("x[1]", "x[2]"):
+        found = feel(plane, [1.0, 10.0], at=f"{at}.{axis}", quick=True)
+        assert (found.at, found.between, found.copy) == (f"{at}.{axis}", f"user[2].device.{axis}", "cube")
+        assert found.impedance == pytest.approx(line.impedance, rel=1e-9)
+        assert found.transmitted_admittance == pytest.approx(line.transmitted_admittance, rel=1e-9)
+        assert found.error_per_force == pytest.approx(line.error_per_force, abs=1e-12)
+    told = "a hand may hold any of device.x[1], device.x[2] (user)"
+    hint = f"Write: --at with the part that is held, as {at}.x[1]"
+    with pytest.raises(ApcError, match=re.escape(f"E931 {told}. {hint}")):
+        feel(plane, [1.0], quick=True)
+    with pytest.raises(ApcError, match=re.escape(f"E931 --hands: {told}.") + "$"):
+        devices_of(plane)

@@ -41,10 +41,12 @@ def test_every_built_in_definition_reads_and_balances() -> None:
         assert component is not None
         assert component.name == name
         assert component.about
-    (flange,) = set(built_in.names) - set(built_in.component_names)
-    connector = built_in.connector(flange)
-    assert connector is not None
-    assert connector.name == flange == "Flange"
+    connectors = set(built_in.names) - set(built_in.component_names)
+    assert connectors == {"Flange", "PlanarFlange", "SpatialFlange"}
+    for name in connectors:
+        connector = built_in.connector(name)
+        assert connector is not None
+        assert connector.name == name
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

@@ -777,7 +777,7 @@ COMPONENT = [
     (
         "b.f = -a.f",
         "b.f = -stiffness*a.x[1]",
-        "16:22: E303 Pad has no a.x[1]; the nearest is a.x. Write: a.x",
+        "16:22: E408 a.x[1] wants a vector before the index, got a.x, which is a number. Write: a.x",
     ),
     (
         "b.f = -a.f",
@@ -885,6 +885,10 @@ FILES = [
         b" a: 1\nb: 2\n",
         ":2:1: E109 this line belongs to nothing above it: its indent or a closing bracket is wrong.",
     ),
+    (b"a: {x: O[1], y: 1}\n", ':1:8: E109 a text with [ in it needs quotes here. Write: "O[1]"'),
+    (b"a: [r = {1, 2}]\n", ':1:5: E109 a text with { in it needs quotes here. Write: "r = {1, 2}"'),
+    (b"a: {x: [1] [2]}\n", ":1:4: E109 this { is never closed, or a comma is missing behind it."),
+    (b"a: {x: 'O' [1]}\n", ":1:4: E109 this { is never closed, or a comma is missing behind it."),
     (b"{a: \n", ":2:1: E109 a value or a closing bracket is missing here."),
     (b"a: 1\n\tb: 2\n", ":2:1: E109 a tab indents this line, and YAML allows spaces only. Write: spaces"),
 ]

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 
+import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
+from apc.present.plane import Disc, Line, Spot, paths_of, spots_of
 from apc.present.still import Body, Wall, bodies_of, draw_still, save_still
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 pytest.importorskip("matplotlib")
 
@@ -57,3 +59,93 @@ def test_every_peer_has_a_row_and_the_rest_is_counted(tmp_path: Path) -> None:
     assert many.get_title() == "three-users-average: at the start (988 more peers)"
     save_still(scene("experiment-average"), tmp_path / "still.svg")
     assert (tmp_path / "still.svg").read_text(encoding="utf-8").startswith("<?xml")
+
+
+# ---- in a plane ----
+
+PUCK = """\
+topology: puck
+clocks: {tick: 1 ms}
+peers: {user: {count: 3, set: {device.x: [[-30 mm, 10 mm], [30 mm, 5 mm], [0 mm, -40 mm]]}}}
+masses:
+  device: {type: PlanarMass, mass: 0.1 kg}
+  puck: {type: PlanarMass, mass: 0.6 kg, x: [2 mm, 3 mm]}
+couplers:
+  contact: {type: DiscContact, a: device, b: puck, radius: 20 mm, stiffness: 1000 N/m, clock: tick}
+  post: {type: DiscContact, a: puck, b: peg.b, radius: 12 mm, stiffness: 9 N/m, damping: 3 N*s/m, clock: tick}
+  peg: {type: Peg, b: post.b, at_: [70 mm, -50 mm]}
+  rim: {type: LineContact, flange: puck, normal: [3, 4], point: [-4 cm, -4 cm], stiffness: 9 N/m, clock: tick}
+"""
+PEG = """\
+component: Peg
+about: A fixed point of a plane.
+connectors: {b: PlanarFlange}
+parameters: {at_: {unit: m, size: 2}}
+equations: ["b.x = at_"]
+"""
+
+
+def in_plane(system: CompiledSystem, peer: int = 0) -> tuple[list[Spot], list[Disc | Line]]:
+    [kind] = system.kinds
+    numbers = resolve(system)
+    vector = [float(one) for one in numbers.parameters[0][numbers.rows[0][peer]]]
+    return spots_of(kind, vector, start_values(jacobians(kind), vector)[0])
+
+
+def test_discs_and_lines_of_a_plane_are_where_the_equations_have_them(tmp_path: Path) -> None:
+    system = compiled(PUCK, library(tmp_path, PEG))
+    spots, surfaces = in_plane(system, 1)
+    assert spots == [Spot("device", (0.03, 0.005), 0.0), Spot("puck", (0.002, 0.003), 0.02)]
+    # 3 x + 4 y = 3 (-0.04) + 4 (-0.04), with a normal of length 1.
+    assert sorted(surfaces, key=repr) == [Disc((0.07, -0.05), 0.012), Line((0.6, 0.8), -0.056)]
+
+
+def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
+    system = compiled(PUCK, library(tmp_path, PEG))
+    axes = draw_still(system).axes
+    assert [one.get_title() for one in axes] == ["user[1]", "user[2]", "user[3]"]
+    assert len({(one.get_xlim(), one.get_ylim()) for one in axes}) == 1
+    (left, right), (low, high) = axes[0].get_xlim(), axes[0].get_ylim()
+    assert right - left == pytest.approx(high - low)
+    assert left < -30 < 82 < right
+    assert low < -62 < 23 < high
+
+
+def test_of_space_two_coordinates_are_drawn_and_the_caption_says_so() -> None:
+    text = (
+        "topology: ball\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+        "masses: {device: {type: SpatialMass, mass: 1 kg, x: [3 mm, 4 mm, 5 mm]}, slider: {mass: 1 kg}}\n"
+        "couplers:\n"
+        "  ball: {type: SphereContact, a: device, b: ground, radius: 16 mm, stiffness: 9 N/m, clock: tick}\n"
+        "  table: {type: PlaneContact, flange: device, normal: [0, 0, 2], stiffness: 9 N/m, clock: tick}\n"
+    )
+    system = compiled(text)
+    spots, surfaces = in_plane(system)
+    assert spots == [Spot("device", (0.003, 0.004, 0.005), 0.0)]
+    assert sorted(surfaces, key=repr) == [Disc((0.0, 0.0, 0.0), 0.016), Line((0.0, 0.0, 1.0), 0.0)]
+    figure = draw_still(system)
+    assert figure.get_suptitle().splitlines() == [
+        "ball: at the start",
+        "of three coordinates the first two",
+        "not drawn, as they move along one axis: slider",
+    ]
+    [ax] = figure.axes
+    assert len(ax.patches) == 1
+    assert len(ax.lines) == 1  # the table lies in the plane that is drawn
+
+
+def test_a_run_in_a_plane_is_drawn_as_paths_as_well(tmp_path: Path) -> None:
+    run = apc.simulate(compiled(PUCK, library(tmp_path, PEG)), duration="5 ms", jit=False)
+    pairs = paths_of(run.signals)
+    assert [tuple(run.signals[one].local for one in pair) for pair in pairs[:2]] == [
+        ("device.x[1]", "device.x[2]"),
+        ("puck.x[1]", "puck.x[2]"),
+    ]
+    assert len(pairs) == 6
+    *_, plane = run.plot().axes
+    assert plane.get_ylabel() == "path: x[2] [mm]"
+    assert [one.get_text() for one in plane.get_legend().get_texts()][:2] == [
+        "user[1].device.x",
+        "user[1].puck.x",
+    ]
+    assert plane.lines[0].get_xdata().tolist() == pytest.approx((1e3 * run.values[:, pairs[0][0]]).tolist())

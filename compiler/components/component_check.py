@@ -12,7 +12,7 @@ scene give the rest.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from itertools import count
@@ -42,6 +42,15 @@ from apc.compiler.language.expression import (
 from apc.compiler.language.expression import Number as Literal
 from apc.compiler.language.unit_check import ANY, check_equation, dimension_of
 from apc.compiler.language.values import PEERS
+from apc.compiler.language.vectors import (
+    VECTOR_WORDS,
+    entries,
+    entry,
+    sizes_of,
+    whole_and_index,
+    written_equation,
+    written_out,
+)
 from apc.compiler.source.reading import (
     add_unknown,
     brief,
@@ -73,16 +82,44 @@ class ComponentNames:
         self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
         for send in component.sends:
             self.dimensions[(OTHERS, send.name)] = send.dimension
+        # The vectors of these names, and the entries of those found later; None while a size isn't known.
+        self.sizes: dict[tuple[str, ...], int | None] = {}
+        for vector, size in sizes_of(self.dimensions).items():
+            self._add_vector(vector, size, self.dimensions[(*vector[:-1], entry(vector[-1], 1))])
         for table in component.parameters:
             if isinstance(table, Reference) and table.role == "table" and table.unit is not None:
                 self.dimensions[(table.name,)] = table.unit.dimension
+
+    def _add_vector(self, parts: tuple[str, ...], size: int, dimension: Dimension | None) -> None:
+        """Know a vector, and each of its entries."""
+        self.sizes[parts] = size
+        self.dimensions |= {(*parts[:-1], one): dimension for one in entries(parts[-1], size)}
+        self.dimensions[parts] = dimension
+
+    def _is_of_numbers(self, text: str) -> bool:
+        """Return whether a text can hold no vector: it is written out as it is."""
+        return not any(self.sizes.values()) and not any(word in text for word in VECTOR_WORDS)
+
+    def size_of(self, parts: tuple[str, ...]) -> int | None:
+        """Return the size of a name: 0 for a number, None for what is to be inferred."""
+        return self.sizes.get(parts, 0)
 
     def infer_sends(self, sends: Sends, mistakes: Mistakes) -> tuple[Send, ...]:
         """Return the sends with the dimension of what they send."""
         return tuple(
             Send(name, expression, text, place, _known(self._dimension(expression, text, place, mistakes)))
             for name, expression, text, place in sends
+            if self._is_of_numbers(text) or self._is_sized(expression, text, place, mistakes)
         )
+
+    def _is_sized(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
+        """Record sizes that do not fit."""
+        try:
+            written_out(expression, self.size_of, text, place)
+        except ApcError as error:
+            mistakes.take(error)
+            return False
+        return True
 
     def infer_locals(self, sends: Sends) -> tuple[tuple[str, Dimension], ...]:
         """Return the undeclared names that stand alone on the left of an equation.
@@ -102,18 +139,42 @@ class ComponentNames:
         }
         open_ = {(OTHERS, name): (expression, text, place) for name, expression, text, place in sends} | open_
         self.dimensions |= dict.fromkeys(open_)
+        self._infer_sizes(open_)
         settled = list(open_)
         while settled:
             found = {name: self._dimension(*one, Mistakes()) for name, one in open_.items()}
             settled = [name for name, dimension in found.items() if dimension is not None]
-            self.dimensions |= {name: found[name] for name in settled}
+            for name in settled:
+                self._add_vector(name, self.sizes[name] or 0, found[name])
             open_ = {name: one for name, one in open_.items() if name not in settled}
+        for name in open_:
+            self._add_vector(name, self.sizes[name] or 0, None)
         return tuple((name[0], _known(self.dimensions[name])) for name in reversed(equations))
 
-    def check(self, component: Component, mistakes: Mistakes) -> None:
-        """Check the names, then the units, of every equation, and that what is sent is no reduction."""
+    def _infer_sizes(self, undeclared: Mapping[tuple[str, ...], tuple[Expr, str, Place]]) -> None:
+        """Find the sizes of names that are not declared; what hangs on itself alone is a number."""
+
+        def size(expression: Expr, text: str, place: Place) -> int | None:
+            try:
+                found = written_out(expression, self.size_of, text, place)
+            except ApcError:
+                return 0  # told of by `check`
+            return len(found) if isinstance(found, tuple) else None if found is None else 0
+
+        self.sizes |= dict.fromkeys(undeclared)
+        settled: dict[tuple[str, ...], int | None] = {}
+        while settled != (settled := {name: size(*one) for name, one in undeclared.items()}):
+            self.sizes |= settled
+        self.sizes |= {name: found or 0 for name, found in settled.items()}
+
+    def check(self, component: Component, mistakes: Mistakes) -> Component:
+        """Check names, then units and sizes, of every equation, and that what is sent is no reduction.
+
+        Return the component without vectors, everything in terms of their entries.
+        """
         for send in component.sends:
             self._check_sent(send, mistakes)
+        written: list[Equation] = []
         for equation in component.equations:
             unknown = False
             left, right = self._decided(equation.left), self._decided(equation.right)
@@ -128,6 +189,30 @@ class ComponentNames:
                     )
                 except ApcError as error:
                     mistakes.take(error)
+                if self._is_of_numbers(equation.text):
+                    written.append(equation)
+                    continue
+                try:
+                    written += written_equation(equation, self.size_of)
+                except ApcError as error:
+                    mistakes.take(error)
+        locals_ = (
+            (one, dimension)
+            for name, dimension in component.locals
+            for one in entries(name, self.size_of((name,)) or 0)
+        )
+        sends = (one for send in component.sends for one in self._sent_entries(send))
+        return replace(component, locals=tuple(locals_), sends=tuple(sends), equations=tuple(written))
+
+    def _sent_entries(self, send: Send) -> Iterator[Send]:
+        """Yield what is sent of each entry of a vector."""
+        if self._is_of_numbers(send.text):
+            yield send
+            return
+        found = written_out(send.expression, self.size_of, send.text, send.place)
+        each = found if isinstance(found, tuple) else (found or send.expression,)
+        for name, one in zip(entries(send.name, len(each) if each is found else 0), each, strict=True):
+            yield replace(send, name=name, expression=one)
 
     def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
         """Record a reduction that doesn't run over the other peers."""
@@ -200,10 +285,28 @@ class ComponentNames:
                         "E303", place_in(place, text, node.start), what, hint="sends: {x: sample(object.x)}"
                     )
                     continue
-                known = sorted(".".join(parts) for parts in self.dimensions)
+                if self._is_bad_index(node.parts, place_in(place, text, node.start), mistakes):
+                    continue
+                known = sorted(
+                    ".".join(parts) for parts in self.dimensions if not whole_and_index(parts[-1])[1]
+                )
                 what = f"{self.component.name} has no {brief(shown)}"
                 add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)
         return wrong
+
+    def _is_bad_index(self, parts: tuple[str, ...], place: Place, mistakes: Mistakes) -> bool:
+        """Record an entry that a vector hasn't got, or an index behind a number."""
+        name, index = whole_and_index(parts[-1])
+        whole = (*parts[:-1], name)
+        if not index or whole not in self.dimensions:
+            return False
+        shown, size = ".".join(whole), self.size_of(whole) or 0
+        if size:
+            expected, got, hint = f"an index from 1 to {size}", f"{index}", entry(shown, size)
+        else:
+            expected, got, hint = "a vector before the index", f"{shown}, which is a number", shown
+        mistakes.add("E408", place, entry(shown, index), expected=expected, got=got, hint=hint)
+        return True
 
 
 def _visible_names(component: Component) -> Iterator[tuple[tuple[str, ...], Dimension]]:

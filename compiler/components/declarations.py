@@ -2,7 +2,8 @@
 
 Takes: the sections of a definition.
 Gives: `read_equations`, `names_of_faulty`, `read_sends`, `read_variables`, `read_parameters`.
-Guarantees: a number is in SI and of its declared unit's dimension; a fault is reported and its item left out.
+Guarantees: a number is in SI and of its declared unit's dimension; a fault is reported and its item left out;
+a vector is declared as its entries, `x[1]`, `x[2]`.
 Does not: look at how the declarations fit together (see `definitions`).
 """
 
@@ -17,6 +18,8 @@ from apc.compiler.language.expression import Equation, Expr
 from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.units import Unit, parse_quantity, parse_unit, quantity
 from apc.compiler.language.values import Value, text_place
+from apc.compiler.language.vectors import SIZES
+from apc.compiler.language.vectors import entries as vector_entries
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
 from apc.compiler.source.reading import (
     add_unknown,
@@ -24,9 +27,11 @@ from apc.compiler.source.reading import (
     check_keys,
     entries,
     form,
+    listed,
     read_mapping,
     read_name,
     read_text,
+    whole_number,
 )
 
 Sends = tuple[tuple[str, Expr, str, Place], ...]
@@ -95,12 +100,13 @@ def read_variables(node: Node | None, mistakes: Mistakes) -> tuple[Variable, ...
         body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{unit: {meant}}}")
         if name is None or body is None:
             continue
-        body = check_keys(body, ("unit", "start", "about"), f"variable {name}", mistakes)
-        unit = _unit(body, name, mistakes)
-        start = _declared(body.get("start"), name, unit, mistakes)
+        body = check_keys(body, ("unit", "size", "start", "about"), f"variable {name}", mistakes)
+        unit, size = _unit(body, name, mistakes), _size(body, name, mistakes)
+        starts = _entries(body.get("start"), "start", name, unit, size, mistakes)
         about = read_text(body.get("about"), "about", mistakes) or ""
-        if unit is not None:
-            found.append(Variable(name, unit, start, about, key.place))
+        if unit is not None and size is not None:
+            named = zip(vector_entries(name, size), starts, strict=True)
+            found += [Variable(one, unit, start, about, key.place) for one, start in named]
     return tuple(found)
 
 
@@ -131,7 +137,8 @@ def read_parameters(node: Node | None, mistakes: Mistakes) -> tuple[Parameter, .
             elif _has_words(body):
                 parameter = _option(name, body, mistakes)
             else:
-                parameter = _number(name, body, mistakes)
+                found += _numbers(name, body, mistakes)
+                continue
         if parameter is not None:
             found.append(parameter)
     return tuple(found)
@@ -184,10 +191,11 @@ def _table(name: str, body: Mapping, mistakes: Mistakes) -> Reference | None:
         return None
 
 
-def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
-    keys = ("unit", "min", "above", "max", "default", "about", "shared", "options")
+def _numbers(name: str, body: Mapping, mistakes: Mistakes) -> list[Number]:
+    """Read a number's declaration, or a vector's, of which each entry is a number."""
+    keys = ("unit", "size", "min", "above", "max", "default", "about", "shared", "options")
     body = check_keys(body, keys, f"parameter {name}", mistakes)
-    unit = _unit(body, name, mistakes)
+    unit, size = _unit(body, name, mistakes), _size(body, name, mistakes)
     shared = read_text(body.get("shared"), "shared", mistakes)
     node = body.get("shared")
     if shared not in (None, "divided", "whole") and node is not None:
@@ -196,30 +204,64 @@ def _number(name: str, body: Mapping, mistakes: Mistakes) -> Number | None:
     above = _declared(body.get("above"), name, unit, mistakes)
     maximum = _declared(body.get("max"), name, unit, mistakes)
     words = []
+    if size and (node := body.get("options")) is not None:
+        mistakes.add(
+            "E203", node.place, name, expected="a number, to have names for its values", got="a vector"
+        )
     for key, value in entries(read_mapping(body.get("options"), "options", mistakes)):
         number = _declared(value, key.text, unit, mistakes)
         if number is not None:
             words.append((key.text, number))
     node = body.get("default")
     named = dict(words).get(node.text) if isinstance(node, Scalar) else None
-    default = named if named is not None else _declared(node, name, unit, mistakes)
+    defaults = (named,) if named is not None else _entries(node, "default", name, unit, size, mistakes)
     about = read_text(body.get("about"), "about", mistakes) or ""
-    if unit is None:
-        return None
-    declared = Number(
-        name,
-        unit,
-        default,
-        above if above is not None else minimum,
-        above is not None,
-        maximum,
-        shared == "divided",
-        tuple(words),
-        about,
-        body.place,
-    )
-    _check_bounds(declared, body, mistakes)
-    return declared
+    if unit is None or size is None:
+        return []
+    least, most = above if above is not None else minimum, maximum
+    found = [
+        Number(
+            one,
+            unit,
+            default,
+            least,
+            above is not None,
+            most,
+            shared == "divided",
+            tuple(words),
+            about,
+            body.place,
+        )
+        for one, default in zip(vector_entries(name, size), defaults, strict=True)
+    ]
+    for one in found:
+        _check_bounds(one, body, mistakes)
+    return found
+
+
+def _size(body: Mapping, name: str, mistakes: Mistakes) -> int | None:
+    """Read `size: 2`: how many entries a vector has; 0 for a number, None for a fault."""
+    node = body.get("size")
+    if node is None:
+        return 0
+    size = whole_number(node)
+    if size in SIZES:
+        return size
+    hint = f"{name}: {{unit: m, size: 2}}" if size != 1 else f"{name}: {{unit: m}}"
+    mistakes.add("E203", node.place, f"the size of {name}", expected="2 or 3", got=form(node), hint=hint)
+    return None
+
+
+def _entries(
+    node: Node | None, key: str, name: str, unit: Unit | None, size: int | None, mistakes: Mistakes
+) -> tuple[Fraction | None, ...]:
+    """Read the default or start of a number, or the list of a vector's."""
+    if not size:
+        return (_declared(node, name, unit, mistakes),) if size == 0 else ()
+    found = None if node is None else listed(node, key, size, "0", mistakes)
+    if found is None:
+        return (None,) * size
+    return tuple(_declared(one, name, unit, mistakes) for one in found)
 
 
 def _check_bounds(number: Number, body: Mapping, mistakes: Mistakes) -> None:

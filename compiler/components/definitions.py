@@ -8,6 +8,7 @@ Does not: know any topology, or which component is used where.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import replace
 from typing import Protocol, TypeVar
@@ -29,10 +30,12 @@ from apc.compiler.components.declarations import (
     read_sends,
     read_variables,
 )
-from apc.compiler.components.parts import MOST_PARTS, Scope, read_entry
+from apc.compiler.components.parts import MOST_PARTS, Scope, read_count, read_entry
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.values import PEERS
+from apc.compiler.language.vectors import entries as elements
+from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.reading import (
     add_unknown,
@@ -44,6 +47,7 @@ from apc.compiler.source.reading import (
     read_text,
 )
 from apc.compiler.source.source import Source
+from apc.compiler.words import counted
 
 COMPONENT_KEYS = (
     "component",
@@ -72,6 +76,13 @@ def read_connector(source: Source) -> Connector:
     flows = read_variables(root.get("flows"), mistakes)
     name = read_text(root.get("connector"), "connector", mistakes) or ""
     about = read_text(root.get("about"), "about", mistakes) or ""
+    mistakes.raise_if_any()
+    if len(potentials) != len(flows):
+        what = (
+            f"{name} is unbalanced: {counted(len(potentials), 'potential')} for {counted(len(flows), 'flow')}"
+        )
+        hint = "a flow for each potential, of its size"
+        mistakes.add("E501", root.place, what, hint=hint)
     mistakes.raise_if_any()
     return Connector(name, about, potentials, flows)
 
@@ -112,7 +123,7 @@ def read_component(source: Source, library: Definitions) -> Component:
     locals_, found = names.infer_locals(sends), names.infer_sends(sends, mistakes)
     component = replace(draft, locals=(*draft.locals, *locals_), sends=(*draft.sends, *found))
     if not mistakes:
-        names.check(component, mistakes)
+        component = names.check(component, mistakes)
     unread.pass_on(mistakes)
     mistakes.raise_if_any()
     check_balance(component, mistakes)
@@ -149,8 +160,8 @@ def _read_declarations(
             about=about,
             source=cited,
             connectors=(*base.connectors, *connectors),
-            parameters=_overridden(base.parameters, parameters),
-            variables=_overridden(base.variables, variables),
+            parameters=_overridden(base.parameters, parameters, mistakes),
+            variables=_overridden(base.variables, variables, mistakes),
             equations=(*base.equations, *equations),
             place=place,
         )
@@ -184,13 +195,28 @@ class _Named(Protocol):
     @property
     def name(self) -> str: ...
 
+    @property
+    def place(self) -> Place: ...
+
 
 Declared = TypeVar("Declared", bound=_Named)
 
 
-def _overridden(base: tuple[Declared, ...], own: tuple[Declared, ...]) -> tuple[Declared, ...]:
+def _overridden(
+    base: tuple[Declared, ...], own: tuple[Declared, ...], mistakes: Mistakes
+) -> tuple[Declared, ...]:
     """Return the inherited declarations, those declared again replaced in their place, then the new ones."""
     merged = {item.name: item for item in base}
+    sizes = Counter(whole_and_index(item.name)[0] for item in base)
+    mine = Counter(whole_and_index(item.name)[0] for item in own)
+    for item in own:
+        name, index = whole_and_index(item.name)
+        same = mine[name] == sizes[name] and item.name in merged
+        if name in sizes and index <= 1 and not same:
+            before = "a number" if name in merged else f"a vector of {sizes[name]}"
+            mistakes.add(
+                "E205", item.place, f"{name} is {before} in what this component extends", hint="another name"
+            )
     merged.update({item.name: item for item in own})
     return tuple(merged.values())
 
@@ -200,6 +226,7 @@ def _read_inner(
 ) -> tuple[tuple[Inner, ...], tuple[tuple[str, str, str], ...]]:
     """Read the parts inside a component and the connectors it passes on to them."""
     bodies: dict[str, tuple[Mapping, Component, Place]] = {}
+    counts: dict[str, int] = {}
     faulty: set[str] = set()
     hint = "parts: {tip: {type: Mass}}"
     for key, value in entries(read_mapping(root.get("parts"), "parts", mistakes, hint=hint)):
@@ -210,6 +237,8 @@ def _read_inner(
         if name is not None and body is not None and component is not None:
             bodies[name] = (body, component, key.place)
             faulty.discard(name)
+            if (count := read_count(name, body, mistakes)) is not None:
+                counts[name] = count
     dimensions: dict[tuple[str, ...], Dimension] = {(p.name,): p.unit.dimension for p in outer.numbers}
     dimensions[PEERS] = DIMENSIONLESS
 
@@ -221,7 +250,7 @@ def _read_inner(
         names=[".".join(parts) for parts in dimensions],
         references=references,
         parts={name: component for name, (_, component, _) in bodies.items()},
-        counts={},
+        counts=counts,
         faulty=faulty,
         whole=f"the parts of {outer.name}",
         outer=outer,
@@ -229,13 +258,26 @@ def _read_inner(
     inner = []
     for name, (body, component, place) in bodies.items():
         free = [connector for connector, _ in component.connectors]
-        entry = read_entry(name, body, component, place, scope, mistakes, free_connectors=free)
-        inner.append(Inner(name, component, entry, place))
+        count = counts.get(name)
+        for index, one in enumerate(elements(name, count or 0), 1):
+            entry = read_entry(
+                name,
+                body,
+                component,
+                place,
+                scope,
+                mistakes,
+                more_keys=("count",),
+                index=index,
+                count=count,
+                free_connectors=free,
+            )
+            inner.append(Inner(one, component, entry, place))
     deepest = max((component.depth for _, component, _ in bodies.values()), default=0)
     if deepest >= DEEPEST:
         what = f"the parts of {outer.name} stand inside one another more than {DEEPEST} deep"
         mistakes.add("E216", outer.place, what, hint="fewer components around one another")
-    if (size := outer.size + sum(component.size for _, component, _ in bodies.values())) > MOST_PARTS:
+    if (size := outer.size + sum(part.component.size for part in inner)) > MOST_PARTS:
         what = (
             f"{outer.name} holds {size:,} parts, those inside parts included, and {MOST_PARTS} are the most"
         )
@@ -246,25 +288,25 @@ def _read_inner(
         for own, other, theirs in part.entry.connections
         if not other
     ]
-    passed += _read_connect(root.get("connect"), outer, bodies, faulty, mistakes)
+    passed += _read_connect(root.get("connect"), outer, inner, faulty, mistakes)
     return tuple(inner), tuple(passed)
 
 
 def _read_connect(
     node: Node | None,
     outer: Component,
-    bodies: dict[str, tuple[Mapping, Component, Place]],
+    inner: Collection[Inner],
     faulty: Collection[str],
     mistakes: Mistakes,
 ) -> list[tuple[str, str, str]]:
     """Read `connect: {flange: tip.flange}`: connectors of the component that are those of an inner part."""
     found = []
     own = dict(outer.connectors)
-    known = [f"{p}.{c}" for p, (_, component, _) in bodies.items() for c, _ in component.connectors]
+    known = [f"{part.name}.{c}" for part in inner for c, _ in part.component.connectors]
     hint = "connect: {flange: tip.flange}"
     for key, value in entries(read_mapping(node, "connect", mistakes, hint=hint)):
         text = read_text(value, key.text, mistakes, hint=f"{key.text}: tip.flange")
-        if text is None or text.partition(".")[0] in faulty:  # which is told of already
+        if text is None or text.partition(".")[0].partition("[")[0] in faulty:  # which is told of already
             continue
         if key.text not in own:
             what = f"connect names {brief(key.text)}, which is no connector of this component"
@@ -320,11 +362,14 @@ def _check_distinct(
 ) -> None:
     seen = {name for name, _ in connectors}
     for item in (*parameters, *variables):
-        if item.name in seen:
-            mistakes.add("E205", item.place, f"the name {item.name} is used twice in this component")
-        if item.name in RESERVED:
-            mistakes.add("E205", item.place, f"{item.name} is a word of the language and can't be a name")
-        seen.add(item.name)
+        name, index = whole_and_index(item.name)
+        if index > 1:
+            continue
+        if name in seen:
+            mistakes.add("E205", item.place, f"the name {name} is used twice in this component")
+        if name in RESERVED:
+            mistakes.add("E205", item.place, f"{name} is a word of the language and can't be a name")
+        seen.add(name)
 
 
 def _connectors(

@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 
 from apc.compiler.components.component import Component, Entry, Number, Option, Reference
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
-from apc.compiler.language.values import Binding, read_binding
+from apc.compiler.language.expression import format_expression
+from apc.compiler.language.grammar import parse_expression
+from apc.compiler.language.values import Binding, is_quantity, read_binding, text_place
+from apc.compiler.language.vectors import entries, entry, sizes_of, whole_and_index, written_out
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import add_unknown, brief, check_keys, read_text
+from apc.compiler.source.reading import add_unknown, brief, check_keys, form, listed, read_text, whole_number
 
 GROUND = "ground"
 LARGEST_ARRAY = 500
@@ -50,6 +54,19 @@ class Scope:
     whole: str
     complete: bool = True
     outer: Component | None = None
+
+
+def read_count(name: str, body: MappingNode, mistakes: Mistakes, *, single: bool = False) -> int | None:
+    """Return how many of a part there are; None for one that is no array, as a `single` one never is."""
+    node = body.get("count")
+    if node is None:
+        return None
+    count = whole_number(node)
+    if not single and count is not None and 1 <= count <= LARGEST_ARRAY:
+        return count
+    expected = "no count, as a link is one" if single else f"a whole number from 1 to {LARGEST_ARRAY}"
+    mistakes.add("E208", node.place, f"the count of {name}", expected=expected, got=form(node))
+    return None
 
 
 def read_entry(
@@ -85,14 +102,17 @@ def read_entry(
         Those of its connectors that may be left unjoined here, as those of a mass.
     """
     connectors = dict(component.connectors)
-    parameters = [p.name for p in component.parameters]
-    variables = [v.name for v in component.variables if v.start is not None]
+    numbers = {p.name: p.unit.text for p in component.parameters if isinstance(p, Number)}
+    numbers |= {v.name: v.unit.text for v in component.variables if v.start is not None}
+    words = [p.name for p in component.parameters if not isinstance(p, Number)]
+    known = dict.fromkeys(whole_and_index(key)[0] for key in numbers)
     body = check_keys(
         body,
-        ("type", *more_keys, *connectors, *parameters, *variables),
+        ("type", *more_keys, *connectors, *words, *known),
         f"{name} ({component.name})",
         mistakes,
     )
+    body = with_entries(body, numbers, scope, mistakes)
     reader = _EntryReader(name, body, place, scope, mistakes, index, count)
     told = reader.parameters(component)
     starts = reader.starts(component)
@@ -105,6 +125,53 @@ def read_entry(
     if len(targets) > 1 and len(set(targets)) == 1:
         mistakes.add("E210", place, f"{name} joins {targets[0][0]} to itself")
     return Entry(told.values, told.options, told.references, told.described, starts, connections)
+
+
+def with_entries(
+    body: MappingNode, numbers: Mapping[str, str], scope: Scope, mistakes: Mistakes
+) -> MappingNode:
+    """Return an entry in which each entry of a vector has a key, `x[1]`, in the place of `x: [1 m, 0 m]`.
+
+    Parameters
+    ----------
+    body
+        The entry.
+    numbers
+        The numbers, and entries of vectors, that it may give, and the unit of each.
+    scope
+        What it can refer to: `x: x0` takes a vector of a component around it.
+    mistakes
+        Takes E203 a list of another length, or none.
+    """
+    vectors = {parts[0]: size for parts, size in sizes_of((name,) for name in numbers).items()}
+    if not vectors:
+        return body
+    found: list[tuple[Scalar, Node]] = []
+    for key, node in body.entries:
+        size = vectors.get(key.text, 0)
+        unit = numbers.get(entry(key.text, 1), "")
+        values = _vector(node, key.text, size, unit, scope, mistakes) if size else (node,)
+        for one, value in zip(entries(key.text, size), values, strict=False):
+            found.append((replace(key, text=one), value))
+    return replace(body, entries=tuple(found))
+
+
+def _vector(
+    node: Node, what: str, size: int, unit: str, scope: Scope, mistakes: Mistakes
+) -> tuple[Node, ...]:
+    """Return a node for each entry of a vector; with a fault, which is told, none."""
+    if isinstance(node, Scalar) and scope.outer is not None and not is_quantity(node.text):
+        place = text_place(node)
+        sizes = sizes_of(tuple(name.split(".")) for name in scope.names)
+        try:
+            tree = parse_expression(node.text, place)
+            found = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
+        except ApcError as error:
+            mistakes.take(error)
+            return ()
+        if isinstance(found, tuple) and len(found) == size:
+            return tuple(replace(node, text=format_expression(one)) for one in found)
+    return listed(node, what, size, f"0 {unit}".removesuffix(" 1"), mistakes) or ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,9 +99,16 @@ class Conditional(Spanned):
     otherwise: Expr
 
 
+@dataclass(frozen=True, slots=True)
+class Vector(Spanned):
+    """`{a, b}`: a vector by its entries; none is left behind `vectors`."""
+
+    entries: tuple[Expr, ...]
+
+
 V = TypeVar("V")
 
-Expr = Number | Name | Negate | Binary | Compare | Logic | Not | Call | Conditional
+Expr = Number | Name | Negate | Binary | Compare | Logic | Not | Call | Conditional | Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +143,9 @@ FUNCTIONS: dict[str, tuple[int, int]] = {
     "mean": (1, 1),
     "sum": (1, 1),
     "count": (1, 1),
+    "dot": (2, 2),
+    "norm": (1, 1),
+    "cross": (2, 2),
 }
 
 KEYWORDS = frozenset(("if", "then", "elseif", "else", "and", "or", "not"))
@@ -206,6 +216,8 @@ def _format(expr: Expr) -> tuple[str, int]:
         case Conditional():
             parts = f"if {_format(expr.condition)[0]} then {_format(expr.then)[0]}"
             return f"{parts} else {_format(expr.otherwise)[0]}", 0
+        case Vector():
+            return f"{{{', '.join(_format(entry)[0] for entry in expr.entries)}}}", Level.ATOM
 
 
 def _inside(expr: Expr, level: int) -> str:
@@ -249,6 +261,8 @@ def children(expr: Expr) -> tuple[Expr, ...]:
             return expr.arguments
         case Conditional():
             return (expr.condition, expr.then, expr.otherwise)
+        case Vector():
+            return expr.entries
 
 
 def rebuild(expr: Expr, parts: tuple[Expr, ...]) -> Expr:
@@ -264,6 +278,8 @@ def rebuild(expr: Expr, parts: tuple[Expr, ...]) -> Expr:
             return replace(expr, arguments=parts)
         case Conditional():
             return replace(expr, condition=parts[0], then=parts[1], otherwise=parts[2])
+        case Vector():
+            return replace(expr, entries=parts)
 
 
 def walk(expr: Expr) -> Iterator[Expr]:

@@ -19,6 +19,7 @@ The grammar, loosest first; `^` and `**` are the same:
     power       = atom ["^" exponent]
     exponent    = ["-"] number | "(" ["-"] number ["/" number] ")"
     atom        = number | name | function "(" expression {"," expression} ")" | "(" expression ")"
+                | "{" expression {"," expression} "}"
     name        = segment {"." segment},   segment = letter {letter | digit | "_"} ["[" integer "]"]
 """
 
@@ -46,6 +47,7 @@ from apc.compiler.language.expression import (
     Negate,
     Not,
     Number,
+    Vector,
     format_expression,
 )
 from apc.compiler.language.lexer import Token, tokens
@@ -166,8 +168,11 @@ class _Parser:
             return
         if self.kind == ")":
             self.fail("E322", "this ) closes nothing")
+        if self.kind == "}":
+            self.fail("E322", "this } closes nothing")
         if self.kind == ",":
-            self.fail("E322", "a comma stands between the arguments of a function only")
+            what = "commas stand between arguments, or entries of a vector, only"
+            self.fail("E322", what)
         if self.kind in KEYWORDS:
             self.fail("E322", f"{self.token.text} belongs to an if … then … else, and none is open here")
         self.fail("E322", "an operator was expected", "", f"here, not {self.got()}")
@@ -254,6 +259,11 @@ class _Parser:
                 return self.name_or_call()
             case "(":
                 return self.parenthesis()
+            case "{":
+                self.step()
+                entries = self.arguments("}", "an entry of a vector")
+                end = self.expect("}", "an opened {").end
+                return self.built(Vector(entries, start=token.start, end=end), *entries)
             case "+":
                 self.step()
                 return self.number(Level.SIGN)
@@ -373,17 +383,22 @@ class _Parser:
                 what += f"; there are: {', '.join(sorted(FUNCTIONS))}"
             self.fail("E325", what, hint=f"{close}(…)" if close else "", at=token.start)
         self.step()
-        arguments: list[Expr] = []
-        while self.kind != ")":
-            arguments.append(self.number(0))
+        arguments = self.arguments(")", f"an argument of {function}")
+        end = self.expect(")", f"{function}(").end
+        self.check_count(function, len(arguments), token.start)
+        return self.built(Call(function, arguments, start=token.start, end=end), *arguments)
+
+    def arguments(self, close: str, each: str) -> tuple[Expr, ...]:
+        """Parse expressions with commas between them, up to what closes them."""
+        found: list[Expr] = []
+        while self.kind != close:
+            found.append(self.number(0))
             if self.kind != ",":
                 break
             self.step()
-            if self.kind == ")":
-                self.fail("E322", f"an argument of {function} is missing behind the comma")
-        end = self.expect(")", f"{function}(").end
-        self.check_count(function, len(arguments), token.start)
-        return self.built(Call(function, tuple(arguments), start=token.start, end=end), *arguments)
+            if self.kind == close:
+                self.fail("E322", f"{each} is missing behind the comma")
+        return tuple(found)
 
     def check_count(self, function: str, count: int, at: int) -> None:
         least, most = FUNCTIONS[function]

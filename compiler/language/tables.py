@@ -32,7 +32,9 @@ from apc.compiler.source.reading import brief
 MAX_BYTES = 1 << 26  # 64 MiB: some eight million numbers, read in a few seconds
 MOST_COLUMNS = 1000  # more than a scene has parameters that differ from peer to peer
 MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.]*\Z")
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\[\]]*\Z")
+# The last bracket holds the unit; those before it, the index of an entry or of an element.
+_HEADING = re.compile(r"(?P<name>[^\[\]]*(\[[0-9]+\][^\[\]]*)*?)(\[(?P<unit>[^\[\]]*)\])?\Z")
 
 Headings = tuple[tuple[str, Unit, Place], ...]  # name, unit and where it stands
 
@@ -228,11 +230,11 @@ def _headings(texts: list[str], file: str) -> Headings:
 
 def _parts(heading: str) -> tuple[str, str | None]:
     """Return the name and the unit of a heading, None if it has none; no name if it is no heading."""
-    name, bracket, unit = heading.strip().partition("[")
-    inside = unit.removesuffix("]")
-    if "]" in name or "[" in inside or "]" in inside or (bracket and inside == unit):
+    found = _HEADING.match(heading.strip())
+    if found is None:
         return "", None
-    return name.strip(), inside.strip() if bracket else None
+    unit = found["unit"]
+    return found["name"].strip(), None if unit is None else unit.strip()
 
 
 def _heading(text: str, place: Place, mistakes: Mistakes) -> tuple[str, Unit]:

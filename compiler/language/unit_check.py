@@ -26,6 +26,7 @@ from apc.compiler.language.expression import (
     Negate,
     Not,
     Number,
+    Vector,
     format_expression,
 )
 from apc.compiler.language.unit_text import format_dimension
@@ -161,6 +162,8 @@ class _Checker:
             case Conditional(condition, then, otherwise):
                 self.dimension(condition)
                 return self.agree("E404", [then, otherwise])
+            case Vector():
+                return self.agree("E404", list(expr.entries))
             case Call():
                 return self.call(expr)
 
@@ -188,6 +191,8 @@ class _Checker:
             case "sign" | "count":
                 self.dimension(first)
                 return DIMENSIONLESS
+            case "dot" | "cross":
+                return self.product(Binary("*", *expr.arguments))
             case "sqrt":
                 inside = self.factor(first)
                 return None if inside is None else inside.power(Fraction(1, 2))
@@ -205,5 +210,5 @@ class _Checker:
                     assert found is not None
                     self.add("E405", expr.arguments[1], "s, as tables are over time", found)
                 return self.dimension(first)
-            case _:  # sample, previous, initial, mean, sum, abs: the same quantity
+            case _:  # sample, previous, initial, mean, sum, abs, norm: the same quantity
                 return self.dimension(first)

@@ -21,6 +21,7 @@ from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.unit_check import ANY, dimension_of
 from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import parse_quantity, parse_unit, quantity
+from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import add_unknown, brief, read_text
 
@@ -186,7 +187,7 @@ def _expression(
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
 ) -> Expr:
-    tree = parse_expression(text, place)
+    tree = number_of(parse_expression(text, place), text, place)
     check_names(tree, text, place, what, known, names_known)
     found = dimension_of(tree, lambda name: known(name.parts), text, place)
     if found not in (None, ANY, dimension):
@@ -249,7 +250,8 @@ def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | Non
         if is_quantity(text):
             found = parse_quantity(text, node.place)
             return Binding(found.value, None, found.unit.dimension, node.place)
-        return Binding(None, parse_expression(text, text_place(node)), DIMENSIONLESS, text_place(node))
+        place = text_place(node)
+        return Binding(None, number_of(parse_expression(text, place), text, place), DIMENSIONLESS, place)
     except ApcError as error:
         mistakes.take(error)
         return None

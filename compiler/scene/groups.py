@@ -29,6 +29,8 @@ from apc.compiler.language.expression import names
 from apc.compiler.language.tables import Column, NamedFiles, Table, read_table
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import PEERS, Value
+from apc.compiler.language.vectors import SIZES, entry
+from apc.compiler.language.vectors import entries as vector_entries
 from apc.compiler.scene.instances import Part
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar, Sequence
@@ -38,6 +40,7 @@ from apc.compiler.source.reading import (
     check_keys,
     entries,
     form,
+    listed,
     read_mapping,
     read_name,
     read_text,
@@ -195,7 +198,7 @@ def read_settings(
     words: list[tuple[str, str]] = []
     columns: dict[str, NDArray[np.float64]] = {}
     section = read_mapping(group.body.get("set"), "set", mistakes, hint="set: {device.mass: 0.2 kg}")
-    for key, node in entries(section):
+    for key, node in _entry_by_entry(section, group, settable, mistakes):
         items = settable.get(key.text)
         if items is None and explained(key.text, key.place):
             continue
@@ -221,6 +224,35 @@ def read_settings(
             columns[whole] = column_.numbers
             _check_column(column_, group.table.lines if group.table is not None else (), item, mistakes)
     return Settings(tuple(values), tuple(words), tuple(columns.items()))
+
+
+def _entry_by_entry(
+    section: MappingNode | None,
+    group: GroupBody,
+    settable: Mapping[str, list[tuple[str, Settable]]],
+    mistakes: Mistakes,
+) -> Iterator[tuple[Scalar, Node]]:
+    """Yield what a group sets, a vector as its entries.
+
+    A list of a vector's entries is that vector at each peer; a list of such lists has one a peer.
+    """
+    for key, node in entries(section):
+        size = next((k for k in reversed(SIZES) if entry(key.text, k) in settable), 0)
+        if not size:
+            yield key, node
+            continue
+        unit = next(i.unit.text for _, i in settable[entry(key.text, 1)] if isinstance(i, Number | Variable))
+        one = f"0 {unit}".removesuffix(" 1")
+        nested = isinstance(node, Sequence) and any(isinstance(item, Sequence) for item in node.items)
+        rows = node.items if nested and isinstance(node, Sequence) else (node,)
+        values = [listed(row, key.text, size, one, mistakes) for row in rows]
+        if not nested and group.table is None and group.body.get("count") is None:
+            what = f"{key.text} is a vector of {size}, and its list doesn't tell how many peers there are"
+            mistakes.add("E201", node.place, what, hint="count: 3")
+        for k, name in enumerate(vector_entries(key.text, size)):
+            column = tuple(value[k] for value in values if value is not None)
+            if len(column) == len(values):
+                yield replace(key, text=name), Sequence(column, node.place) if nested else column[0]
 
 
 def _word(

@@ -9,11 +9,12 @@ Does not: read a section (see `scene`), or look into equations.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from collections.abc import Mapping as MappingType
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
+from itertools import product
 
 from apc.compiler.components.component import Component, Inner, Reference, Settable
 from apc.compiler.components.parts import GROUND, MOST_PARTS, Scope, read_entry
@@ -28,6 +29,7 @@ from apc.compiler.language.values import (
     renamed,
     settle,
 )
+from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
 from apc.compiler.source.reading import (
@@ -286,8 +288,13 @@ def settable_names(parts: Collection[Part]) -> dict[str, list[tuple[str, Settabl
         for item in items:
             whole = f"{part.name}.{item.name}"
             found.setdefault(whole, []).append((whole, item))
-            head, bracket, rest = part.name.partition("[")
-            if bracket:
-                alias = f"{head}{rest.partition(']')[2]}.{item.name}"
-                found.setdefault(alias, []).append((whole, item))
+            for name in _of_arrays(part.name):
+                found.setdefault(f"{name}.{item.name}", []).append((whole, item))
     return found
+
+
+def _of_arrays(part: str) -> Iterator[str]:
+    """Yield the names that stand for a part among others: `a[1].b[2]` is one of `a.b[2]`, `a[1].b`, `a.b`."""
+    elements = [(name, whole_and_index(name)[0]) for name in part.split(".")]
+    names = product(*(dict.fromkeys(either) for either in elements))
+    return (one for name in names if (one := ".".join(name)) != part)

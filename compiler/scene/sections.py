@@ -12,12 +12,12 @@ from collections.abc import Collection
 
 from apc.compiler.components.definitions import read_type
 from apc.compiler.components.library import Library
-from apc.compiler.components.parts import LARGEST_ARRAY, Scope
+from apc.compiler.components.parts import Scope, read_count
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.scene.instances import PartEntry
 from apc.compiler.scene.named_numbers import NamedNumbers, read_new_name
 from apc.compiler.source.nodes import Mapping, Node
-from apc.compiler.source.reading import entries, form, read_mapping, whole_number
+from apc.compiler.source.reading import entries, read_mapping
 
 SECTIONS = ("masses", "couplers", "links", "hands")
 DEFAULT_TYPES = {"masses": "Mass", "links": "Link"}
@@ -65,26 +65,10 @@ class PartSections:
             default, example = DEFAULT_TYPES.get(section), _TYPE_EXAMPLES.get(section, "Mass")
             component = read_type(key, body, default, self.library, mistakes, example=example)
             if component is not None:
-                count = self._count(name, section, body)
+                count = read_count(name, body, mistakes, single=section == "links")
                 self.entries[name] = PartEntry(section, body, component, key.place, count)
                 self.taken.add(name)
                 self.faulty.discard(name)
-
-    def _count(self, name: str, section: str, body: Mapping) -> int | None:
-        """Return how many of a part there are; None for one that is no array."""
-        node = body.get("count")
-        if node is None:
-            return None
-        count = whole_number(node)
-        if section != "links" and count is not None and 1 <= count <= LARGEST_ARRAY:
-            return count
-        expected = (
-            f"a whole number from 1 to {LARGEST_ARRAY}"
-            if section != "links"
-            else "no count, as a link is one"
-        )
-        self.mistakes.add("E208", node.place, f"the count of {name}", expected=expected, got=form(node))
-        return None
 
     def is_reported(self, name: str) -> bool:
         """Return whether `part.parameter` is of a part that is missing for a fault that was reported."""

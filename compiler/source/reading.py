@@ -69,6 +69,26 @@ def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "
     return None
 
 
+def listed(node: Node, what: str, size: int, one: str, mistakes: Mistakes) -> tuple[Node, ...] | None:
+    """Return the items of a list that has as many as a vector has entries.
+
+    Parameters
+    ----------
+    node, what, mistakes
+        As for `read_mapping`.
+    size
+        How many there must be.
+    one
+        An item to show in a message.
+    """
+    if isinstance(node, Sequence) and len(node.items) == size:
+        return node.items
+    got = f"{len(node.items)}" if isinstance(node, Sequence) else form(node)
+    hint = f"{what}: [{', '.join([one] * size)}]"
+    mistakes.add("E203", node.place, what, expected=f"a list of {size} values", got=got, hint=hint)
+    return None
+
+
 def whole_number(node: Node) -> int | None:
     """Return the whole number that a scalar is; None if it is none, as `true` or one in quotes."""
     value = node.value if isinstance(node, Scalar) else None

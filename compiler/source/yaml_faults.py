@@ -7,6 +7,8 @@ Does not: read YAML.
 
 from __future__ import annotations
 
+import re
+
 import yaml
 
 from apc.compiler.errors import Mistake, Place
@@ -42,6 +44,11 @@ _PROBLEMS: tuple[tuple[str, str, str], ...] = (
 )
 
 
+# What a bracket stands behind in a text, and what it holds with the rest of the text.
+_TEXT = re.compile(r"[^\s,:{}\[\]'\"][^,:{}\[\]'\"]*\Z")
+_BRACKET = re.compile(r"[\[{][^{}\[\]]*[\]}][^,:{}\[\]]*")
+
+
 def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
     """Rewrite PyYAML's error as one sentence at the place that has to change."""
     mark = error.problem_mark or error.context_mark
@@ -56,6 +63,12 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
         quoted = f"'{rest.strip()[:40]}'"
         return Mistake("E109", place, f"a text starting with {rest[:1]} needs quotes", hint=quoted)
     told = f"{error.problem}; {error.context}"
+    before = _TEXT.search(place.source_line[: place.column - 1])
+    bracket = _BRACKET.match(rest)
+    if before and bracket and "expected ','" in told:  # x[1], {1, 0} or chain[1:2] between { and }
+        text = before[0] + bracket[0].rstrip()
+        where = place.shifted(-len(before[0]))
+        return Mistake("E109", where, f"a text with {rest[0]} in it needs quotes here", hint=f'"{text}"')
     for part, sentence, hint in _PROBLEMS:
         if part in told:
             opened = sentence.startswith("this ") and error.context_mark is not None

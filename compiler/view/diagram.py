@@ -7,7 +7,7 @@ Does not: place anything on a page: `picture` does, or Graphviz.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 
 from apc.compiler.components.component import Number, Reference
@@ -17,6 +17,7 @@ from apc.compiler.language.dimensions import SECOND, Dimension
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_si
 from apc.compiler.language.values import Value
+from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene
@@ -169,20 +170,35 @@ def _node(scene: Scene, part: Part, name: str, count: int) -> Vertex:
 
 def _numbers(scene: Scene, part: Part) -> Iterator[str]:
     """Yield a part's numbers, those that are zero left out, and its words that are no default."""
-    for own, value in part.values:
-        if value.number:
-            yield f"{own} {_quantity(part, own, value)}{_expression(value)}"
-        parameter = part.component.parameter(own)
-        if part.shared and isinstance(parameter, Number) and parameter.divided:
-            each = Value(value.number / scene.peers, value.dimension, None, value.place)
-            yield f"shared: {_quantity(part, own, each)} a copy"
-    for own, value in part.starts:
-        yield f"{own} starts at {_quantity(part, own, value)}"
+    for name, named in _by_vector(part.values):
+        if any(value.number for _, value in named):
+            yield f"{name} {_quantities(part, named)}{_expression(named[0][1]) if len(named) == 1 else ''}"
+        for own, value in named:
+            parameter = part.component.parameter(own)
+            if part.shared and isinstance(parameter, Number) and parameter.divided:
+                each = Value(value.number / scene.peers, value.dimension, None, value.place)
+                yield f"shared: {_quantity(part, own, each)} a copy"
+    for name, named in _by_vector(part.starts):
+        yield f"{name} starts at {_quantities(part, named)}"
     for own, word in part.options:
         if word != getattr(part.component.parameter(own), "default", None):
             yield f"{own} {word}"
     for table in part.tables:
         yield f"{table.name}: a table of {len(table.times)} rows"
+
+
+def _by_vector(values: Iterable[tuple[str, Value]]) -> Iterator[tuple[str, list[tuple[str, Value]]]]:
+    """Yield numbers by name, the entries of a vector together."""
+    found: dict[str, list[tuple[str, Value]]] = {}
+    for own, value in values:
+        found.setdefault(whole_and_index(own)[0], []).append((own, value))
+    yield from found.items()
+
+
+def _quantities(part: Part, named: Sequence[tuple[str, Value]]) -> str:
+    """Return a number with its unit, or those of a vector's entries."""
+    shown = [_quantity(part, own, value) for own, value in named]
+    return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
 
 
 def _expression(value: Value) -> str:

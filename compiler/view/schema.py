@@ -20,6 +20,7 @@ from apc.compiler.errors import Place
 from apc.compiler.functions.exchange import LOSS_ABOUT
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.units import Unit, parse_unit
+from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.channels import PROBABILITIES
 from apc.compiler.scene.graphs import SHAPES
 from apc.compiler.scene.instances import PART_KEYS
@@ -180,15 +181,31 @@ def _part(component: Component, quantities: _Quantities) -> Schema:
     for name, connector in component.connectors:
         about = f"the part, or its connector, that this {connector.name} is joined to"
         properties[name] = {"$ref": "#/$defs/joined", "description": about}
+    entries: dict[str, list[Schema]] = {}
     for parameter in component.parameters:
-        properties[parameter.name] = _parameter(parameter, quantities)
+        entries.setdefault(whole_and_index(parameter.name)[0], []).append(_parameter(parameter, quantities))
     for variable in component.variables:
         if variable.start is not None:
-            about = f"start value of the {variable.about or variable.name}"
-            properties[variable.name] = {**quantities.of(variable.unit), "description": about}
+            name, _ = whole_and_index(variable.name)
+            about = f"start value of the {variable.about or name}"
+            entries.setdefault(name, []).append({**quantities.of(variable.unit), "description": about})
+    properties |= {name: found[0] if len(found) == 1 else _vector(found) for name, found in entries.items()}
+    required = [whole_and_index(p.name)[0] for p in component.parameters if _is_required(p)]
     return {
         "description": component.about,
-        **_object(properties, required=[p.name for p in component.parameters if _is_required(p)]),
+        **_object(properties, required=dict.fromkeys(required)),
+    }
+
+
+def _vector(entries: list[Schema]) -> Schema:
+    """Return the schema of a list with a value for each entry of a vector."""
+    size, about = len(entries), entries[0].get("description", "")
+    return {
+        "type": "array",
+        "description": about,
+        "prefixItems": entries,
+        "minItems": size,
+        "maxItems": size,
     }
 
 
@@ -266,6 +283,7 @@ def _by_type(choices: dict[str, Schema]) -> Schema:
 
 def _group() -> Schema:
     value = {"type": ["string", "number"]}
+    values = {"type": "array", "items": value}
     return {
         "anyOf": [{"required": [key]} for key in ("count", "set", "table")],
         **_object(
@@ -280,7 +298,7 @@ def _group() -> Schema:
                     "type": "object",
                     "description": "this group's own settings; a list has a value a peer",
                     "propertyNames": {"pattern": _SETTING},
-                    "additionalProperties": {"anyOf": [value, {"type": "array", "items": value}]},
+                    "additionalProperties": {"anyOf": [value, values, {"type": "array", "items": values}]},
                 },
                 "table": {**_string(), "description": "a CSV file with a row a peer"},
             }

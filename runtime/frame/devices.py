@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.frozen import dataclass
+from apc.compiler.language.vectors import whole_and_index
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.overrides import apply, parse_override
@@ -53,7 +54,7 @@ _NUMBERS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Device:
-    """What a hand holds: the part, its position and velocity among the states.
+    """What a hand holds: the part, or an axis of it, its position and velocity among the states.
 
     A force F there adds F · `inverse` to the rate of the velocity, exact for the numbers it was found with;
     `mass` is the same for any, as a CasADi function (x, u, p, t) → 1/m.
@@ -81,7 +82,8 @@ def find_device(
     site, parameters, unit_of, listening
         The kind, a vector (n_p,) of its parameters, their units, and what it hears at the start.
     part
-        The part that is meant; without it, the only one that others are not told about.
+        The part that is meant, or the axis of one that moves along several, `device.x[2]`; without it, the
+        only one that others are not told about.
     """
     kind = site.kind
     if not (site.walkable and kind.derivative.is_a("SXFunction")):
@@ -101,7 +103,7 @@ def find_device(
     for place, state in enumerate(kind.states):
         driven = np.flatnonzero(site.pattern.a[place])
         own = _part(state.name)
-        wanted = own == part if part else own not in told_of
+        wanted = part in (own, state.name) if part else own not in told_of
         if state.unit != "m" or not wanted or len(driven) != 1 or site.pattern.b[place].any():
             continue
         velocity = int(driven[0])
@@ -116,6 +118,8 @@ def find_device(
             for at in range(len(slopes))
             if slopes[at] and change[at]
         }
+        if whole_and_index(state.name)[1]:
+            own = state.name  # one axis of several
         if len(set(inverses.values())) == 1:
             (mass, at), inverse = next(iter(inverses.items()))
             shared = peers if copied[at] else None
@@ -194,7 +198,9 @@ def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands
             one
             or f"{group.name} has no {part or 'device: every mass of it is a copy that others are told of'}"
         )
-        raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {why}", hint=OWN_MASS))
+        raise ApcError(
+            Mistake("E931", Place(system.origin.topology), f"{option}: {why}", hint="" if one else OWN_MASS)
+        )
     return found
 
 

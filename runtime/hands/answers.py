@@ -21,6 +21,7 @@ from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
+from apc.compiler.language.vectors import whole_and_index
 from apc.eigen.closing import Loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup
@@ -73,11 +74,14 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
         for one in (other, port):
             if one.peer not in group.peers:
                 continue
-            named = one.part or (port.part if port.peer in group.peers else "")
+            along = port.peer in group.peers or whole_and_index(port.part)[1]
+            named = one.part or (port.part if along else "")
             device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=named)
             if not isinstance(device, Device):
                 what = device or f"{group.name} has no device"
-                hint = f"--at with the part that is held, as {group.name}[1].device" if device else OWN_MASS
+                moving = [state.name for state in group.jacobians.kind.states]
+                meant = next((n for n in moving if whole_and_index(n)[1] == 1 and n in what), "device")
+                hint = f"--at with the part that is held, as {group.name}[1].{meant}" if device else OWN_MASS
                 raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
             held[one] = device
         if device is None:
@@ -150,7 +154,8 @@ class Responses:
         self.peer, self.across = peer, other
         self.own, self.to = modes.class_of[peer], modes.class_of[other]
         self.device, self.other = modes.device, modes.other
-        self.copies = [_copy(site.group) for site in modes.loops[0].sites]
+        _, axis = whole_and_index(modes.device.part)
+        self.copies = [_copy(site.group, axis) for site in modes.loops[0].sites]
         named = self.copies[self.own]
         self.copy = named[0] if named else ""
 
@@ -253,15 +258,19 @@ class Responses:
         return found
 
 
-def _copy(group: PeerGroup) -> tuple[str, int] | None:
-    """Return what a peer tells others the position of, and which state that is; None if nothing."""
+def _copy(group: PeerGroup, axis: int) -> tuple[str, int] | None:
+    """Return what a peer tells others the position of, and which state that is; None if nothing.
+
+    Of a position with several axes it is the one along that of the device, or 0 for the only one.
+    """
     kind = group.jacobians.kind
     for send, sending in zip(group.site.sends, kind.sends, strict=True):
         for row, unit in zip(send.x, sending.units, strict=True):
             places = np.flatnonzero(row)
             if unit == "m" and len(places) == 1 and row[places[0]] == 1:
                 place = int(places[0])
-                return kind.states[place].name.rpartition(".")[0], place
+                if whole_and_index(kind.states[place].name)[1] == axis:
+                    return kind.states[place].name.rpartition(".")[0], place
     return None
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.frozen import dataclass
+from apc.compiler.language.vectors import whole_and_index
 from apc.frame.parameters import resolve
 from apc.option_value import option_value
 
@@ -62,7 +63,9 @@ def find_port(system: CompiledSystem, text: str, option: str) -> Port:
         first, _, rest = own.partition(".")
         if first in names:
             group, number, own = first, "1", rest
-    parts = sorted({name.name.rpartition(".")[0] for kind in system.kinds for name in kind.states})
+    states = [state.name for kind in system.kinds for state in kind.states]
+    parts = sorted({name.rpartition(".")[0] for name in states})
+    parts += sorted({name for name in states if whole_and_index(name)[1]})  # an axis of one
     named = own if own in parts else "device" if "device" in parts else next(iter(parts), "device")
     example = f'{option} "{names[0]}[1].{named}"'
     if group is not None and group not in names:

@@ -187,7 +187,8 @@ def open_ports(
         device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
         if not isinstance(device, Device):
             what = f"{option}: {device or f'{group.name} has no device'}"
-            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=OWN_MASS))
+            hint = "" if device else OWN_MASS
+            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
         felt = _felt_velocity(group, device)
         if felt:
             return felt

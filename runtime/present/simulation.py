@@ -23,6 +23,7 @@ from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text, note
 from apc.present.pictures import check_format, write_figure
+from apc.present.plane import draw_paths, paths_of
 from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ DASHES = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (7, 2)), (0, (
 MOST_CURVES = 24  # in a panel: more can't be told apart
 MOST_POINTS = 2000  # of a curve: about one a pixel and a half of a wide picture
 WIDTH, HEIGHT = 9.0, 2.4  # inches: of the figure, of a panel
+PATHS = 2.0  # times as high is a plane
 _WORDS = {
     "rests": "Nothing moves: no force and no start value sets it in motion.",
     "settles": "From {settled} on every position stays within 5 % of its range.",
@@ -283,11 +285,21 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
         _panel(ax, trajectory, unit, places)
         ax.set_xlabel("time [s]")
         return ax.figure
-    figure = figures.Figure(figsize=(WIDTH, HEIGHT * len(panels) + 0.6), layout="constrained")
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for one, (unit, places) in zip(axes, panels.items(), strict=True):
+    paths = paths_of(trajectory.signals)
+    heights = [1.0] * len(panels) + [PATHS] * bool(paths)
+    figure = figures.Figure(figsize=(WIDTH, HEIGHT * sum(heights) + 0.6), layout="constrained")
+    axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for one, (unit, places) in zip(axes, panels.items(), strict=False):
         _panel(one, trajectory, unit, places)
-    axes[-1].set_xlabel("time [s]")
+        if one is not axes[0]:
+            one.sharex(axes[0])
+        one.tick_params(labelbottom=one is axes[len(panels) - 1])
+    axes[len(panels) - 1].set_xlabel("time [s]")
+    if paths:
+        styles = [_style(trajectory.signals, [one for one, _ in paths], place) for place, _ in paths]
+        drawn = [(*pair, *style) for pair, style in zip(paths, styles, strict=True)]
+        draw_paths(axes[-1], trajectory.signals, trajectory.values, drawn[:MOST_CURVES])
+        _legend(axes[-1], len(drawn))
     figure.suptitle(f"{trajectory.topology}: {trajectory.summary.verdict}", fontsize=11)
     return figure
 
@@ -304,29 +316,35 @@ def _panels(signals: Sequence[Signal]) -> dict[str, list[int]]:
 def _panel(ax: Any, trajectory: Trajectory, unit: str, places: Sequence[int]) -> None:
     title, shown, scale = QUANTITIES.get(unit, ("", unit, 1.0))
     signals = trajectory.signals
-    peers = list(dict.fromkeys((one.group, one.peer) for one in signals))
-    locals_ = list(dict.fromkeys(signals[place].local for place in places))
-    drawn = places[:MOST_CURVES]
-    for place in drawn:
-        one = signals[place]
+    for place in places[:MOST_CURVES]:
         time, values = thinned(trajectory.time, trajectory.values[:, place])
+        colour, dashes = _style(signals, places, place)
         ax.plot(
-            time,
-            scale * values,
-            color=f"C{peers.index((one.group, one.peer)) % 10}",
-            linestyle=DASHES[locals_.index(one.local) % len(DASHES)],
-            linewidth=1.0,
-            label=one.name,
+            time, scale * values, color=colour, linestyle=dashes, linewidth=1.0, label=signals[place].name
         )
-    left = len(places) - len(drawn)
     ax.set_ylabel(f"{title} [{shown}]" if title else f"[{shown}]")
     ax.margins(x=0)
     ax.grid(visible=True, linewidth=0.4, alpha=0.5)
+    _legend(ax, len(places))
+
+
+def _style(signals: Sequence[Signal], places: Sequence[int], place: int) -> tuple[str, Any]:
+    """Return a signal's colour, which is its peer's, and its dashes among those that a panel shows."""
+    one = signals[place]
+    peers = list(dict.fromkeys((signal.group, signal.peer) for signal in signals))
+    locals_ = list(dict.fromkeys(signals[other].local for other in places))
+    return f"C{peers.index((one.group, one.peer)) % 10}", DASHES[locals_.index(one.local) % len(DASHES)]
+
+
+def _legend(ax: Any, curves: int) -> None:
+    """Name the curves beside a panel, and say how many more there are than it shows."""
+    drawn = min(curves, MOST_CURVES)
+    left = curves - drawn
     ax.legend(
         loc="center left",
         bbox_to_anchor=(1.01, 0.5),
-        fontsize=6.5 if len(drawn) > 10 else 8,
-        ncols=1 if len(drawn) <= 14 else 2,
+        fontsize=6.5 if drawn > 10 else 8,
+        ncols=1 if drawn <= 14 else 2,
         frameon=False,
         handlelength=2.6,
         title=f"and {left} more" if left else None,

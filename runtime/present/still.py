@@ -1,6 +1,7 @@
 """A picture of how a scene begins: every peer's bodies side by side, and the surfaces between them.
 
-Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `draw_still`, `save_still`.
+Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `draw_still`, `save_still`; of bodies that
+move in a plane the picture of `plane`.
 Guarantees: everything is found in the equations: a body is a position (a state in metres); where something is
 decided by the distance of two of them, or of one from a fixed place, in metres, there is a surface.
 Does not: play the scene, or know what a part is called.
@@ -11,9 +12,9 @@ sent to the others, or else the second, is drawn with a half width of w, the oth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi
 import numpy as np
@@ -27,6 +28,7 @@ from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.optional import need
 from apc.present.pictures import check_format, write_figure
+from apc.present.plane import draw_plane, moves_in_plane, spots_of
 from apc.simulation.signals import sent_states
 
 Floats = NDArray[np.float64]
@@ -51,6 +53,10 @@ class Wall:
     """A fixed place, in m, that something is decided by."""
 
     place: float
+
+
+B = TypeVar("B")  # bodies and surfaces, on a line or in a plane
+S = TypeVar("S")
 
 
 def bodies_of(kind: Kind, vector: Sequence[float], start: Sequence[float]) -> tuple[list[Body], list[Wall]]:
@@ -118,7 +124,9 @@ def draw_still(system: CompiledSystem) -> Any:
         E875 matplotlib is not installed.
     """
     figures, patches = need("matplotlib.figure", "plot"), need("matplotlib.patches", "plot")
-    rows = _rows(system)
+    if moves_in_plane(system):
+        return draw_plane(system, _rows(system, spots_of))
+    rows = _rows(system, bodies_of)
     figure = figures.Figure(figsize=(WIDTH, ROW * len(rows) + MARGIN), layout="constrained")
     ax = figure.subplots()
     names = list(dict.fromkeys(body.name for _, bodies, _ in rows for body in bodies))
@@ -154,16 +162,19 @@ def draw_still(system: CompiledSystem) -> Any:
     return figure
 
 
-def _rows(system: CompiledSystem) -> list[tuple[str, list[Body], list[Wall]]]:
-    """Return the peers that are drawn: name, bodies, walls."""
+def _rows(
+    system: CompiledSystem,
+    seen: Callable[[Kind, Sequence[float], Sequence[float]], tuple[list[B], list[S]]],
+) -> list[tuple[str, list[B], list[S]]]:
+    """Return the peers that are drawn: name, and the bodies and surfaces that are seen of its start."""
     numbers = resolve(system)
     sites = [jacobians(kind) for kind in system.kinds]
-    found: list[tuple[str, list[Body], list[Wall]]] = []
+    found: list[tuple[str, list[B], list[S]]] = []
     for group, one in enumerate(system.groups):
         for peer in range(min(one.count, MOST_PEERS - len(found))):
             vector = [float(v) for v in numbers.parameters[group][numbers.rows[group][peer]]]
             start, _, _ = start_values(sites[one.kind], vector)
-            found.append((f"{one.name}[{peer + 1}]", *bodies_of(system.kinds[one.kind], vector, start)))
+            found.append((f"{one.name}[{peer + 1}]", *seen(system.kinds[one.kind], vector, start)))
     return found
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from tests.fuzz.equations import odd_equations
+from tests.fuzz.vectors import odd_vectors
 
 MODELS = Path(__file__).resolve().parents[2] / "models"
 TOPOLOGY = "scene.yaml"
@@ -101,14 +102,14 @@ KEYS = (
     "topology", "about", "library", "clocks", "parameters", "peers", "masses", "couplers", "links", "hands", "experiment", "studies",
     "count", "set", "table", "type", "at", "shared", "a", "b", "object", "flange", "clock", "delay", "link", "stiffness", "damping", "mass",
     "graph", "delays", "edges", "arcs", "period", "phase", "region", "x", "y", "v", "unit", "min", "max", "above", "default", "options",
-    "start", "component", "connector", "extends", "connectors", "variables", "parts", "connect", "sends", "equations", "source",
+    "start", "size", "component", "connector", "extends", "connectors", "variables", "parts", "connect", "sends", "equations", "source",
     "potentials", "flows", "<<", "device", "cube", "haptic", "user", "lan", "device.mass", "contact.stiffness", "duration", "seed",
 )  # fmt: skip
 NAMES = ("x", "v", "f", "a.x", "b.x", "a.f", "b.f", "flange.x", "flange.f", "object.x", "object.f", "mass", "damping", "stiffness", "delay",
-         "limit", "side", "others.x", "others.v", "others", "time", "peers", "device.x", "kt", "haptic", "held1", "q", "a", "b")  # fmt: skip
+         "limit", "side", "others.x", "others.v", "others", "time", "peers", "device.x", "kt", "haptic", "held1", "q", "a", "b", "x[1]", "a.x[2]", "device.x[1]")  # fmt: skip
 UNITS = ("", "kg", "N", "N/m", "N*s/m", "s", "ms", "m", "m/s", "Hz", "1", "rad", "N/m^(3/2)", "kg*m/s^2", "furlong", "µm", "N//m", "N/m/", "^2", "m^0", "m^(1/3)")  # fmt: skip
 UNARY = ("der", "sample", "hold", "previous", "initial", "abs", "sign", "sqrt", "exp", "log", "sin", "cos", "tanh", "floor",
-         "mean", "sum", "max", "min", "count", "foo")  # fmt: skip
+         "mean", "sum", "max", "min", "count", "dot", "norm", "cross", "foo")  # fmt: skip
 LIKE = str.maketrans(
     {"a": "а", "e": "е", "o": "о", "c": "с", "x": "х", "-": "−", ":": "：", "*": "∗", "/": "∕", " ": "\u00a0"}
 )
@@ -366,6 +367,8 @@ def _expression(rng: random.Random, depth: int) -> str:
         other = _expression(rng, depth - 1)
         test = rng.choice(["<", "<=", ">", ">=", "==", "!=", "and", "or"])
         return f"if {inner} {test} {other} then {_expression(rng, depth - 1)} else {other}"
+    if how == 7:
+        return f"{{{inner}, {_expression(rng, depth - 1)}}}"
     return f"{inner} {rng.choice('+-*/')} {_expression(rng, depth - 1)}"
 
 
@@ -555,4 +558,5 @@ SORTS: tuple[tuple[str, Callable[[random.Random], dict[str, bytes]], int], ...] 
     ("table", _table, 8),
     ("bomb", _bomb, 2),
     (PLAYED, odd_equations, 3),
+    ("vectors", odd_vectors, 6),
 )

@@ -1,0 +1,289 @@
+"""Vectors written out: an expression of vectors to one for each entry.
+
+Takes: `Expr` and `Equation`, and the size of every name: 0 for a number.
+Gives: `written_out`, `written_equation`, `number_of`; `entry`, `entries`, `whole_and_index`, `sizes_of`.
+Guarantees: what is written out holds no vector; each piece keeps the place it has in the text; sizes that do
+not fit are refused with what to write.
+Does not: check units, or know what a name is of.
+
+Equations between vectors hold for each entry, as in Modelica (Modelica Language Specification 3.6, section
+10.6): sums and branches are of one size, a number scales a vector, an operator or function of one number is
+taken of each entry. The entries of `a.x` are `a.x[1]`, `a.x[2]`, … A product of two vectors is written `dot`
+or `cross`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from functools import partial, reduce
+from itertools import islice
+from typing import NoReturn
+
+from apc.compiler.errors import ApcError, Mistake, Place, place_in
+from apc.compiler.language.expression import (
+    Binary,
+    Call,
+    Compare,
+    Conditional,
+    Equation,
+    Expr,
+    Logic,
+    Name,
+    Negate,
+    Not,
+    Number,
+    Vector,
+    children,
+    format_expression,
+    rebuild,
+    walk,
+)
+from apc.compiler.language.grammar import MAX_LENGTH
+
+SIZES = (2, 3)
+VECTOR_WORDS = ("{", "dot", "norm", "cross")  # what makes or takes vectors is written with one of these
+LONGEST_REPEATED = 20  # characters of a number that a message writes once for each entry
+
+# An expression written out: a number, a vector's entries, or None where a name's size isn't known yet.
+Written = Expr | tuple[Expr, ...] | None
+SizeOf = Callable[[tuple[str, ...]], int | None]
+
+
+def entry(name: str, index: int) -> str:
+    """Return the name of a vector's entry, counted from 1."""
+    return f"{name}[{index}]"
+
+
+def entries(name: str, size: int) -> tuple[str, ...]:
+    """Return the names that a declaration makes: those of a vector's entries, or the name of a number."""
+    return tuple(entry(name, k + 1) for k in range(size)) if size else (name,)
+
+
+def whole_and_index(name: str) -> tuple[str, int]:
+    """Return the vector that an entry is of, and which it is; of a number its name and 0."""
+    whole, bracket, index = name.rstrip("]").rpartition("[")
+    return (whole, int(index)) if bracket and name.endswith("]") else (name, 0)
+
+
+def sizes_of(names: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
+    """Return the vectors whose entries are among names, and the size of each."""
+    found: dict[tuple[str, ...], int] = {}
+    for parts in names:
+        if parts[-1].endswith("]"):
+            whole, index = whole_and_index(parts[-1])
+            found[*parts[:-1], whole] = max(index, found.get((*parts[:-1], whole), 0))
+    return found
+
+
+def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written:
+    """Return an expression for each entry of a vector, one for a number.
+
+    Parameters
+    ----------
+    expr
+        The tree; its offsets count in `text`.
+    size_of
+        Gives the size of a name, None when it isn't known.
+    text, place
+        The text, and where it starts.
+
+    Returns
+    -------
+    The entries of a vector, or the tree of a number; None when its size hangs on names without one.
+
+    Raises
+    ------
+    ApcError
+        E328 it gets too long, E406 sizes that differ, E407 a vector where a number is due or the reverse.
+    """
+    writer = _Writer(size_of, text, place)
+    found = writer.written(expr)
+    for one in found if isinstance(found, tuple) else (found,) if found is not None else ():
+        if one is not expr and len(list(islice(walk(one), MAX_LENGTH + 1))) > MAX_LENGTH:
+            what = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
+            writer.fail("E328", expr, what)
+    return found
+
+
+def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...]:
+    """Return an equation for each entry; raises as `written_out`, also where its sides differ in size."""
+    writer = _Writer(size_of, equation.text, equation.place)
+    sides = (equation.left, equation.right)
+    left, right = (written_out(side, size_of, equation.text, equation.place) for side in sides)
+    writer.agree(sides, (left, right))
+    if not isinstance(left, tuple) or not isinstance(right, tuple):
+        assert isinstance(left, Expr) and isinstance(right, Expr)
+        return (replace(equation, left=left, right=right),)
+    return tuple(replace(equation, left=one, right=two) for one, two in zip(left, right, strict=True))
+
+
+def number_of(expr: Expr, text: str, place: Place) -> Expr:
+    """Return an expression over numbers without `dot`, `norm` and the like. Raises E407 if it is a vector."""
+    return _Writer(lambda _: 0, text, place).number(expr)
+
+
+class _Writer:
+    """Writes one text out; the first mistake is raised."""
+
+    def __init__(self, size_of: SizeOf, text: str, place: Place) -> None:
+        self.size_of, self.text, self.place = size_of, text, place
+
+    def said(self, expr: Expr) -> str:
+        """Return a part as it is written, or as it would be when it comes from somewhere else."""
+        return self.text[expr.start : expr.end] or format_expression(expr)
+
+    def fail(
+        self, code: str, at: Expr, what: str, expected: str = "", got: str = "", hint: str = ""
+    ) -> NoReturn:
+        raise ApcError(Mistake(code, place_in(self.place, self.text, at.start), what, expected, got, hint))
+
+    def written(self, expr: Expr) -> Written:
+        match expr:
+            case Number():
+                return expr
+            case Name(path):
+                size = self.size_of(path)
+                if size is None:
+                    return None
+                whole = (replace(expr, parts=(*path[:-1], one)) for one in entries(path[-1], size))
+                return tuple(whole) if size else expr
+            case Vector():
+                if len(expr.entries) not in SIZES:
+                    got = f"{len(expr.entries)}"
+                    self.fail("E406", expr, self.said(expr), f"{_or(SIZES)} entries", got)
+                return tuple(self.number(one) for one in expr.entries)
+            case Binary("+" | "-"):
+                parts = [self.written(expr.left), self.written(expr.right)]
+                self.agree((expr.left, expr.right), parts)
+                return self.each(expr, parts)
+            case Binary("*"):
+                parts = [self.written(expr.left), self.written(expr.right)]
+                if all(isinstance(part, tuple) for part in parts):
+                    hint = f"dot({format_expression(expr.left)}, {format_expression(expr.right)})"
+                    self.fail("E407", expr, self.said(expr), "one vector at most in a product", "two", hint)
+                return self.each(expr, parts)
+            case Binary("/"):
+                return self.each(expr, [self.written(expr.left), self.number(expr.right)])
+            case Binary():
+                inner = format_expression(expr.left)
+                square = isinstance(expr.right, Number) and expr.right.value == 2
+                hint = (
+                    f"dot({inner}, {inner})" if square else f"norm({inner})^{format_expression(expr.right)}"
+                )
+                return self.each(expr, [self.number(expr.left, hint), expr.right])
+            case Negate():
+                return self.each(expr, [self.written(expr.operand)])
+            case Conditional():
+                branches = [self.written(expr.then), self.written(expr.otherwise)]
+                self.agree((expr.then, expr.otherwise), branches)
+                return self.each(expr, [self.number(expr.condition), *branches])
+            case Compare() | Logic() | Not():
+                return self.each(expr, [self.number(part) for part in children(expr)])
+            case Call():
+                return self.call(expr)
+
+    def call(self, expr: Call) -> Written:
+        first, *others = expr.arguments
+        match expr.function:
+            case "dot" | "cross" | "norm":
+                return self.product(expr)
+            case "count":
+                return expr  # of peers, whatever they send
+            case "sample":
+                return self.each(expr, [self.written(first), *others])  # the second is a clock
+            case "hold":
+                return self.each(expr, [self.written(first), *(self.number(one) for one in others)])
+            case "interpolate":
+                return self.each(expr, [first, *(self.number(one) for one in others)])
+        parts = [self.written(one) for one in expr.arguments]
+        vectors = [k for k, part in enumerate(parts) if isinstance(part, tuple)]
+        self.agree([expr.arguments[k] for k in vectors], [parts[k] for k in vectors])
+        return self.each(expr, parts)
+
+    def product(self, expr: Call) -> Written:
+        """Write out `dot`, `cross` and `norm`, each piece of which stands where the whole does."""
+        vectors: list[tuple[Expr, ...]] = []
+        for one in expr.arguments:
+            found = self.written(one)
+            if found is None:
+                return None if expr.function == "cross" else Number(Fraction(0))
+            if not isinstance(found, tuple):
+                shown = [format_expression(part) for part in expr.arguments]
+                hint = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(expr.function, "")
+                self.fail("E407", one, f"{self.said(one)} in {expr.function}", "a vector", "a number", hint)
+            vectors.append(found)
+        self.agree(expr.arguments, vectors)
+
+        def binary(operator: str, one: Expr, two: Expr) -> Expr:
+            return Binary(operator, one, two, start=expr.start, end=expr.end)
+
+        def turned(i: int, j: int) -> Expr:
+            return binary("-", binary("*", a[i], b[j]), binary("*", a[j], b[i]))
+
+        a, b = vectors[0], vectors[-1]
+        if expr.function == "norm":
+            squares = reduce(partial(binary, "+"), (binary("^", one, Number(Fraction(2))) for one in a))
+            return replace(expr, function="sqrt", arguments=(squares,))
+        if expr.function == "dot":
+            return reduce(partial(binary, "+"), (binary("*", x, y) for x, y in zip(a, b, strict=True)))
+        return turned(0, 1) if len(a) == 2 else (turned(1, 2), turned(2, 0), turned(0, 1))
+
+    def number(self, expr: Expr, hint: str = "") -> Expr:
+        """Return an expression that has to be a number."""
+        found = self.written(expr)
+        if isinstance(found, tuple):
+            self.fail("E407", expr, self.said(expr), "a number", _size(found), hint or self.of_vector(expr))
+        return expr if found is None else found
+
+    def agree(self, parts: Sequence[Expr], found: Sequence[Written]) -> None:
+        """Refuse parts that are not of one size."""
+        known = [(part, one) for part, one in zip(parts, found, strict=True) if one is not None]
+        for part, one in known[1:]:
+            like, first = known[0]
+            if _length(one) == _length(first):
+                continue
+            hint = ""
+            if not isinstance(one, tuple) and len(format_expression(part)) <= LONGEST_REPEATED:
+                hint = "{" + ", ".join([format_expression(part)] * _length(first)) + "}"
+            elif isinstance(one, tuple) and not isinstance(first, tuple):
+                hint = self.of_vector(part)
+            self.fail(
+                "E406", part, self.said(part), f"{_size(first)} like {self.said(like)}", _size(one), hint
+            )
+
+    def each(self, node: Expr, parts: Sequence[Written]) -> Written:
+        """Return a node of other parts: one for each entry, where one of them is a vector."""
+        old = children(node)
+        size = max(map(_length, parts), default=0)
+        if not size:
+            if None in parts:
+                return None
+            same = all(one is two for one, two in zip(parts, old, strict=True))
+            return node if same else rebuild(node, tuple(one for one in parts if isinstance(one, Expr)))
+
+        def of(k: int, part: Written, before: Expr) -> Expr:
+            return part[k] if isinstance(part, tuple) else before if part is None else part
+
+        return tuple(
+            rebuild(node, tuple(of(k, part, before) for part, before in zip(parts, old, strict=True)))
+            for k in range(size)
+        )
+
+    def of_vector(self, expr: Expr) -> str:
+        """Return numbers that somebody may have meant who wrote a vector."""
+        of = format_expression(expr)
+        return f"{entry(of, 1)}, or norm({of})" if isinstance(expr, Name) else f"norm({of})"
+
+
+def _length(found: Written) -> int:
+    return len(found) if isinstance(found, tuple) else 0
+
+
+def _size(found: Written) -> str:
+    return f"a vector of {len(found)}" if isinstance(found, tuple) else "a number"
+
+
+def _or(numbers: Iterable[int]) -> str:
+    return " or ".join(map(str, numbers))
