@@ -84,7 +84,7 @@ HOUSE = (
         hands errors network box
         """,
     ),
-    ("apc.hands", "port passivity response norms feel"),
+    ("apc.hands", "port passivity box response norms feel"),
     (
         "apc.vary",
         """
