@@ -190,7 +190,7 @@ def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None
     return buzz(system, prepared=prepared, modes=modes)
 
 
-def proved_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:
+def proved_box(system: CompiledSystem, box: Sequence[Range], *, passive: bool = False) -> BoxProof:
     """Return the proof over a box; imported here, as few analyses ask for one.
 
     Parameters
@@ -199,12 +199,19 @@ def proved_box(system: CompiledSystem, box: Sequence[Range]) -> BoxProof:
         The compiled scene.
     box
         Ranges of parameters.
+    passive
+        Whether every passive hand is meant, over the nominal network.
 
     Raises
     ------
     ApcError
-        As `box_proof.prove_box`, or `moments.box.prove_box` where links are, or may become, unreliable.
+        As `box_proof.prove_box`, or `moments.box.prove_box` where links are, or may become, unreliable; as
+        `hands.box.prove_box`.
     """
+    if passive:
+        from apc.hands.box import prove_box as prove_for_hands
+
+        return prove_for_hands(system, box)
     from apc.analysis.box_proof import prove_box
     from apc.network.nominal import channel_numbers, left_out
 

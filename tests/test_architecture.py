@@ -87,7 +87,11 @@ HOUSE = (
         hands errors network box
         """,
     ),
+<<<<<<< HEAD
     ("apc.hands", "port passivity response norms asked answers viscosity feel"),
+=======
+    ("apc.hands", "port passivity box response norms feel"),
+>>>>>>> rc
     (
         "apc.vary",
         """

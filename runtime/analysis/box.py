@@ -174,13 +174,15 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
 class OpenSites:
     """A scene's peers where they are alike only if they are alike all over a box.
 
-    `at` is the scene there, `sites` the matrices of each group by its name, over `Fraction` and `Ratio`.
+    `at` is the scene there, `sites` the matrices of each group by its name, over `Fraction` and `Ratio`, and
+    `vectors` its parameters.
     """
 
     at: CompiledSystem
     groups: tuple[PeerGroup, ...]
     exchange: Exchange
     sites: Mapping[str, LinearSite]
+    vectors: Mapping[str, list[Any]]
 
 
 def open_sites(
@@ -222,11 +224,11 @@ def open_sites(
             break
     else:
         raise AssertionError("peers of different groups are alike at three places of the box")
-    sites = {
-        group.name: _open_site(group, opened[own[0]], system)
-        for group, own in zip(groups, members, strict=True)
+    vectors = {
+        group.name: _open_vector(group, opened[own[0]]) for group, own in zip(groups, members, strict=True)
     }
-    return OpenSites(at, groups, exchange, sites)
+    sites = {group.name: _open_site(group, vectors[group.name], system) for group in groups}
+    return OpenSites(at, groups, exchange, sites, vectors)
 
 
 def _members(group: PeerGroup, starts: NDArray[np.int64]) -> list[int]:
@@ -296,21 +298,23 @@ _RULES: dict[str, Callable[..., Any]] = {
 }
 
 
-def _open_site(group: PeerGroup, opened: Mapping[str, Ratio], system: CompiledSystem) -> LinearSite:
+def _open_vector(group: PeerGroup, opened: Mapping[str, Ratio]) -> list[Any]:
+    """Return a group's parameters, some of them open."""
+    kind = group.jacobians.kind
+    numbers = exact_numbers(kind, group.parameters)
+    return [opened.get(name, value) for name, value in zip(kind.parameters, numbers, strict=True)]
+
+
+def _open_site(group: PeerGroup, vector: Sequence[Any], system: CompiledSystem) -> LinearSite:
     """Return a site's matrices over the open parameters."""
     built = group.jacobians
-    names = built.kind.parameters
-    vector = [
-        opened.get(name, value)
-        for name, value in zip(names, exact_numbers(built.kind, group.parameters), strict=True)
-    ]
     zeros = [[Fraction(0)] * built.function.numel_in(argument) for argument in range(4)]
 
     def refuse(name: str, value: Any) -> Any:
         raise NotRational(f"hold {name}(), which is no quotient of polynomials")
 
     try:
-        flat = evaluate_exact(built.function, [*zeros, vector, [Fraction(0)]], rounded=refuse)[0]
+        flat = evaluate_exact(built.function, [*zeros, list(vector), [Fraction(0)]], rounded=refuse)[0]
     except NotRational as reason:
         what = f"the equations of {group.name} {reason}"
         raise ApcError(Mistake("E832", Place(system.name), what)) from None

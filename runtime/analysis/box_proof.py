@@ -1,8 +1,8 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
 Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `prove_box`; `Cell`, `halved`, `Halved`, `middle`, `site_at`, `range_ball`; `BITS`,
-`UNDECIDED`.
+Gives: `BoxProof`, `prove_box`; `Cell`, `halved`, `Halved`, `middle`, `site_at`, `range_ball`, `ball_radii`;
+`BITS`, `UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
 
@@ -49,6 +49,7 @@ from apc.eigen.ratios import Ratio
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, stays_rigid, what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
+from apc.frame.discretize import UNIT
 from apc.frame.names import Range
 from apc.frame.site import LinearSite, entrywise
 from apc.result import Result
@@ -292,6 +293,19 @@ def _reach_out(question: _Question, cell: Cell) -> Floats | None:
 def range_ball(low: Fraction, high: Fraction) -> Any:
     """Return a ball that holds a range."""
     return flint.arb(rational_ball(low)).union(flint.arb(rational_ball(high)))
+
+
+def ball_radii(balls: Balls) -> Floats:
+    """Return balls (n, m) as floats with their radii (2, n, m)."""
+    found = np.zeros((2, *balls.shape))
+    for place, ball in np.ndenumerate(balls):
+        if isinstance(ball, int):
+            found[(0, *place)] = ball
+            continue
+        value = float(ball.mid())
+        found[(0, *place)] = value
+        found[(1, *place)] = float((ball - value).abs_upper()) * (1 + 4 * UNIT)
+    return found
 
 
 def _floats(matrix: Any) -> Floats:

@@ -1,7 +1,8 @@
 """What a loop gives back of what it is given, at the worst frequency: its H∞ norm, its least real part.
 
 Takes: x⁺ = A x + B r, d = C x + D r, of floats or of floats with their radii.
-Gives: `peak_gain`, `least_real`; `dissipates`, with it `proves_gain` and `proves_positive`; `is_positive`.
+Gives: `peak_gain`, `least_real`; `dissipates`, with it `proves_gain`, `proves_positive` and
+`proves_positive_between`; `is_positive`.
 Guarantees: what is proved holds for all matrices within the radii. No grid of frequencies decides anything.
 Does not: take out rigid motions, or weigh what comes in.
 
@@ -197,15 +198,47 @@ def proves_positive(
     spared
         As for `dissipates`.
     """
+    return dissipates(a, b, _popov(a, b, c, RADII.add(d, weight)), spared=spared)
+
+
+def proves_positive_between(
+    middle: Sequence[Matrix], corners: Sequence[Sequence[Matrix]], *, spared: Sequence[float] = SPARED
+) -> bool:
+    """Say whether `proves_positive` for all loops whose matrices are mixtures of those at corners.
+
+    Parameters
+    ----------
+    middle, corners
+        A, B, C and D + W (2, …) with their radii, of a loop about the middle and at each corner.
+    spared
+        As for `dissipates`.
+
+    Notes
+    -----
+    Of one storage P ≻ 0 what is supplied less what is stored is concave in (A, B, C, D): it is least at a
+    corner.
+    """
+    first, *rest = ((a, b, _popov(a, b, c, e)) for a, b, c, e in (middle, *corners))
+    return dissipates(*first, spared=spared, others=rest)
+
+
+def _popov(a: Matrix, b: Matrix, c: Matrix, e: Matrix) -> Matrix:
+    """Return the supply 2 rᵀ (C x + E r) (2, n + m, n + m) with its radii."""
     n, m = a.shape[-1], b.shape[-1]
     supply = np.zeros((2, n + m, n + m))
     supply[:, n:, :n], supply[:, :n, n:] = c, np.swapaxes(c, -1, -2)
-    whole = RADII.add(d, weight)
-    supply[:, n:, n:] = RADII.add(whole, np.swapaxes(whole, -1, -2))
-    return dissipates(a, b, supply, spared=spared)
+    supply[:, n:, n:] = RADII.add(e, np.swapaxes(e, -1, -2))
+    return supply
 
 
-def dissipates(a: Matrix, b: Matrix, supply: Matrix, *, spared: Sequence[float] = SPARED) -> bool:
+def dissipates(
+    a: Matrix,
+    b: Matrix,
+    supply: Matrix,
+    *,
+    spared: Sequence[float] = SPARED,
+    others: Sequence[tuple[Matrix, Matrix, Matrix]] = (),
+) -> bool:
     """Say whether a loop is proved stable and proved to store less than it is supplied, whatever comes in.
 
     Parameters
@@ -218,6 +251,8 @@ def dissipates(a: Matrix, b: Matrix, supply: Matrix, *, spared: Sequence[float] 
     spared
         Parts of the storage that are left over for rounding, one after the other: less than the supply is
         above what is lost, relatively.
+    others
+        Other loops with their supply that the same storage is to serve.
 
     Notes
     -----
@@ -234,7 +269,7 @@ def dissipates(a: Matrix, b: Matrix, supply: Matrix, *, spared: Sequence[float] 
     sizes = np.maximum(sizes, UNSEEN * sizes.max(initial=0.0) or 1.0)
     for part in spared:
         p = _storage(*plain, part * sizes)
-        if p is not None and _serves(a, b, supply, (p + p.T) / 2):
+        if p is not None and all(_serves(*one, (p + p.T) / 2) for one in ((a, b, supply), *others)):
             return True
     return False
 

@@ -1,7 +1,8 @@
 """Is a scene stable with every passive hand at every device?
 
 Takes: a `CompiledSystem`.
-Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`; `worst_at`, `frequency_of`.
+Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`; `circulates`,
+`worst_at`, `frequency_of`.
 Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
 anything that gives back no more energy than it was given, each by itself, or, where devices feel each other
 alike, joined to each other too.
@@ -134,7 +135,7 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
         modes = () if isinstance(loops, str) else tuple(_judge(loop) for loop in loops)
-        why = loops if isinstance(loops, str) else CIRCULATES if any(map(_circulates, loops)) else ""
+        why = loops if isinstance(loops, str) else CIRCULATES if any(map(circulates, loops)) else ""
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     stable: bool | None = None
     joined = not isinstance(loops, str) and all(loop.maps.joined for loop in loops)
@@ -181,7 +182,7 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
         found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
         if not isinstance(loops, str):
             found = [
-                _bounds(loop)[:3] if bounded else (-np.inf if _circulates(loop) else _least(loop)[0],) * 3
+                _bounds(loop)[:3] if bounded else (-np.inf if circulates(loop) else _least(loop)[0],) * 3
                 for loop in loops
             ]
             scale = max(float(one) for loop in loops for one in loop.dampings) or 1.0
@@ -222,7 +223,7 @@ def _bounds(loop: PortLoop) -> tuple[float, float, float, float]:
     −∞ where the scene is unstable with its devices clamped, of which this is no proof, and where slow motions
     draw energy, of which it is one.
     """
-    if _circulates(loop):
+    if circulates(loop):
         return -np.inf, -np.inf, -np.inf, 0.0
     matrices = loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d
     least, angle = _least(loop)
@@ -247,8 +248,13 @@ def _least(loop: PortLoop) -> tuple[float, float]:
     return least_real(*map(value_of, (loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d, loop.maps.weight)))
 
 
-def _circulates(loop: PortLoop) -> bool:
+def circulates(loop: PortLoop) -> bool:
     """Say whether the stiffness at rest is not that of any spring.
+
+    Parameters
+    ----------
+    loop
+        A mode.
 
     Notes
     -----

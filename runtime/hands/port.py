@@ -412,6 +412,41 @@ class Cut:
             joined=bool((many == self.counts).all()),
         )
 
+    def slopes(self, whole: Matrix, slope: Matrix, dampings: Matrix) -> tuple[Matrix, ...] | None:
+        """Return how A, B, C and D + W change with a parameter, with radii; devices count as they are many.
+
+        Parameters
+        ----------
+        whole, slope
+            The closed matrix (2, …) and how it changes, at all points meant.
+        dampings
+            How the devices' dampings change (2, sites, 1).
+        """
+        at, exact, multiply, add = self.at, RADII.exact, RADII.multiply, RADII.add
+        of, across, sums = exact(at.of), exact(at.of.T.copy()), exact(at.sums)
+        a, placed, felt = _moving(whole, at, self.rigid, RADII)
+        aside = _aside(a, placed, of, RADII)
+        if aside is None:
+            return None
+        a_by, placed_by, felt_by = _moving(slope, at, self.rigid, RADII)
+        pushed = add(multiply(placed_by, of), multiply(a_by, aside))
+        aside_by = solve(RADII.subtract(exact(np.eye(a.shape[-1])), a), pushed)
+        if aside_by is None:
+            return None
+        at_once = slope[..., at.out[:, None], at.into]
+        forces = add(add(multiply(felt_by, aside), multiply(felt, aside_by)), multiply(at_once, of))
+        each = at.of @ self.counts
+        peers, units = exact(np.diag(each)), exact(np.diag(np.sqrt(at.seconds / each)))
+        static = multiply(peers, forces)[..., np.argmax(at.of, axis=0), :]
+        pole = multiply(multiply(of, static), across)
+        half = multiply(add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(len(at.into)) / 4))
+        each_by = multiply(exact(at.of * (each / at.seconds)[:, None]), dampings)
+        dampers = each_by * np.eye(len(at.into))
+        e = RADII.subtract(add(multiply(peers, multiply(at_once, sums)), dampers), half)
+        b = RADII.subtract(multiply(placed_by, sums), multiply(aside_by, across))
+        felt_by = multiply(units, multiply(peers, felt_by))
+        return a_by, multiply(b, units), felt_by, multiply(multiply(units, e), units)
+
 
 def port_loop(found: Openings, loop: Loop, *, option: str) -> tuple[PortLoop, Cut]:
     """Return the map of a loop whose devices are moved from outside, and where it was cut.

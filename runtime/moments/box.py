@@ -26,7 +26,17 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.box import OpenSites, open_sites
-from apc.analysis.box_proof import BITS, UNDECIDED, BoxProof, Cell, halved, middle, range_ball, site_at
+from apc.analysis.box_proof import (
+    BITS,
+    UNDECIDED,
+    BoxProof,
+    Cell,
+    ball_radii,
+    halved,
+    middle,
+    range_ball,
+    site_at,
+)
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
@@ -219,20 +229,7 @@ def _lost(system: CompiledSystem) -> dict[str, float]:
 def _lifted(group: PeerGroup, site: LinearSite, balls: Sequence[Any]) -> PeerGroup:
     """Return peers with the frame of all values that balls of their parameters hold."""
     inside = site_at(site, balls, None)
-    steps = {duration: _with_radius(step) for duration, step in frame_steps(inside, group.schedule).items()}
-    found = compose(every_matrix(inside, _with_radius), group.schedule, steps, numbers=RADII)
+    steps = {duration: ball_radii(step) for duration, step in frame_steps(inside, group.schedule).items()}
+    found = compose(every_matrix(inside, ball_radii), group.schedule, steps, numbers=RADII)
     kind, schedule = group.jacobians.kind, group.schedule
     return replace(group, lifted=named(kind, schedule, found.mapped(value_of), found.mapped(radius_of)))
-
-
-def _with_radius(balls: NDArray[Any]) -> Floats:
-    """Return balls (n, m) as floats with their radii (2, n, m)."""
-    found = np.zeros((2, *balls.shape))
-    for place, ball in np.ndenumerate(balls):
-        if isinstance(ball, int):
-            found[(0, *place)] = ball
-            continue
-        value = float(ball.mid())
-        found[(0, *place)] = value
-        found[(1, *place)] = float((ball - value).abs_upper()) * (1 + 4 * UNIT)
-    return found
