@@ -87,11 +87,7 @@ HOUSE = (
         hands errors network box
         """,
     ),
-<<<<<<< HEAD
-    ("apc.hands", "port passivity response norms asked answers viscosity feel"),
-=======
-    ("apc.hands", "port passivity box response norms feel"),
->>>>>>> rc
+    ("apc.hands", "port certify passivity box response norms asked answers viscosity feel"),
     (
         "apc.vary",
         """

@@ -11,13 +11,14 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.analysis.analysis import analyze, prepare
+from apc.analysis.analysis import analyze, lifted_groups, prepare
 from apc.compiler.errors import ApcError
 from apc.eigen.dissipation import least_real
 from apc.frame.devices import clamped, held, with_hands
 from apc.frame.radius import value_of
+from apc.hands.certify import certified
 from apc.hands.passivity import passive_growth, passive_hands
-from apc.hands.port import port_loops
+from apc.hands.port import open_ports, port_loop, port_loops
 from apc.regions.axes import parse_axes
 from apc.regions.region import region
 from apc.vary.critical import critical
@@ -327,3 +328,31 @@ def test_the_command_line(
     assert "E930 no hands are named (free, clamped," in capsys.readouterr().err
     assert run(["analyze", "three.yaml", "--hands", "claped"]) == 1
     assert "clamped" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("stiffness", "stable"), [(458.24, True), (458.25, False), (500.0, False)])
+def test_balls_prove_what_floats_say_and_never_the_opposite(stiffness: float, stable: bool) -> None:
+    """The three users of the paper bear 458.242 N/m (see above); either side of it is proved, neither both."""
+    system = compiled(replaced(AVERAGE, ("stiffness: 500", f"stiffness: {stiffness}")))
+    found = passive_hands(system, certify=True)
+    assert found.stable is stable
+    assert found.proof == "proved in ball arithmetic, 128 bits"
+    opened = open_ports(system, *lifted_groups(system), option="--hands passive")
+    assert not isinstance(opened, str)
+    held = [port_loop(opened, loop, option="--hands passive") for loop in opened.loops]
+    proved = []
+    for loop, (own, cut) in zip(opened.loops, held, strict=True):
+        dampings = np.array([float(one) for one in own.dampings])
+        angle = least_real(
+            *(value_of(one) for one in (own.maps.a, own.maps.b, own.maps.c, own.maps.d, own.maps.weight))
+        )[1]
+        bits = [bool(certified(loop, cut, dampings, passive=claim, angle=angle)) for claim in (True, False)]
+        assert bits.count(True) == 1, own.name
+        proved.append(bits[0])
+    assert all(proved) is stable
+
+
+def test_a_scene_unstable_clamped_is_proved_so_in_balls() -> None:
+    mesh = passive_hands(compiled(MESH), certify=True)
+    assert mesh.stable is False
+    assert mesh.proof.startswith("with its devices clamped it is unstable: proved unstable with ")

@@ -101,7 +101,8 @@ def analyze_command(
     if hands == PASSIVE:
         asked = {"--method": method != AUTO, "--box": bool(box), "--conventions": every_convention}
         asked["--buzz"] = with_buzz
-        _judge_passive(system, [name for name, given in asked.items() if given], as_json=as_json)
+        refused = [name for name, given in asked.items() if given]
+        _judge_passive(system, refused, certify=certify, as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
@@ -123,7 +124,7 @@ def analyze_command(
     print_result(found, as_json=as_json)
 
 
-def _judge_passive(system: CompiledSystem, asked: list[str], *, as_json: bool) -> None:
+def _judge_passive(system: CompiledSystem, asked: list[str], *, certify: bool, as_json: bool) -> None:
     """Say whether a scene is stable with any passive hands; refuse what is asked for besides."""
     from apc.hands.passivity import passive_hands
 
@@ -131,4 +132,4 @@ def _judge_passive(system: CompiledSystem, asked: list[str], *, as_json: bool) -
         options = " and ".join((*asked, "--hands passive"))
         what = f"{options} don't go together: what hands can draw has no modes of its own"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
-    print_result(passive_hands(system), as_json=as_json)
+    print_result(passive_hands(system, certify=certify), as_json=as_json)

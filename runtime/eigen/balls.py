@@ -252,7 +252,24 @@ def _flint(block: Balls) -> Any:
     return flint.arb_mat(height, width, block.ravel().tolist())
 
 
-BALLS = Arithmetic(_multiply, np.add, np.subtract, lambda value: value.astype(object))
+def _exact(value: NDArray[Any]) -> Balls:
+    """Return exact numbers as balls; 0 and 1 as the integers, what is written in balls as it is."""
+    if value.dtype != np.float64:
+        return value.astype(object)
+    found = np.empty(value.size, dtype=object)
+    found[:] = [int(one) if one in (0.0, 1.0) else flint.arb(one) for one in value.ravel().tolist()]
+    return found.reshape(value.shape)
+
+
+def _solve(matrix: Balls, right: Balls) -> Balls | None:
+    try:
+        found = np.array(_flint(matrix).solve(_flint(right)).entries(), dtype=object)
+    except ZeroDivisionError:
+        return None
+    return found.reshape(right.shape)
+
+
+BALLS = Arithmetic(_multiply, np.add, np.subtract, _exact, _solve)
 
 
 def square(balls: Balls) -> Any:

@@ -15,7 +15,7 @@ xᵀP x, P ≻ 0, that no input fills faster than it is supplied?
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -261,17 +261,28 @@ def dissipates(
     if not all(np.isfinite(one).all() for one in (a, b, supply)):
         return False
     plain = value_of(a), value_of(b), value_of(supply)
-    first = _storage(*plain, np.zeros(a.shape[-1]))
+    loops = ((a, b, supply), *others)
+    return any(all(_serves(*one, p) for one in loops) for p in storages(*plain, spared))
+
+
+def storages(a: Floats, b: Floats, supply: Floats, spared: Sequence[float]) -> Iterator[Floats]:
+    """Yield storages P (n, n) that prove what `dissipates` does, but for rounding, which is to be checked.
+
+    Parameters
+    ----------
+    a, b, supply, spared
+        As for `dissipates`, without radii.
+    """
+    first = _storage(a, b, supply, np.zeros(a.shape[-1]))
     if first is None:
-        return False
+        return
     # What nothing comes of needs some storage, too, for that of all to be positive.
     sizes = np.diag(first)
     sizes = np.maximum(sizes, UNSEEN * sizes.max(initial=0.0) or 1.0)
     for part in spared:
-        p = _storage(*plain, part * sizes)
-        if p is not None and all(_serves(*one, (p + p.T) / 2) for one in ((a, b, supply), *others)):
-            return True
-    return False
+        p = _storage(a, b, supply, part * sizes)
+        if p is not None:
+            yield (p + p.T) / 2
 
 
 def _storage(a: Floats, b: Floats, supply: Floats, more: Floats) -> Floats | None:

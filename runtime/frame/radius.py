@@ -34,12 +34,16 @@ FEW = 16
 
 @dataclass(frozen=True, slots=True)
 class Arithmetic:
-    """How matrices of a kind of number are multiplied, added and subtracted, and exact ones written."""
+    """How matrices of a kind of number are multiplied, added, subtracted and solved, and exact ones written.
+
+    `solve` gives X of M X = R, None where it can't be said, or where nobody asks it of such numbers.
+    """
 
     multiply: Callable[[Matrix, Matrix], Matrix]
     add: Callable[[Matrix, Matrix], Matrix]
     subtract: Callable[[Matrix, Matrix], Matrix]
     exact: Callable[[Matrix], Matrix]
+    solve: Callable[[Matrix, Matrix], Matrix | None] = lambda matrix, right: None
 
 
 def with_radius(value: Matrix, radius: Matrix) -> Matrix:
@@ -104,12 +108,6 @@ def _exact(value: Matrix) -> Matrix:
     return np.stack([value, np.zeros_like(value)], axis=-min(value.ndim + 1, 3))
 
 
-FLOATS = Arithmetic(np.matmul, np.add, np.subtract, lambda value: value)
-RADII = Arithmetic(
-    _multiply, lambda a, b: _added(a, b, np.add), lambda a, b: _added(a, b, np.subtract), _exact
-)
-
-
 def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
     """Return X of M X = R for all M (2, n, n) and R (2, n, m) within their radii; None where it has no bound.
 
@@ -135,3 +133,16 @@ def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
         if share < 0.5:
             return with_radius(found, bound * (1 + 8 * UNIT) / (1 - share))
     return None
+
+
+def _solve_floats(matrix: Matrix, right: Matrix) -> Matrix | None:
+    try:
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        return None
+
+
+FLOATS = Arithmetic(np.matmul, np.add, np.subtract, lambda value: value, _solve_floats)
+RADII = Arithmetic(
+    _multiply, lambda a, b: _added(a, b, np.add), lambda a, b: _added(a, b, np.subtract), _exact, solve
+)

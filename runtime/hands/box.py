@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from apc.compiler.frozen import dataclass
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -38,6 +37,7 @@ from apc.analysis.box_proof import (
 )
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.balls import (
     Balls,

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, analyze, prepare
+from apc.analysis.analysis import Prepared, analyze, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
@@ -23,7 +23,8 @@ from apc.finite_equations import finite_equations
 from apc.frame.devices import clamped, refuse_hands
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, solve, value_of
-from apc.hands.port import PortLoop, port_loops
+from apc.hands.certify import certified
+from apc.hands.port import PortLoop, open_ports, port_loop, port_loops
 from apc.moments.network import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
@@ -34,6 +35,11 @@ Complexes = NDArray[np.complex128]
 OPTION = "--hands passive"
 STABLE, UNSTABLE = "stable with any passive hands", "unstable with some passive hands"
 UNDECIDED, NEVER = "undecided", "unstable with some passive hands, however much damping there is"
+
+PROVED = "proved by floats whose every rounding is bounded"
+NOT_IN_BALLS = (
+    "in ball arithmetic it can't be: its equations are no rational numbers, or 512 bits are too few"
+)
 
 CIRCULATES = (
     "What devices feel of one another at rest is not what springs give: moved slowly round, they give back "
@@ -108,7 +114,9 @@ class PassiveHands(Result):
 
 
 @part("passive hands")
-def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> PassiveHands:
+def passive_hands(
+    system: CompiledSystem, prepared: Prepared | None = None, *, certify: bool = False
+) -> PassiveHands:
     """Say whether a scene is stable with every passive hand at every device.
 
     Parameters
@@ -117,6 +125,8 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
         The compiled scene, with the numbers to analyse.
     prepared
         From `analysis.prepare`, of this system with any numbers.
+    certify
+        Whether the verdict is to be proved in ball arithmetic, too.
 
     Raises
     ------
@@ -131,9 +141,13 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
     """
     refuse_hands(system, OPTION)
     prepared = prepared or prepare(system)
-    fixed = analyze(clamped(system, option=OPTION))
+    fixed = analyze(clamped(system, option=OPTION), certify=certify)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        loops = port_loops(system, prepared, option=OPTION)
+        opened = open_ports(system, *lifted_groups(system, prepared=prepared), option=OPTION)
+        cuts = (
+            [] if isinstance(opened, str) else [port_loop(opened, one, option=OPTION) for one in opened.loops]
+        )
+        loops = opened if isinstance(opened, str) else tuple(loop for loop, _ in cuts)
         modes = () if isinstance(loops, str) else tuple(_judge(loop) for loop in loops)
         why = loops if isinstance(loops, str) else CIRCULATES if any(map(circulates, loops)) else ""
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
@@ -146,6 +160,25 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
         stable = True
     verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
     of = ", of the linearization" if not linear else ""
+    proof = "" if stable is None else f"{PROVED}{of}"
+    if certify and stable is not None and not why:
+        bits = 0
+        if fixed.stable and not isinstance(opened, str):
+            asked = [
+                certified(
+                    loop,
+                    cut,
+                    np.array([float(one.touched.damping) for one in opened.of(loop)]),
+                    passive=stable,
+                    angle=_least(own)[1],
+                )
+                for loop, (own, cut), mode in zip(opened.loops, cuts, modes, strict=True)
+                if stable or mode.passive is False
+            ]
+            bits = (min if stable else max)(asked)
+        proof = f"proved in ball arithmetic, {bits} bits{of}" if bits else f"{proof}; {NOT_IN_BALLS}"
+        if fixed.stable is False:
+            proof = f"with its devices clamped it is unstable: {fixed.proof or PROVED}{of}"
     return PassiveHands(
         topology=system.name,
         verdict=NEVER if why else verdict,
@@ -156,7 +189,7 @@ def passive_hands(system: CompiledSystem, prepared: Prepared | None = None) -> P
         modes=modes,
         joined=joined,
         why=why,
-        proof="" if stable is None else f"proved by floats whose every rounding is bounded{of}",
+        proof=proof,
         linearized=not linear,
         left_out=left_out(system, linear=linear),
     )

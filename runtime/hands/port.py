@@ -24,6 +24,7 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
+import flint
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +32,7 @@ from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
+from apc.eigen.balls import BALLS
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of
@@ -397,7 +399,11 @@ class Cut:
         half = multiply(numbers.add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(len(at.into)) / 4))
         dampers = _diagonal((many * dampings) @ at.of.T / at.seconds)
         units = exact(_diagonal(np.sqrt(at.seconds / each)))
-        damping = with_radius(dampers, 4 * UNIT * dampers) if numbers is RADII else dampers
+        damping: Matrix = dampers
+        if numbers is RADII:
+            damping = with_radius(dampers, 4 * UNIT * dampers)
+        elif numbers is BALLS:
+            damping = np.vectorize(lambda one: flint.arb(one, 4 * UNIT * one), otypes=[object])(dampers)
 
         def scaled(matrix: Matrix) -> Matrix:
             return multiply(multiply(units, matrix), units)
@@ -504,6 +510,11 @@ def _diagonal(values: Floats) -> Floats:
 
 def _weights(static: Matrix, counts: Sequence[int], numbers: Arithmetic) -> Floats:
     """Return `reciprocal`, of one matrix with its radii or of many in floats (k, …)."""
+    if numbers is BALLS:  # any numbers will do, as long as they are the same throughout
+        middle, off = np.vectorize(lambda one: (float(flint.arb(one).mid()), float(flint.arb(one).rad())))(
+            static
+        )
+        return reciprocal(with_radius(middle, off), counts)
     if numbers is RADII or len(counts) == 1:
         return reciprocal(static, counts) if numbers is RADII else np.array(counts, dtype=np.float64)
     return np.stack([reciprocal(with_radius(one, EVEN * np.abs(one).max()), counts) for one in static])
@@ -558,9 +569,4 @@ def _moving(whole: Matrix, at: _Wires, rigid: Floats, numbers: Arithmetic) -> tu
 def _aside(a: Matrix, placed: Matrix, of: Matrix, numbers: Arithmetic) -> Matrix | None:
     """Return where all else is while devices stand aside by 1, site by site; None where it can't be said."""
     still, pushed = numbers.subtract(numbers.exact(np.eye(a.shape[-1])), a), numbers.multiply(placed, of)
-    if numbers is RADII:
-        return solve(still, pushed)
-    try:
-        return np.asarray(np.linalg.solve(still, pushed))
-    except np.linalg.LinAlgError:
-        return None
+    return numbers.solve(still, pushed)
