@@ -332,7 +332,7 @@ def test_the_command_line(
 
 @pytest.mark.parametrize(("stiffness", "stable"), [(458.24, True), (458.25, False), (500.0, False)])
 def test_balls_prove_what_floats_say_and_never_the_opposite(stiffness: float, stable: bool) -> None:
-    """The three users of the paper bear 458.242 N/m (see above); either side of it is proved, neither both."""
+    """The paper's three users bear 458.242 N/m (see above): either side of it is proved, neither both."""
     system = compiled(replaced(AVERAGE, ("stiffness: 500", f"stiffness: {stiffness}")))
     found = passive_hands(system, certify=True)
     assert found.stable is stable
