@@ -91,9 +91,8 @@ def analyze_command(
 
     system = open_scene(file, settings, hands=hands)
     if hands == PASSIVE:
-        asked = {"--method": method != AUTO, "--box": bool(box), "--conventions": every_convention}
-        asked["--buzz"] = with_buzz
-        _judge_passive(system, [name for name, given in asked.items() if given], as_json=as_json)
+        asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
+        _judge_passive(system, [name for name, given in asked.items() if given], box, as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
@@ -115,12 +114,20 @@ def analyze_command(
     print_result(found, as_json=as_json)
 
 
-def _judge_passive(system: CompiledSystem, asked: list[str], *, as_json: bool) -> None:
-    """Say whether a scene is stable with any passive hands; refuse what is asked for besides."""
+def _judge_passive(system: CompiledSystem, asked: list[str], box: tuple[str, ...], *, as_json: bool) -> None:
+    """Say whether a scene is stable with any passive hands, in a box if asked; refuse anything else."""
     from apc.hands.passivity import passive_hands
 
     if asked:
         options = " and ".join((*asked, "--hands passive"))
         what = f"{options} don't go together: what hands can draw has no modes of its own"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
+    if box:
+        from apc.analysis.box import parse_range
+        from apc.answer import proved_box
+
+        print_result(
+            proved_box(system, [parse_range(system, one) for one in box], passive=True), as_json=as_json
+        )
+        return
     print_result(passive_hands(system), as_json=as_json)
