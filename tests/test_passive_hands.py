@@ -12,12 +12,14 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.analysis.analysis import analyze, lifted_groups, prepare
+from apc.analysis.box import parse_range
 from apc.compiler.errors import ApcError
 from apc.eigen.dissipation import least_real
 from apc.frame.devices import clamped, held, with_hands
 from apc.frame.radius import value_of
+from apc.hands.box import prove_box
 from apc.hands.certify import certified
-from apc.hands.passivity import passive_growth, passive_hands
+from apc.hands.passivity import STABLE, UNSTABLE, passive_growth, passive_hands
 from apc.hands.port import open_ports, port_loop, port_loops
 from apc.regions.axes import parse_axes
 from apc.regions.region import region
@@ -294,6 +296,47 @@ def test_a_critical_stiffness_is_bounded_to_nine_digits(count: int, limit: float
     assert crossing.proof == "what hands can draw bounded on either side"
 
 
+@pytest.mark.parametrize(
+    ("boxes", "stable"),
+    [
+        (("contact.stiffness=±1%", "coordination.stiffness=±1%"), True),
+        (("device.mass=±10%", "device.damping=±5%"), True),
+        (("coordination.stiffness=440 N/m:458.3 N/m",), False),
+        (("coordination.stiffness=458.2421 N/m:458.2422 N/m",), False),
+    ],
+)
+def test_a_box_is_proved_where_the_boundary_is_far_and_refuted_where_it_is_inside(
+    boxes: tuple[str, ...], stable: bool
+) -> None:
+    """Three users bear 458.24216 N/m with any passive hand, by an independent program."""
+    system = compiled(users(3, 200))
+    found = prove_box(system, [parse_range(system, one) for one in boxes])
+    assert found.stable is stable
+    assert found.verdict == {True: STABLE, False: UNSTABLE}[stable]
+    if not stable:
+        (stiffness,) = found.point
+        assert stiffness > 458.242164
+
+
+def test_a_box_of_two_kinds_of_devices_is_proved() -> None:
+    text = replaced(
+        AVERAGE, ("user: {count: 3}", "a: {count: 1, set: {device.mass: 0.2 kg}}\n  b: {count: 2}")
+    )
+    system = compiled(replaced(text, ("stiffness: 500", "stiffness: 200")))
+    assert passive_hands(system).stable
+    assert prove_box(system, [parse_range(system, "contact.stiffness=±0.5%")]).stable
+
+
+def test_no_box_is_proved_where_hands_pull_unevenly_or_a_velocity_is_sampled() -> None:
+    with pytest.raises(ApcError, match=r"E930.*unevenly"):
+        system = compiled(replaced(STAR, ("stiffness: 500", "stiffness: 100")))
+        prove_box(system, [parse_range(system, "contact.stiffness=±1%")])
+    text = replaced(AVERAGE, ("stiffness: 1000 N/m, clock", "stiffness: 1000 N/m, damping: 2 N*s/m, clock"))
+    found = prove_box(compiled(text), [parse_range(compiled(text), "contact.stiffness=±1%")])
+    assert found.stable is False
+    assert "samples the velocity of device" in str(found)
+
+
 def test_region_and_sweep_say_what_critical_does(tmp_path: Path) -> None:
     """At 1000 N/m of contact 458.24 N/m are borne, by an independent program."""
     scene = tmp_path / "three.yaml"
@@ -322,7 +365,12 @@ def test_the_command_line(
     assert document["modes"][1]["damping_needed"] == pytest.approx(8.540418397892944, rel=1e-11)
     assert run(["analyze", "three.yaml", "--hands", "clamped"]) == 0
     assert "devices clamped: stable" in capsys.readouterr().out
-    assert run(["analyze", "three.yaml", "--hands", "passive", "--box", "contact.stiffness=±1%"]) == 1
+    gentle = ["--set", "coordination.stiffness=200 N/m"]
+    assert (
+        run(["analyze", "three.yaml", "--hands", "passive", *gentle, "--box", "contact.stiffness=±1%"]) == 0
+    )
+    assert "proved stable with any passive hands for every value in the box" in capsys.readouterr().out
+    assert run(["analyze", "three.yaml", "--hands", "passive", "--buzz"]) == 1
     assert "E930" in capsys.readouterr().err
     assert run(["analyze", "three.yaml", "--hands", ""]) == 1
     assert "E930 no hands are named (free, clamped," in capsys.readouterr().err

@@ -99,10 +99,9 @@ def analyze_command(
 
     system = open_scene(file, settings, hands=hands, told=note_aside)
     if hands == PASSIVE:
-        asked = {"--method": method != AUTO, "--box": bool(box), "--conventions": every_convention}
-        asked["--buzz"] = with_buzz
+        asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
         refused = [name for name, given in asked.items() if given]
-        _judge_passive(system, refused, certify=certify, as_json=as_json)
+        _judge_passive(system, refused, box, certify=certify, as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
@@ -124,12 +123,22 @@ def analyze_command(
     print_result(found, as_json=as_json)
 
 
-def _judge_passive(system: CompiledSystem, asked: list[str], *, certify: bool, as_json: bool) -> None:
-    """Say whether a scene is stable with any passive hands; refuse what is asked for besides."""
+def _judge_passive(
+    system: CompiledSystem, asked: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
+) -> None:
+    """Say whether a scene is stable with any passive hands, in a box if asked; refuse anything else."""
     from apc.hands.passivity import passive_hands
 
     if asked:
         options = " and ".join((*asked, "--hands passive"))
         what = f"{options} don't go together: what hands can draw has no modes of its own"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
+    if box:
+        from apc.analysis.box import parse_range
+        from apc.answer import proved_box
+
+        print_result(
+            proved_box(system, [parse_range(system, one) for one in box], passive=True), as_json=as_json
+        )
+        return
     print_result(passive_hands(system, certify=certify), as_json=as_json)

@@ -52,7 +52,9 @@ from apc.eigen.balls import (
 )
 from apc.eigen.closing import ClosedSystem, close_loop
 from apc.eigen.dissipation import is_positive, least_real, proves_positive_between
+from apc.eigen.modes import split
 from apc.eigen.ratios import Ratio
+from apc.eigen.rigid import find_rigid_modes, stays_rigid
 from apc.frame.devices import refuse_hands
 from apc.frame.discretize import UNIT
 from apc.frame.exact import evaluate_exact
@@ -65,13 +67,14 @@ from apc.hands.port import Cut, Maps, open_ports, port_loop
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
 
 PLACE = Place("box")
 
 # Parts of what is left over for a cell's storage, tried one after the other.
 SPARED = (0.1, 1e-2, 1e-3)
 
-# The share of its smallest entries at which a stiffness counts as none all over the box.
+# What is this small, relatively, is nothing where exact equations say that something is.
 NOTHING = 1e-9
 
 
@@ -79,7 +82,7 @@ NOTHING = 1e-9
 class _Cut:
     """A mode cut open at its devices: its sites over the open parameters, and their devices' dampings.
 
-    `free` (k, d) are the directions in which devices can stand aside and feel nothing.
+    `free` (k, d) are the directions in which devices can stand aside, and all else with them.
     """
 
     system: ClosedSystem
@@ -158,6 +161,10 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question | st
         key = id(one.ported.schedule)
         sites[key] = one.site(own, np.array(inverse, dtype=object))
         dampings[key] = -own.a[velocity, velocity] / inverse
+    plain = split(opened.groups, opened.exchange).systems
+    rigid = {
+        one.name: _translates(one, tuple(opened.sites[group.name] for group in one.sites)) for one in plain
+    }
     cuts = []
     for loop in openings.loops:
         port, cut = port_loop(openings, loop, option=OPTION)
@@ -166,7 +173,9 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question | st
             raise ApcError(Mistake("E930", PLACE, what, hint="apc analyze --hands passive"))
         keys = [id(group.schedule) for group in loop.sites]
         own_sites, own_dampings = (tuple(held[key] for key in keys) for held in (sites, dampings))
-        cuts.append(_Cut(close_loop(loop), own_sites, own_dampings, cut, _unfelt(port.maps)))
+        cuts.append(
+            _Cut(close_loop(loop), own_sites, own_dampings, cut, _unfelt(port.maps, rigid.get(loop.name, 0)))
+        )
     asked = (system, prepared, tuple(ranges), tuple(cuts))
     found = _Question(*asked, np.ones(len(ranges)))
     weights = []
@@ -178,12 +187,19 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question | st
     return _Question(*asked, np.nan_to_num(weights) + np.finfo(np.float64).tiny)
 
 
-def _unfelt(maps: Maps) -> Floats:
-    """Return the directions (k, d) in which devices can stand aside and feel nothing, there and anywhere."""
+def _translates(system: ClosedSystem, sites: tuple[LinearSite, ...]) -> int:
+    """Return in how many directions a mode moves as one, devices and all, the same all over the box."""
+    free = find_rigid_modes(system)
+    return 0 if free.drifts or not stays_rigid(system, sites) else free.basis.shape[1]
+
+
+def _unfelt(maps: Maps, count: int) -> Floats:
+    """Return the directions (k, d) in which devices stand aside and all else too; none unless so many."""
     stiffness = value_of(maps.static)
     values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
-    least = NOTHING * max(float(np.abs(values).max()), float(np.abs(value_of(maps.weight)).max()))
-    return np.asarray(vectors[:, np.abs(values) <= least])
+    size = max(float(np.abs(values).max()), float(np.abs(value_of(maps.weight)).max()))
+    unfelt = np.abs(values) <= NOTHING * size
+    return np.asarray(vectors[:, unfelt if int(unfelt.sum()) == count else slice(0)])
 
 
 def _growth_at(asked: _Question, point: Sequence[Fraction], *, bounded: bool) -> Any:
@@ -217,19 +233,19 @@ def _proved(mode: _Cut, cell: Cell) -> bool:
         return False
     twice = RADII.add(everywhere.static, np.swapaxes(everywhere.static, -1, -2))
     # Where devices stand aside together and feel nothing, they do so all over the box.
-    size = max(float(np.abs(value_of(twice)).max()), 1.0)
+    size = 4 * float(np.abs(twice).sum()) + 1.0
     if not is_positive(RADII.add(twice, RADII.exact(size * mode.free @ mode.free.T))):
         return False
     loop = (middles.a, middles.b, middles.c, RADII.add(middles.d, middles.weight))
     moved = []
     for by, (low, high) in enumerate(cell):
         slope = ball_radii(mapped(slope_of, duals[by]))
-        found = mode.cut.slopes(whole, slope, _dampings(mode, balls, by))
+        found = mode.cut.slopes(whole, slope, _dampings(mode, balls, by), mode.free)
         if found is None:
             return False
         reach = float(high - low) / 2 * (1 + 4 * UNIT)
         moved.append([RADII.multiply(RADII.exact(reach * np.eye(one.shape[-2])), one) for one in found])
-    corners = [loop]
+    corners: list[tuple[Matrix, ...]] = [loop]
     for change in moved:
         corners = [
             tuple(turn(one, by) for one, by in zip(corner, change, strict=True))
@@ -238,7 +254,7 @@ def _proved(mode: _Cut, cell: Cell) -> bool:
         ]
     # A storage that serves with half of what can be spared leaves the rest for the cell.
     a, b, c, e = loop
-    least, _ = least_real(*map(value_of, loop), np.zeros(e.shape[-2:]))
+    least, _ = least_real(value_of(a), value_of(b), value_of(c), value_of(e), np.zeros(e.shape[-2:]))
     if not 0 < least < np.inf:
         return least > 0
     less = RADII.subtract(e, RADII.exact(least / 2 * np.eye(e.shape[-1])))

@@ -418,7 +418,9 @@ class Cut:
             joined=bool((many == self.counts).all()),
         )
 
-    def slopes(self, whole: Matrix, slope: Matrix, dampings: Matrix) -> tuple[Matrix, ...] | None:
+    def slopes(
+        self, whole: Matrix, slope: Matrix, dampings: Matrix, free: Floats
+    ) -> tuple[Matrix, ...] | None:
         """Return how A, B, C and D + W change with a parameter, with radii; devices count as they are many.
 
         Parameters
@@ -427,6 +429,9 @@ class Cut:
             The closed matrix (2, …) and how it changes, at all points meant.
         dampings
             How the devices' dampings change (2, sites, 1).
+        free
+            Directions (k, d), at right angles, in which devices stand aside and all else moves along
+            whatever the parameter is.
         """
         at, exact, multiply, add = self.at, RADII.exact, RADII.multiply, RADII.add
         of, across, sums = exact(at.of), exact(at.of.T.copy()), exact(at.sums)
@@ -439,8 +444,12 @@ class Cut:
         aside_by = solve(RADII.subtract(exact(np.eye(a.shape[-1])), a), pushed)
         if aside_by is None:
             return None
+        left = np.eye(len(free)) - free @ free.T
+        held = with_radius(left, (left != 0) * (len(left) + 2) * UNIT)
+        aside_by = multiply(aside_by, held)
         at_once = slope[..., at.out[:, None], at.into]
-        forces = add(add(multiply(felt_by, aside), multiply(felt, aside_by)), multiply(at_once, of))
+        forces = multiply(add(multiply(felt_by, aside), multiply(at_once, of)), held)
+        forces = add(forces, multiply(felt, aside_by))
         each = at.of @ self.counts
         peers, units = exact(np.diag(each)), exact(np.diag(np.sqrt(at.seconds / each)))
         static = multiply(peers, forces)[..., np.argmax(at.of, axis=0), :]
