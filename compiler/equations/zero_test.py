@@ -113,7 +113,8 @@ class ZeroTest:
         whole = np.ldexp(fractions, DIGITS).astype(np.int64).astype(np.object_)
         # 2⁶¹ ≡ 1: a power of two is that of its exponent modulo 61, be it negative.
         residues: NDArray[np.object_] = whole << ((exponents - DIGITS) % BITS).astype(np.object_)
-        return residues % PRIME
+        residues %= PRIME
+        return residues
 
 
 def _modular(value: Ratio) -> int:
