@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from typing import Any
 
 import casadi
@@ -19,6 +20,7 @@ from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.symbolic import no_derivative, to_term
 from apc.compiler.equations.terms import symbol
+from apc.compiler.equations.zero_test import ZeroTest
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.language.expression import Name
@@ -221,3 +223,13 @@ def test_a_loop_that_needs_another_is_solved_after_it() -> None:
     assert found["y"] == pytest.approx(2.0, abs=1e-12)
     assert found["z"] + found["z"] ** 5 == pytest.approx(4.0, abs=1e-12)
     assert found["w"] == found["z"] - found["y"]
+
+
+def test_a_number_a_peer_has_the_residue_of_its_fraction() -> None:
+    numbers = [0.1, -3.5, 1e300, 5e-324, -2.3e-308, 0.0, 1.0, 123456789.123]
+    for number in numbers:
+        others = [one for one in numbers if one != number]
+        test = ZeroTest(values={symbol("a"): np.array(others), symbol("b"): Fraction(number)})
+        assert not test(symbol("a") - symbol("b"))
+        test = ZeroTest(values={symbol("a"): np.array(numbers), symbol("b"): Fraction(number)})
+        assert test(symbol("a") - symbol("b"))

@@ -24,7 +24,9 @@ from apc.compiler.equations.terms import ZERO, Number, Product, Ratio, Sum, Symb
 Given: TypeAlias = Fraction | NDArray[np.float64] | Term
 # A residue, or one a peer: an array of Python's integers, whose products outgrow 64 bits.
 Residue: TypeAlias = int | NDArray[np.object_]
-PRIME = 2**61 - 1
+BITS = 61
+PRIME = (1 << BITS) - 1
+DIGITS = 53  # binary ones of a float
 
 
 class ZeroTest:
@@ -107,10 +109,12 @@ class ZeroTest:
             return self._value(given)
         if isinstance(given, Fraction):
             return _modular(given)
-        ratios = (float(one).as_integer_ratio() for one in given)
-        # The denominator is a power of two, and 2⁶¹ ≡ 1: dividing by 2^k is multiplying by 2^(−k mod 61).
-        residues = [(n << (1 - d.bit_length()) % 61) % PRIME for n, d in ratios]
-        return np.array(residues, dtype=np.object_)
+        fractions, exponents = np.frexp(given)
+        whole = np.ldexp(fractions, DIGITS).astype(np.int64).astype(np.object_)
+        # 2⁶¹ ≡ 1: a power of two is that of its exponent modulo 61, be it negative.
+        residues: NDArray[np.object_] = whole << ((exponents - DIGITS) % BITS).astype(np.object_)
+        residues %= PRIME
+        return residues
 
 
 def _modular(value: Ratio) -> int:

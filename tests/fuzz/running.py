@@ -52,8 +52,9 @@ _FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Pop
             "compile")  # fmt: skip
 
 _CYTHON = b"_getframe()"  # what Cython has compiled when it writes a traceback
-# What SymPy writes itself about polynomials in so many unknowns, and runs: nothing of a file is in it.
-_MONOMIALS = re.compile(rb"def monomial_[a-z]+\([ABk, ]+\):[\sa-z0-9(),+*<>=:ABN-]*\Z")
+# What `dataclasses` writes for a class of many objects, of its fields' names, and runs: nothing of a file is
+# in it.
+_METHODS = re.compile(rb"def __create_fn__\([\w, ]*\):\n def __(init|eq|hash|setattr|delattr|[lg][te])__\(")
 _OWN_TEXT = re.compile(r'<code object <module> .*"<string>", line 1>')
 _MODULE = re.compile(r'<code object <module> .*\.py", line 1>')  # what runs when a module is loaded
 
@@ -265,17 +266,17 @@ def _become_worker(work: Callable[[Callable[[int, str, str], None]], object], wr
 
 _foreign: list[str] = []
 _listening = False
-_of_monomials = False  # what was compiled last
+_of_methods = False  # what was compiled last
 
 
 def _listen(event: str, arguments: tuple[object, ...]) -> None:
     """Note what no input may cause, and files opened to write."""
-    global _of_monomials
+    global _of_methods
     if not _listening or arguments[:1] == (_CYTHON,):
         return
     if event == "compile":
-        _of_monomials = isinstance(arguments[0], bytes) and bool(_MONOMIALS.match(arguments[0]))
-    if _of_monomials and (event == "compile" or (event == "exec" and _OWN_TEXT.search(str(arguments)))):
+        _of_methods = isinstance(arguments[0], bytes) and bool(_METHODS.match(arguments[0]))
+    if _of_methods and (event == "compile" or (event == "exec" and _OWN_TEXT.search(str(arguments)))):
         return
     if (event in _FOREIGN and not (event == "exec" and _MODULE.search(str(arguments)))) or (
         event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax+")
