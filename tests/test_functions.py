@@ -9,6 +9,7 @@ from typing import Any
 import casadi
 import pytest
 
+from apc.analysis.selfcheck import check_frame
 from apc.compiler.compiled import CompiledSystem, Formula, Kind, Parameter
 from apc.compiler.plain import PlainFunction
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, library, replaced, told
@@ -254,3 +255,50 @@ def test_a_link_over_which_only_some_send_a_value_is_refused() -> None:
         "E215 grip.x travels over lan, and those of b send other values over it. "
         "Write: a link of its own for what only some groups send"
     )
+
+
+def test_a_held_value_is_sent_though_only_another_kind_of_peer_hears_it(tmp_path: Path) -> None:
+    """And what it is multiplied by, a parameter, is one of the sender's."""
+    component = """\
+component: Told
+about: A client tells its force, held and in other units of it; the server puts it on its object.
+source: this test
+connectors: {object: Flange}
+sends: {x: sample(object.x), f: gain*sample(acting)}
+parameters:
+  role: {options: [server, client], default: client, about: which of both}
+  stiffness: {unit: N/m, min: 0, about: of the pull}
+  gain: {unit: 1, default: 1, about: of what is told}
+  clock: clock
+  link: link
+variables:
+  pull: {unit: N, about: force}
+  acting: {unit: N, about: held}
+  f: {unit: N, about: on the object}
+equations:
+  - pull = stiffness*(sample(object.x) - mean(others.x))
+  - acting = hold(pull)
+  - f = if role == server then -sum(others.f) else pull
+  - object.f = hold(f)
+"""
+    text = """\
+topology: told
+clocks: {tick: 1 ms}
+peers:
+  server: {count: 1, set: {it.role: server}}
+  client: {count: 2}
+masses: {cube: {mass: 1 kg, damping: 1 N*s/m}}
+couplers: {it: {type: Told, object: cube, stiffness: 50 N/m, gain: 0.5, clock: tick, link: lan}}
+links: {lan: {clock: tick, delay: 2 ms, graph: star}}
+"""
+    system = compiled(text, library(tmp_path, component))
+    check_frame(system)
+    server, client = system.kinds
+    (send,) = client.sends
+    place = send.channels.index("it.f")
+    held = [hold.name for hold in client.holds].index("it.pull")
+    u = [float(number == held) for number in range(len(client.holds))]
+    values = {parameter.name: parameter.value for parameter in system.parameters}
+    p = [values[name] for name in client.parameters]
+    assert float(send.send([0.0] * len(client.states), u, p, 0)[place]) == 0.5
+    assert [one.name for one in server.clocks[0].receives][-1] == "sum(others.it.f)"

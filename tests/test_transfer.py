@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -82,4 +84,18 @@ def test_the_derivative_is_the_derivative() -> None:
 def test_a_queue_of_any_length_does_not_spoil_the_bound(chain: int) -> None:
     transfer = build_transfer(_sites(4, chain=chain), COUNTS)
     found = respond([transfer], POINTS, np.zeros(len(POINTS)))
+    assert np.all(found.doubt <= 1e-7 * np.abs(found.value).max())
+
+
+def test_a_residue_that_should_be_nothing_does_not_spoil_the_others() -> None:
+    """A mass that tells its velocity and a force of its place: nothing of the velocity has the pole 1."""
+    decay, rise = math.exp(-5 * 8e-3 / 0.6), 0.6 / 5 * (1 - math.exp(-5 * 8e-3 / 0.6))
+    p = np.array([[1, rise, 0, 1e-5], [0, decay, 0, 2e-3], [300, 3.9, 0, 6e-3], [0, 0, 0, 0]])
+    q = np.array([[2e-5, 2e-5, 0], [8e-3, 3e-3, 0], [2e-2, 1e-2, -300], [-1, 0, 0]])
+    s = np.array([[0, 0, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0]])
+    maps = FrameMap(*(block[None].astype(float) for block in (p, q, s, np.zeros((3, 3)))))
+    bounded = BoundedMap(*maps.blocks, maps.mapped(lambda block: 1e-15 * np.abs(block)))
+    found = respond([build_transfer(bounded, np.ones(1))], POINTS, np.zeros(len(POINTS)))
+    for point, value, bound in zip(POINTS, found.value, found.doubt, strict=True):
+        assert np.all(np.abs(_answer(maps, np.ones(1), point) - value) <= bound + 1e-12 * np.abs(value).max())
     assert np.all(found.doubt <= 1e-7 * np.abs(found.value).max())

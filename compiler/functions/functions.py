@@ -43,7 +43,7 @@ from apc.compiler.functions.exchange import (
     used_links,
     with_rounded,
 )
-from apc.compiler.functions.reached import Reached
+from apc.compiler.functions.reached import Reached, reached_together
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.recordings import TimeTable
 from apc.compiler.language.unit_text import format_dimension
@@ -57,7 +57,7 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     """Write every kind as CasADi functions, and what lies between the sites beside them."""
     scene = system.scene
     timings = Timings(scene)
-    builders = [_KindBuilder(scene, kind, timings) for kind in system.kinds]
+    builders = [_KindBuilder(scene, one, timings) for one in reached_together(system.kinds)]
     rows = _shared_rows([builder.reached for builder in builders])
     kinds = [builder.build(rows) for builder in builders]
     check_channels(scene, kinds)
@@ -124,7 +124,8 @@ _Channels = dict[str, tuple[str, int]]  # of each send: its link, and its row in
 class _KindBuilder:
     """One kind's functions: what is read of it was found before, and is written."""
 
-    def __init__(self, scene: Scene, kind: SortedKind, timings: Timings) -> None:
+    def __init__(self, scene: Scene, reached: Reached, timings: Timings) -> None:
+        kind = reached.kind
         self.kind = kind
         self.scene = scene
         self.tables: dict[str, TimeTable] = {
@@ -135,7 +136,7 @@ class _KindBuilder:
         }
         self.timings = timings
         self.dropped: list[tuple[str, str]] = []
-        self.reached = Reached(kind)
+        self.reached = reached
 
     def build(self, rows: dict[str, str]) -> Kind:
         """Write the kind's functions; `rows` says in which row each send that is heard travels."""

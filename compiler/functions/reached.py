@@ -1,6 +1,6 @@
 """What of a kind is ever read: the motion of its states, through all crossings, depends on it.
 
-Takes: `SortedKind`. Gives: `Reached`.
+Takes: `SortedKind`s. Gives: `Reached`, `reached_together`.
 Guarantees: what a state's derivative depends on is reached, however many samples, ticks, holds, sends and
 peers lie between; nothing else is.
 Does not: write functions (see `functions`).
@@ -8,7 +8,7 @@ Does not: write functions (see `functions`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clocks import HoldCrossing, PreviousCrossing, ReceiveCrossing
@@ -23,11 +23,12 @@ from apc.compiler.functions.casadi_writer import Definition
 class Reached:
     """One kind: what defines each symbol, which crossings there are, and which symbols are read.
 
+    `heard` are names of sends that other kinds hear: what this kind sends under them is read, too.
     `holds`, `previous` and `receives` are the crossings that are read, by their symbols; `edges` what a
     reduction runs over, for those that do; `sends` everything the kind could send.
     """
 
-    def __init__(self, kind: SortedKind) -> None:
+    def __init__(self, kind: SortedKind, heard: Collection[str] = ()) -> None:
         self.kind = kind
         self.continuous: dict[Symbol, Definition] = kind.partitions[0].definitions
         self.clocked: dict[Symbol, Definition] = {
@@ -45,7 +46,8 @@ class Reached:
             {symbol(previous.symbol): previous for previous in kind.previous},
             {symbol(receive.symbol): receive for receive in kind.receives},
         )
-        self.symbols = self._closure(derivative_symbol(name) for name in kind.states)
+        told = [s for name in self.sends if name in heard for s in self.sends[name].expression.free_symbols]
+        self.symbols = self._closure([*(derivative_symbol(name) for name in kind.states), *told])
         self.holds = {s: hold for s, hold in self._known.holds.items() if s in self.symbols}
         self.previous = {s: one for s, one in self._known.previous.items() if s in self.symbols}
         self.receives = {s: receive for s, receive in self._known.receives.items() if s in self.symbols}
@@ -121,6 +123,17 @@ class Reached:
             for name in (self._known.receives[s].send, *_others(self.edges.get(s))):
                 if name in self.sends:
                     yield from self.sends[name].expression.free_symbols
+
+
+def reached_together(kinds: Sequence[SortedKind]) -> list[Reached]:
+    """Return what is read of each kind, where each sends what any of them hears."""
+    heard: set[str] = set()
+    while True:
+        found = [Reached(kind, heard) for kind in kinds]
+        now = {name for one in found for name in one.heard}
+        if now <= heard or len(kinds) == 1:  # what a kind hears itself is reached as it is
+            return found
+        heard |= now
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,6 +38,9 @@ INNER = 0.3
 # left is this share of a rounding.
 SERIES, CUT = 60, 2.0**-7
 
+# What residues may be off by, relatively, before those that should be nothing count as larger.
+FINE = 1e-9
+
 # Sites worked on together: they stay in the cache of a processor.
 CHUNK = 1024
 
@@ -58,7 +61,7 @@ class Transfer:
     poles: Complexes  # (K, k)
     residues: Complexes  # (K, k, n_s · n_r)
     residue_sizes: Floats
-    residue_error: Floats  # (k,): what they may be off by, relative to their sizes
+    residue_error: Floats  # (k,): what they may be off by, relative to their sizes, which are bounds for it
     block: Floats  # (k,): a bound on ‖(ζ − T₂)⁻¹‖ from twice `inner` on
     loop: Floats  # (k, K + 1): u w, see `build_transfer`; the block last
     left: Floats  # (k, K + 1, n_s): |S X| u
@@ -109,6 +112,7 @@ def _gathered(
     errors = np.full((sites, n), np.inf)
     poles = np.zeros((most, sites), np.complex128)
     residues = np.zeros((most, sites, n_s * n_r), np.complex128)
+    sizes = np.zeros(residues.shape)
     doubt, block = np.zeros(sites), np.zeros(sites)
     loop = np.zeros((sites, most + 1))
     left, right = np.zeros((sites, most + 1, n_s)), np.zeros((sites, most + 1, n_r))
@@ -122,6 +126,7 @@ def _gathered(
             part = _split(own, counts[place], values[place], vectors[place], count, inner)
             poles[:count, place] = values[place, :count].T
             residues[:count, place] = (counts[place, None, None] * part.residues).swapaxes(0, 1)
+            sizes[:count, place] = (counts[place, None, None] * part.sizes).swapaxes(0, 1)
             kept = [*range(count), most]  # the block comes last
             left[np.ix_(place, kept)] = counts[place, None, None] * part.left
             right[np.ix_(place, kept)], loop[np.ix_(place, kept)] = part.right, part.loop
@@ -137,7 +142,7 @@ def _gathered(
         eigenvalue_errors=errors,
         poles=poles,
         residues=residues,
-        residue_sizes=np.abs(residues),
+        residue_sizes=sizes,
         residue_error=doubt,
         block=block,
         loop=loop,
@@ -176,6 +181,7 @@ class _Parts:
     """
 
     residues: Complexes
+    sizes: Floats
     doubt: Floats
     block: Floats
     loop: Floats
@@ -204,9 +210,15 @@ def _split(
     product = (a_size + a_doubt).swapaxes(1, 2)[:, :large, :, None] * (b_size + b_doubt)[:, :large, None, :]
     exact = np.abs(residues)
     off = np.maximum(product - exact, 0.0) + 8 * UNIT * product
-    # Relative to each residue; one that should be nothing is off by something all the same.
-    floor = UNIT * product.max(axis=(1, 2, 3), initial=0.0)[:, None, None, None]
-    doubt = (off / np.maximum(exact, floor + np.finfo(np.float64).tiny)).max(axis=(1, 2, 3), initial=0.0)
+    # Relative to each residue. One that should be nothing is off by something all the same: where that would
+    # spoil the others, it counts as large as its error says.
+    least = UNIT * product.max(axis=(1, 2, 3), initial=0.0) + np.finfo(np.float64).tiny
+    doubt = (off / np.maximum(exact, least[:, None, None, None])).max(axis=(1, 2, 3), initial=0.0)
+    whole = off.max(axis=(1, 2, 3), initial=0.0) / np.maximum(exact.max(axis=(1, 2, 3), initial=0.0), least)
+    doubt = np.minimum(doubt, np.maximum(whole, FINE))
+    sizes = np.maximum(
+        exact, (1 + 8 * UNIT) * off / np.maximum(doubt, np.finfo(np.float64).tiny)[:, None, None, None]
+    )
 
     u, w = _rank_one(block_norms(change, large))
     left = block_norms_along(a_size + a_doubt, large) * u[:, None, :]
@@ -216,6 +228,7 @@ def _split(
     block = block_resolvent(small, 2 * inner)
     return _Parts(
         residues=residues.reshape(sites, large, a.shape[1] * b.shape[2]),
+        sizes=sizes.reshape(sites, large, a.shape[1] * b.shape[2]),
         doubt=doubt,
         block=block,
         loop=u * w,
