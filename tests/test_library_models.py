@@ -82,7 +82,7 @@ def test_every_component_loads() -> None:
 
 
 def test_every_component_is_tested() -> None:
-    pages = [ROOT / "tests" / "test_models.py", ROOT / "tests" / "test_plane.py", Path(__file__)]
+    pages = [ROOT / "tests" / "test_models.py", ROOT / "tests" / "test_planar.py", Path(__file__)]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     for name in Library().component_names:
         words = "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name)
