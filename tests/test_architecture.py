@@ -112,7 +112,7 @@ HOUSE = (
     (
         "apc.present",
         """
-        forms pictures network hands analysis vary region_picture region plane simulation still recording
+        forms pictures network hands analysis vary region_picture region planar simulation still recording
         bench
         """,
     ),
