@@ -30,14 +30,14 @@ from apc.threads import single_threaded
 from apc.vary.crossings import CELL
 from apc.vary.delays import delay_now
 from apc.vary.evaluator import reaches_time
-from apc.vary.mean_square import (
+from apc.vary.growth import (
     BY_GROWTH,
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
     criterion_of,
     growth_at,
-    search_mean_square,
+    search_growth,
 )
 from apc.vary.search import Crossing, Search, Told, search, search_delay
 
@@ -135,7 +135,7 @@ def critical(
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
         if by_growth:
             low, high = (None if one is None else float(one) for one in limits)
-            found = search_mean_square(
+            found = search_growth(
                 *(system, free, low, high, present, prepared, _PLACE), told=told, criterion=chosen_criterion
             )
         elif timed:
