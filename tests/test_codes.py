@@ -174,7 +174,7 @@ E915 runtime/simulation: a run has more rows than anyone waits for
 E920 runtime/benchmark: the truths of hard cases can't be had
 E921 runtime/benchmark runtime/cli: there is nothing to measure by the number of peers
 E922 runtime/cli: a measurement shows a fault of the program
-E930 runtime/cli runtime/frame runtime/vary: no such hands, or they don't go with what is asked
+E930 runtime/cli runtime/frame runtime/hands runtime/vary: no such hands, or they don't go with what is asked
 E931 runtime/frame runtime/hands: a peer has no device, or several that a hand might hold
 E932 runtime/frame: a scene has hands already
 E933 runtime/hands: a device can't be cut out of its scene, or the scene is too large for it

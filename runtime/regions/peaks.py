@@ -40,7 +40,7 @@ ABOVE, ON_AXIS = 1e-10, 1e-5
 LEVELS = 20
 
 # Newton's steps to the top of a peak, and a step that is the last.
-STEPS, SHORT = 8, 1e-9
+STEPS, SHORT = 8, 1e-7
 FARTHEST, POLISHED = 0.3, 2
 
 # Squares of gains nearer to each other than this turn into each other anyhow.

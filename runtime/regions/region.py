@@ -46,15 +46,18 @@ from apc.vary.evaluator import (
 )
 from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.mean_square import (
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_time
+from apc.vary.growth import (
     BY_GROWTH,
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
-    MeanSquareEvaluator,
+    GrowthEvaluator,
     criterion_of,
     growth_at,
     refuse_time,
 )
+from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.ports import PortEvaluator, port_evaluator
 from apc.vary.search import Told
 
@@ -76,7 +79,7 @@ FOLD = 0.1
 CHUNK = 1024
 
 
-Source = BatchEvaluator | PointEvaluator | MeanSquareEvaluator | PortEvaluator
+Source = BatchEvaluator | PointEvaluator | GrowthEvaluator | PortEvaluator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +106,7 @@ class Curve:
     @property
     def mode(self) -> str:
         """The name of the closed system that makes the boundary here, or the criterion that does."""
-        if isinstance(self.source, MeanSquareEvaluator):
+        if isinstance(self.source, GrowthEvaluator):
             return self.source.criterion
         middle = len(self.knots) // 2
         return _identify(self.source, self.knots[middle], complex(self.eigenvalues[middle]))[0]
@@ -114,7 +117,7 @@ class Curve:
 
         Both are NaN where it can't be told.
         """
-        if isinstance(self.source, MeanSquareEvaluator):
+        if isinstance(self.source, GrowthEvaluator):
             return np.nan, np.nan
         angles = np.abs(np.angle(self.eigenvalues))
         middle = len(self.knots) // 2
@@ -278,7 +281,7 @@ def region(
             source = ports
         elif meant in BY_GROWTH:
             times = []
-            source = MeanSquareEvaluator(system, free, prepared, PLACE, meant)
+            source = GrowthEvaluator(system, free, prepared, PLACE, meant)
         elif times:
             source = PointEvaluator(system, free, prepared)
         else:
@@ -353,9 +356,7 @@ def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
     if isinstance(source, BatchEvaluator):
         return resolve_family(source, rectangle, partial(matrix_errors, source))
-    if isinstance(
-        source, MeanSquareEvaluator | PortEvaluator
-    ):  # a series would take more points than it saves
+    if isinstance(source, GrowthEvaluator | PortEvaluator):  # a series would take more points than it saves
         errors = tuple(one[0] for one in source.errors(rectangle.values(np.array([[0.5, 0.5]]))))
         return DirectFamily(source, rectangle, tuple(len(one) for one in errors), errors)
     if timed:  # each point has a schedule of its own: there are no slopes, and no one size
@@ -404,7 +405,7 @@ def _relative_error(arc: Arc, offset: Floats) -> float:
 
 def _identify(source: Source, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
-    assert not isinstance(source, MeanSquareEvaluator), "one number has no mode"
+    assert not isinstance(source, GrowthEvaluator), "one number has no mode"
     if isinstance(source, PortEvaluator):
         name, hertz, frame_s = source.motion_at(value, abs(float(np.angle(eigenvalue))))
         return name, 2 * np.pi * hertz * frame_s, frame_s

@@ -22,8 +22,8 @@ from apc.frame.names import find, unit_of
 from apc.frame.overrides import apply
 from apc.sweeps.grid import Grid
 from apc.tables import Column, Row
+from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE
 from apc.vary.many import FAULT, ManyAnalyses, Varied, by_matrices, many_analyses
-from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, PASSIVE
 
 PLACE = Place("sweep")
 

@@ -32,13 +32,15 @@ from apc.vary.crossings import CELL
 from apc.vary.delays import delay_now
 from apc.vary.evaluator import reaches_count, reaches_time
 from apc.vary.mean_square import (
+from apc.vary.evaluator import reaches_time
+from apc.vary.growth import (
     BY_GROWTH,
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
     criterion_of,
     growth_at,
-    search_mean_square,
+    search_growth,
 )
 from apc.vary.search import Crossing, Search, Told, search, search_delay
 
@@ -146,7 +148,7 @@ def critical(
             found = search_counts(system, free, limits, present, stable_of, _PLACE, told=told)
         elif by_growth:
             low, high = (None if one is None else float(one) for one in limits)
-            found = search_mean_square(
+            found = search_growth(
                 *(system, free, low, high, present, prepared, _PLACE), told=told, criterion=chosen_criterion
             )
         elif timed:

@@ -31,8 +31,8 @@ from apc.moments.network import Growth, growth
 from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
 from apc.vary.evaluator import free_parameters
+from apc.vary.growth import BOUNDED, MEAN_SQUARE, FirstLost, allowed, first_lost, growth_at
 from apc.vary.margins import GROWTH, Margin, Margins, coupler_parameters
-from apc.vary.mean_square import BOUNDED, MEAN_SQUARE, FirstLost, allowed, first_lost, growth_at
 from apc.vary.search import SAMPLES
 from apc.vary.sensitivity import Sensitivities, Sensitivity, varied
 

@@ -10,7 +10,8 @@ Does not: vary a time, or ask what hands can draw (see `regions.peaks`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import casadi
@@ -34,6 +35,9 @@ from apc.vary.wiring import site_key
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
+
+# Scenes prepared that are kept.
+KEPT = 16
 
 # The step of a central difference, of a direction: what it cuts off and what rounding leaves are then alike.
 DIFFERENCE = 1e-5
@@ -181,6 +185,25 @@ def port_evaluator(system: CompiledSystem, free: Sequence[Free], prepared: Prepa
         As `passivity.passive_hands`.
     """
     refuse_hands(system, OPTION)
+    known = tuple(map(id, prepared.jacobians))
+    return _evaluator(_Asked(system, tuple(free), known, prepared.order, prepared))
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """All that an evaluator follows from; `known` are the identities of the Jacobians in `prepared`."""
+
+    system: CompiledSystem
+    free: tuple[Free, ...]
+    known: tuple[int, ...]
+    order: tuple[str, ...]
+    prepared: Prepared = field(compare=False)
+
+
+@lru_cache(maxsize=KEPT)
+def _evaluator(of: _Asked) -> PortEvaluator | None:
+    """Prepare a scene, see `port_evaluator`."""
+    system, free, prepared = of.system, of.free, of.prepared
     if not all(prepared.jacobians[group.kind].parameters_suffice for group in system.groups):
         return None
     groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
@@ -193,7 +216,7 @@ def port_evaluator(system: CompiledSystem, free: Sequence[Free], prepared: Prepa
         layout = lay_out_loop(loop)
         wired.append(_Wired(loop, tuple(feedback_of(loop, layout)), layout, cut, port))
     return PortEvaluator(
-        free=tuple(free),
+        free=free,
         batch=batch_evaluator(system, free, groups, exchange, matrices=False),
         openings=openings,
         inertias={id(one): _inertias(one) for one in openings.groups},

@@ -28,7 +28,7 @@ from apc.optional import need
 from apc.present.pictures import write_figure
 from apc.present.region_picture import PANEL, STYLES
 from apc.threads import single_threaded
-from apc.vary.mean_square import growth_at
+from apc.vary.growth import growth_at
 from tests.bench.judge import Judge, parser_of
 from tests.topologies import SCENES, compiled, replaced
 

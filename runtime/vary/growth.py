@@ -1,8 +1,8 @@
 """The values of one parameter at which one number passes 1: in mean square, or with passive hands.
 
 Takes: a `CompiledSystem` and the name of a parameter, or of what its links lose.
-Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `search_mean_square`;
-`first_lost`, `FirstLost`, `BOUNDED`; `growth_at`, `allowed`; `MeanSquareEvaluator`.
+Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `search_growth`;
+`first_lost`, `FirstLost`, `BOUNDED`; `growth_at`, `allowed`; `GrowthEvaluator`.
 Guarantees: on either side of a crossing, by its error, bounds on the growth of second moments decide, or on
 what hands can draw, which counts as a growth (see `passivity.passive_growth`).
 Does not: find two crossings between neighbouring samples; follow a delay, whose pieces are the nominal
@@ -159,7 +159,7 @@ def growth_at(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MeanSquareEvaluator:
+class GrowthEvaluator:
     """An `Evaluator` of one number: the root of what is said to grow in a frame, as a matrix (1, 1).
 
     Derivatives are differences over a small part of the directions, right to about 1e-9 of them.
@@ -221,7 +221,7 @@ def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
     )
 
 
-def search_mean_square(
+def search_growth(
     system: CompiledSystem,
     free: Free,
     low: float | None,
@@ -367,7 +367,7 @@ def first_lost(
     samples
         Where to look, the first a stable value.
     prepared, place
-        As for `search_mean_square`.
+        As for `search_growth`.
     """
     looking, why, reached = _Looking(system, free, prepared, place, {}), "", samples[0]
     for one, other in itertools.pairwise(samples):
