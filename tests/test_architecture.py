@@ -92,11 +92,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
-<<<<<<< HEAD
-        delays lags search counts mean_square critical margins sensitivity over_network
-=======
-        delays lags search growth critical margins sensitivity over_network
->>>>>>> rc
+        delays lags search counts growth critical margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),

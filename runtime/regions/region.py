@@ -44,9 +44,6 @@ from apc.vary.evaluator import (
     reaches_count,
     reaches_time,
 )
-from apc.vary.marginal import marginal_motion, with_rigid
-from apc.vary.mean_square import (
-from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_time
 from apc.vary.growth import (
     BY_GROWTH,
     MEAN_SQUARE,

@@ -36,7 +36,6 @@ from apc.sweeps.store import Parts, open_parts, remove_parts
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
 from apc.tables import BLOCK, Cell, Column, Row, check_table_path, write_table
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
-from apc.vary.mean_square import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 
 if TYPE_CHECKING:
     import pandas

@@ -31,8 +31,6 @@ from apc.vary.counts import search_counts
 from apc.vary.crossings import CELL
 from apc.vary.delays import delay_now
 from apc.vary.evaluator import reaches_count, reaches_time
-from apc.vary.mean_square import (
-from apc.vary.evaluator import reaches_time
 from apc.vary.growth import (
     BY_GROWTH,
     MEAN_SQUARE,

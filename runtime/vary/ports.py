@@ -10,7 +10,7 @@ Does not: vary a time, or ask what hands can draw (see `regions.peaks`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import lru_cache
 from typing import Any
 
