@@ -15,9 +15,9 @@ scene                       named_numbers, timebase, instances, sections, channe
 equations                   connections: where connectors meet; flatten
                             reductions: what is heard of the others; clock_inference: what ticks together;
                             clocks
-                            terms, symbolic, zero_test: algebra; solution, matching, residuals, elimination,
-                            tearing, blocks: solving; derivatives, aliases, index: derivatives and states;
-                            structure
+                            terms, symbolic, identities, zero_test: algebra; solution, matching, residuals,
+                            elimination, tearing, blocks: solving; derivatives, aliases, index: derivatives
+                            and states; structure
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
 compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others

@@ -36,7 +36,8 @@ HOUSE = (
     (
         "apc.compiler.equations",
         """
-        connections flatten reductions clock_inference clocks terms symbolic zero_test solution matching
+        connections flatten reductions clock_inference clocks terms symbolic identities zero_test solution
+        matching
         residuals elimination tearing blocks derivatives aliases index structure
         """,
     ),

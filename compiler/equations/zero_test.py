@@ -3,8 +3,8 @@
 Takes: terms. Gives: `ZeroTest`, `Vanishing`, `NOTHING_VANISHES`.
 Guarantees: a rational expression that is zero is found to be; one that is not is taken for zero with a
 probability below its degree/2⁶¹; the same expressions give the same answers.
-Does not: simplify or expand anything, or know how function values depend on each other: sin(x)² + cos(x)² − 1
-is not found to be zero.
+Does not: simplify or expand anything; what function values have in common, as sin(x)² + cos(x)² = 1, is asked
+of `identities`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.equations.terms import ZERO, Number, Product, Ratio, Sum, Symbol, Term
+from apc.compiler.equations.identities import is_identity
+from apc.compiler.equations.terms import ZERO, Number, Product, Ratio, Sum, Symbol, Term, number
 
 # A number of the scene: one for all peers, one a peer (count,), or an expression over other numbers.
 Given: TypeAlias = Fraction | NDArray[np.float64] | Term
@@ -60,7 +61,13 @@ class ZeroTest:
         """Return whether the expression is zero."""
         if isinstance(expression, Number):
             return expression == ZERO
-        return bool(np.any(np.equal(self._value(expression), 0)))
+        if np.any(np.equal(self._value(expression), 0)):
+            return True
+        if self._nonzero is not None:
+            return False
+        numbers = {name: number(given) for name, given in self._given.items() if isinstance(given, Fraction)}
+        known = expression.replace(numbers) if numbers else expression
+        return known == ZERO or is_identity(known)
 
     def _value(self, node: Term) -> Residue:
         known = self._values.get(node)

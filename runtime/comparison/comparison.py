@@ -25,7 +25,7 @@ from apc.hands.feel import Feel, feel
 from apc.moments.network import NetworkVerdict, judge_network
 from apc.result import Result
 from apc.vary.critical import Critical, critical
-from apc.vary.mean_square import NOMINAL, PASSIVE, criterion_of
+from apc.vary.growth import NOMINAL, PASSIVE, criterion_of
 from apc.vary.search import Told
 
 if TYPE_CHECKING:
