@@ -57,7 +57,7 @@ WIDE = {
 # frame of a thousand ticks sums as many roundings.
 WIDE_KRYLOV = {"client-server": 1.0, "coasting": 1.0, "defective": 1e-3, "high-rate-ratio": 1e-5}
 
-# Where a server adds up what it is told, Arnoldi's method does not see which motion stands still, and says so:
+# Where a server adds up what it is told, Arnoldi's method does not see which motion stands still and says so:
 # it is among the modes, and its radius 1 bounds nothing.
 STANDING = {("krylov", "client-server")}
 
