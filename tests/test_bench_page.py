@@ -123,7 +123,7 @@ def test_every_picture_of_the_readme_is_drawn_by_a_command_that_stands_there() -
     found = pictures(text)
     assert shown
     assert list(found) == shown
-    assert {words[1] for words in found.values()} == {"region", "simulate", "-m"}
+    assert {words[1] for words in found.values()} == {"region", "simulate", "compare", "-m"}
     for picture, words in found.items():
         assert words[-1] == picture
         assert all((README.parent / word).is_file() for word in words if word.endswith(".yaml"))

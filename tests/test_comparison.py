@@ -346,3 +346,13 @@ def test_one_file_at_fault_is_told_as_everywhere(
 def test_without_a_file_there_is_nothing_to_compare(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["compare"]) == 2
     assert "Missing argument 'FILE...'" in capsys.readouterr().err
+
+
+def test_the_function_does_what_the_command_does(
+    scenes: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = apc.compare(scenes, set={"lan.delay": "16 ms"}, over=["contact.stiffness"])
+    assert run(["compare", *scenes, "--set", "lan.delay=16 ms", "--over", "contact.stiffness"]) == 0
+    assert capsys.readouterr().out.rstrip("\n") == str(found)
+    pytest.importorskip("pandas")
+    assert found.to_dataframe()["stiffness parameter"].tolist() == ["contact.stiffness"] * 2

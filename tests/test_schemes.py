@@ -146,7 +146,7 @@ def waves(
         p, *filtered = memory
         wave = mean(heard, 2)
         if cutoff is not None:
-            wave = filtered[0] + (1 - math.exp(-cutoff * 1e-3)) * (wave - filtered[0])
+            wave = filtered[0] + cutoff * 1e-3 / (1 + cutoff * 1e-3) * (wave - filtered[0])
         push = contact(x)
         moved = math.sqrt(2 / impedance) * wave + correction * (mean(heard, 0) - p)
         # f = K (x − p − T v) + B (x' − v) with v = moved + f/b, solved for f.
@@ -192,7 +192,7 @@ def test_filtered_waves_are_their_law(delay: int, cutoff: float, correction: flo
 
 @pytest.mark.parametrize("impedance", [0.3, 10.0, 400.0])
 def test_power_into_the_line_is_half_the_outgoing_square_less_half_the_incoming(impedance: float) -> None:
-    """(u² − w²)/2 = f v, whatever the copy does and whatever is heard."""
+    """(u² − w²)/2 = f v, whatever the copy does and whatever is heard; both waves come times √(2b)."""
     text = replaced(scene("two-users-waves"), ("impedance: 10 N*s/m", f"impedance: {impedance} N*s/m"))
     system = compiled(text)
     (kind,) = system.kinds
@@ -211,7 +211,7 @@ def test_power_into_the_line_is_half_the_outgoing_square_less_half_the_incoming(
         found = dict(zip(clock.outputs, casadi.DM(y).full().ravel().tolist(), strict=True))
         f, out = found["coordination.f"], found["coordination.out"]
         v = (found["coordination.p"] - point) / 1e-3
-        assert (out**2 - heard**2) / 2 == pytest.approx(f * v, rel=1e-9, abs=1e-12)
+        assert (out**2 - heard**2) / (4 * impedance) == pytest.approx(f * v, rel=1e-9, abs=1e-12)
         assert f == pytest.approx(500 * (place - found["coordination.p"]) + 5 * (speed - v), rel=1e-9)
 
 

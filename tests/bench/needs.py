@@ -15,7 +15,7 @@ from pathlib import Path
 from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.equations.structure import SortedSystem
-from apc.compiler.functions.reached import Reached
+from apc.compiler.functions.reached import reached_together
 from apc.compiler.pipeline import each_stage
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Schedule
@@ -48,9 +48,10 @@ def accounts(path: Path) -> tuple[Account, ...]:
     schedules = prepare(system).schedules
     schedule_of = {group.kind: one for group, one in zip(system.groups, schedules, strict=True)}
     found = []
-    for place, kind in enumerate(ordered.kinds):
+    for place, reached in enumerate(reached_together(ordered.kinds)):
+        kind = reached.kind
         steps = [name.name for part in kind.partitions for name in part.definitions]
-        read = {one.name for one in Reached(kind).symbols}
+        read = {one.name for one in reached.symbols}
         unread = tuple(name for name in steps if name not in read)
         found.append(
             Account(
