@@ -1,382 +1,106 @@
-"""Parts that move in a plane and in space against their closed forms; vectors in groups, tables, arrays."""
+"""Claims about `apc.vary.plane`: all crossings of a loop with a delay of any length, against closed forms."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import dataclass
 
-import casadi
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-import apc
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
-from apc.compiler.pipeline import compile_topology
-from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, library, replaced
+from apc.eigen.bordered import Logarithm
+from apc.vary.plane import cross, over_all
 
-PLANAR = (SCENES / "planar-users.yaml").read_text(encoding="utf-8").partition("\n")[2]
-EXACT = 1e-13  # a few roundings
-POINT = "topology: point\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\nmasses:\n"
-PLANE = f"{POINT}  device: {{type: PlanarMass, mass: 2 kg, damping: 3 N*s/m}}\n"
-SPACE = f"{POINT}  device: {{type: SpatialMass, mass: 2 kg, damping: 3 N*s/m}}\n"
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 
 
-def values(system: CompiledSystem) -> dict[str, float]:
-    return {parameter.name: parameter.value for parameter in system.parameters}
+@pytest.fixture(autouse=True)
+def _as_searches_do() -> Iterator[None]:
+    with np.errstate(all="ignore"):
+        yield
 
 
-def rates(system: CompiledSystem, x: Mapping[str, float]) -> dict[str, float]:
-    """Return dx/dt by state, at x by state; what isn't named is 0, nothing is held."""
-    (kind,) = system.kinds
-    states = [state.name for state in kind.states]
-    p = [values(system)[name] for name in kind.parameters]
-    found = kind.derivative([x.get(n, 0.0) for n in states], [0.0] * len(kind.holds), p, 0)
-    return dict(zip(states, casadi.DM(found).full().ravel().tolist(), strict=True))
+@dataclass(frozen=True)
+class Pull:
+    """x⁺ = pole x − p x(d frames ago): F(ζ) = ζ − pole + p ζ^(−d), `times` over."""
+
+    delay: int
+    pole: float = 1.0
+    times: int = 1
+
+    @property
+    def states(self) -> int:
+        """How many zeros F has, less its poles at 0."""
+        return self.times
+
+    @property
+    def longest(self) -> int:
+        """The delay."""
+        return self.delay
+
+    def at(self, values: Floats, rows: NDArray[np.intp], points: Complexes) -> Logarithm:
+        """Return log F and its derivatives."""
+        late = values[rows] * points**-self.delay
+        f = points - self.pole + late
+        turning = 1j * (points - self.delay * late)
+        moving = points**-self.delay / f
+        return Logarithm(self.times * np.log(f), self.times * turning / f, self.times * moving)
+
+    def over(self, values: Floats, points: Complexes) -> Logarithm:
+        """Return the same at all values and points."""
+        return over_all(self, values, points)
+
+    def alone(self, values: Floats) -> Complexes:
+        """Return the pole."""
+        return np.full((len(values), 2), self.pole, dtype=np.complex128)
 
 
-def forces(system: CompiledSystem, x: Mapping[str, float]) -> dict[str, float]:
-    """Return what the only clock computes, at x by state."""
-    (kind,) = system.kinds
-    (clock,) = kind.clocks
-    p = [values(system)[name] for name in kind.parameters]
-    at = [x.get(state.name, 0.0) for state in kind.states]
-    found = clock.tick(at, [0.0] * len(kind.holds), [], [], p, 0)
-    return dict(zip(clock.outputs, casadi.DM(found).full().ravel().tolist(), strict=True))
+@pytest.mark.parametrize("delay", [0, 1, 2, 7, 30, 100, 300, 1000])
+def test_an_integrator_pulled_back_late_is_stable_up_to_its_closed_form(delay: int) -> None:
+    """|p| < 2 sin(π/(2(2d + 1))): Levin and May, Theoretical Population Biology 9, 1976."""
+    limit = 2 * np.sin(np.pi / (2 * (2 * delay + 1)))
+    points = np.concatenate([[0.0], np.geomspace(1e-3 * limit, 1e3 * limit, 40)])
+    found = cross([Pull(delay)], points, 1e-3 * limit)
+    assert found.whole
+    (root,) = found.roots
+    assert root.value == pytest.approx(limit, rel=1e-12) and root.rising
+    assert abs(np.angle(root.eigenvalue)) == pytest.approx(np.pi / (2 * delay + 1), rel=1e-10)
+    assert np.array_equal(found.stable, points < limit) or found.stable[0]
 
 
-def sizes(text: str) -> np.ndarray:
-    """Return the magnitudes of all eigenvalues of a scene, each as often as it comes, largest first."""
-    found = apc.analyze(compiled(text))
-    each = [abs(one.eigenvalue) for one in found.modes for _ in range(one.multiplicity)]
-    return np.sort(each)[::-1]
-
-
-# ---- what a plane has twice ----
-
-
-def test_the_scene_in_a_plane_has_each_eigenvalue_of_the_scene_on_a_line_twice() -> None:
-    line, plane = sizes(AVERAGE), sizes(PLANAR)
-    several = line > 1e-6  # smaller ones are of multiple eigenvalues at zero, whose errors are large
-    assert several.sum() >= 10
-    assert plane[: 2 * several.sum()] == pytest.approx(np.repeat(line[several], 2), rel=1e-9)
-    one, two = apc.analyze(compiled(AVERAGE)), apc.analyze(compiled(PLANAR))
-    assert two.spectral_radius == pytest.approx(one.spectral_radius, rel=1e-12)
-    assert two.rigid_modes == 2 * one.rigid_modes
-
-
-def test_planar_average_position_shakes_where_average_position_does() -> None:
-    known = [apc.critical(compiled(text), "contact.stiffness") for text in (AVERAGE, PLANAR)]
-    line, plane = ([c.value for c in one.crossings] for one in known)
-    assert plane == pytest.approx(line, rel=1e-9)
-
-
-@pytest.mark.parametrize(("mass", "spring", "size"), [("Planar", "Planar", 2), ("Spatial", "Spatial", 3)])
-def test_planar_mass_and_spatial_mass_swing_along_each_axis_as_a_mass_does(
-    mass: str, spring: str, size: int
-) -> None:
-    """PlanarSpringDamper, SpatialSpringDamper: m s² + (b + B) s + K = 0, each root once for each axis."""
-    tie = "stiffness: 70 N/m, damping: 4 N*s/m"
-    line = f"{ONE_MASS}couplers: {{tie: {{type: SpringDamper, a: device, b: ground, {tie}}}}}\n"
-    base = PLANE if size == 2 else SPACE
-    more = f"{base}couplers: {{tie: {{type: {spring}SpringDamper, a: device, b: ground, {tie}}}}}\n"
-    found = apc.analyze(compiled(more))
-    assert found.spectral_radius == pytest.approx(math.exp(-7 / 4), rel=1e-12)
-    one, other = sizes(line), sizes(more)
-    assert other == pytest.approx(np.repeat(one, size), rel=1e-12)
-
-
-def test_sampled_planar_spring_damper_pulls_along_the_line_between_its_ends() -> None:
-    system = compiled(
-        f"{PLANE}couplers:\n  it: {{type: SampledPlanarSpringDamper, a: device, b: ground, clock: tick, "
-        "stiffness: 70 N/m, damping: 4 N*s/m}\n"
-    )
-    at = {"device.x[1]": 0.3, "device.x[2]": -0.4, "device.v[1]": 0.5, "device.v[2]": 2.0}
-    assert forces(system, at) == pytest.approx(
-        {"it.f[1]": 70 * 0.3 + 4 * 0.5, "it.f[2]": -70 * 0.4 + 4 * 2.0}, rel=EXACT
-    )
-
-
-def test_planar_constant_force_pushes_in_its_direction() -> None:
-    system = compiled(
-        f"{PLANE}hands: {{push: {{type: PlanarConstantForce, flange: device, force: [3 N, -4 N]}}}}\n"
-    )
-    found = rates(system, {})
-    assert [found["device.v[1]"], found["device.v[2]"]] == pytest.approx([1.5, -2.0], rel=EXACT)
-
-
-# ---- contacts ----
-
-
-def radial(size: int) -> str:
-    name, base = ("DiscContact", PLANE) if size == 2 else ("SphereContact", SPACE)
-    part = f"type: {name}, a: device, b: ground, radius: 50 mm, stiffness: 900 N/m, damping: 2 N*s/m"
-    return f"{base}couplers:\n  ball: {{{part}, clock: tick}}\n"
-
-
-@pytest.mark.parametrize("size", [2, 3])
-def test_disc_contact_and_sphere_contact_push_along_the_line_of_centres_and_never_pull(size: int) -> None:
-    """f = −(K depth − B rate of distance) d/|d| into the device's side, where that is a push."""
-    system = compiled(radial(size))
-    inside = np.array([0.012, -0.016, 0.015][:size])
-    moving = np.array([-0.3, 0.1, 0.2][:size])
-    for place, speed in (
-        (inside, 0 * moving),
-        (inside, moving),
-        (inside, 1e3 * inside),
-        (4 * inside, moving),
-    ):
-        at = {f"device.x[{k + 1}]": float(v) for k, v in enumerate(place)}
-        at |= {f"device.v[{k + 1}]": float(v) for k, v in enumerate(speed)}
-        away = place / np.linalg.norm(place)
-        depth = 0.05 - np.linalg.norm(place)
-        push = max(0.0, 900 * depth - 2 * float(away @ speed)) if depth > 0 else 0.0
-        found = forces(system, at)
-        assert [found[f"ball.f[{k + 1}]"] for k in range(size)] == pytest.approx(-push * away, rel=EXACT)
-
-
-def test_disc_contact_is_stiff_along_the_normal_and_gives_way_across_it() -> None:
-    """Linearized: K along the normal, −K depth/distance across; each a mass on a sampled spring by itself.
-
-    With x' = v, m v' = −b v − K x sampled each T: x and v at the next tick from those of this one.
-    """
-    m, b, stiffness, distance = 2.0, 3.0, 900.0, 0.04
-    text = radial(2).replace("damping: 2 N*s/m, ", "").replace("3 N*s/m}", "3 N*s/m, x: [24 mm, 32 mm]}")
-    assert "24 mm" in text
-    e = math.exp(-b / m * 1e-3)
-
-    def tick(k: float) -> np.ndarray:
-        held = 1e-3 / b - m * (1 - e) / b**2
-        step = np.array([[1, m * (1 - e) / b], [0, e]])
-        return np.abs(np.linalg.eigvals(step - k * np.array([[held, 0], [(1 - e) / b, 0]])))
-
-    expected = np.concatenate([tick(stiffness), tick(-stiffness * (0.05 - distance) / distance)])
-    assert sizes(text) == pytest.approx(np.sort(expected)[::-1], rel=1e-9)
-
-
-def test_coinciding_centres_have_no_direction_and_no_verdict() -> None:
-    """norm has no slope at zero, as sqrt has none: the start is refused, not guessed."""
-    with pytest.raises(ApcError, match=r"E808 .*at the start values"):
-        apc.analyze(compiled(radial(2)))
-
-
-@pytest.mark.parametrize("size", [2, 3])
-def test_line_contact_and_plane_contact_push_along_their_normal_and_never_pull(size: int) -> None:
-    name, base = ("LineContact", PLANE) if size == 2 else ("PlaneContact", SPACE)
-    normal, point = np.array([3.0, -4.0, 12.0][:size]), np.array([0.1, 0.2, -0.1][:size])
-    shown = f"normal: {normal.tolist()}, point: [{', '.join(f'{v} m' for v in point)}]"
-    system = compiled(
-        f"{base}couplers:\n  wall: {{type: {name}, flange: device, {shown}, stiffness: 900 N/m, "
-        "damping: 2 N*s/m, clock: tick}\n"
-    )
-    unit = normal / np.linalg.norm(normal)
-    for away, along, speed in ((-0.01, 0.7, 0.0), (-0.01, 0.7, -2.0), (-0.01, 0.7, 9.0), (0.01, 0.7, -2.0)):
-        across = np.zeros(size)
-        across[:2] = [normal[1], -normal[0]]
-        place, moving = point + away * unit + along * across, speed * unit
-        at = {f"device.x[{k + 1}]": float(v) for k, v in enumerate(place)}
-        at |= {f"device.v[{k + 1}]": float(v) for k, v in enumerate(moving)}
-        push = max(0.0, 900 * -away - 2 * speed) if away < 0 else 0.0
-        assert forces(system, at)["wall.push"] == pytest.approx(push, rel=1e-11)
-    held = {hold.name: k for k, hold in enumerate(system.kinds[0].holds)}
-    assert list(held) == ["wall.push"]
-    (kind,) = system.kinds
-    p = [values(system)[one] for one in kind.parameters]
-    found = kind.derivative([0.0] * (2 * size), [5.0], p, 0)
-    by_name = dict(zip((s.name for s in kind.states), casadi.DM(found).full().ravel().tolist(), strict=True))
-    assert [by_name[f"device.v[{k + 1}]"] for k in range(size)] == pytest.approx(5 * unit / 2, rel=EXACT)
-
-
-# ---- numbers of vectors ----
-
-
-def starts(text: str, folder: Path | None = None) -> list[list[float]]:
-    """Return where the device of each peer starts."""
-    if folder is None:
-        system = compiled(text)
-    else:
-        (folder / "scene.yaml").write_text(text, encoding="utf-8")
-        system = compile_topology(folder / "scene.yaml")
-    run = apc.simulate(system, duration="1 ms", jit=False)
-    names = [one.name for one in run.signals]
-    return [
-        [run.values[0, names.index(f"{g.name}[{peer + 1}].device.x[{k}]")] for k in (1, 2)]
-        for g in system.groups
-        for peer in range(g.count)
+@pytest.mark.parametrize("delay", [1, 8, 64])
+def test_a_fast_pole_is_held_between_two_values(delay: int) -> None:
+    """With a pole outside, a pull too weak or too strong leaves it unstable: at ζ = 1, and further on."""
+    pole = 1 + 0.5 / (delay + 1)
+    points = np.geomspace(1e-3, 10.0, 60) * (pole - 1)
+    found = cross([Pull(delay, pole)], points, 1e-3)
+    brute = [
+        float(np.abs(np.roots([1.0, -pole, *np.zeros(delay - 1), p])).max()) < 1
+        for p in np.geomspace(points[0], points[-1], 4000)
     ]
+    changes = np.flatnonzero(np.diff(brute))
+    grid = np.geomspace(points[0], points[-1], 4000)
+    assert [one.rising for one in found.roots] == [bool(brute[place]) for place in changes]
+    for root, place in zip(found.roots, changes, strict=True):
+        assert grid[place] <= root.value <= grid[place + 1]
+    assert found.whole
+    assert found.roots[0].value == pytest.approx(pole - 1, rel=1e-9)  # at ζ = 1
 
 
-TIED = f"{PLANE}couplers: {{tie: {{type: PlanarSpringDamper, a: device, b: ground, stiffness: 9 N/m}}}}\n"
+def test_loops_that_cross_at_the_same_value_cross_once() -> None:
+    limit = 2 * np.sin(np.pi / 82)
+    points = np.linspace(limit / 3, 3 * limit, 12)
+    found = cross([Pull(20), Pull(20)], points, limit)
+    assert found.whole and [root.rising for root in found.roots] == [True]
 
 
-def test_a_group_gives_a_vector_one_value_for_all_or_a_list_of_lists_one_a_peer(tmp_path: Path) -> None:
-    def groups(body: str) -> str:
-        return replaced(TIED, ("{user: {count: 1}}", f"{{user: {{{body}}}}}"))
-
-    both = [[0.001, 0.002]] * 2
-    assert starts(groups("count: 2, set: {device.x: [1 mm, 2 mm]}")) == both
-    assert starts(groups('count: 2, set: {"device.x[1]": 1 mm, "device.x[2]": 2 mm}')) == both
-    each = [[0.001, 0.002], [0.003, 0.004]]
-    assert starts(groups("set: {device.x: [[1 mm, 2 mm], [3 mm, 4 mm]]}")) == each
-    assert starts(groups('set: {"device.x[1]": [1 mm, 3 mm], "device.x[2]": [2 mm, 4 mm]}')) == each
-    (tmp_path / "users.csv").write_text("device.x[1] [mm],device.x[2] [mm]\n1,2\n3,4\n", encoding="utf-8")
-    assert starts(groups("table: users.csv"), tmp_path) == each
+def test_what_is_unstable_all_along_has_no_crossing() -> None:
+    found = cross([Pull(50, pole=2.0)], np.geomspace(1e-3, 0.9, 20), 1e-3)
+    assert found.whole and not found.roots and not found.stable.any()
 
 
-def test_an_entry_of_a_vector_is_a_parameter_like_others() -> None:
-    text = f"{PLANE}hands: {{push: {{type: PlanarConstantForce, flange: device, force: [3 N, -4 N]}}}}\n"
-    run = apc.simulate(compiled(text), duration="1 s", set={"push.force[2]": "6 N"}, jit=False)
-    names = [one.name for one in run.signals]
-    end = [run.values[-1, names.index(f"user[1].device.v[{k}]")] for k in (1, 2)]
-    assert end[1] / end[0] == pytest.approx(6 / 3, rel=1e-9)
-
-
-# ---- several pairs at a connector; arrays inside a component ----
-
-SLAB = (
-    """\
-connector: Pose
-about: A body of a plane that turns as well.
-potentials: {x: {unit: m, size: 2}, angle: {unit: rad}}
-flows: {f: {unit: N, size: 2}, torque: {unit: N*m}}
-""",
-    """\
-component: Slab
-about: A body that moves and turns in a plane.
-connectors: {centre: Pose}
-parameters: {mass: {unit: kg, above: 0}, inertia: {unit: kg*m^2, above: 0}}
-variables:
-  x: {unit: m, size: 2, start: [0 m, 0 m]}
-  v: {unit: m/s, size: 2, start: [0 m/s, 0 m/s]}
-  angle: {unit: rad, start: 0 rad}
-  rate: {unit: rad/s, start: 0 rad/s}
-equations:
-  - der(x) = v
-  - mass*der(v) = centre.f
-  - der(angle) = rate
-  - inertia*der(rate) = centre.torque
-  - centre.x = x
-  - centre.angle = angle
-""",
-    """\
-component: Mount
-about: Holds a body, sampled, along and about its axes.
-connectors: {a: Pose, b: Pose}
-parameters: {stiffness: {unit: N/m}, twist: {unit: N*m}, clock: clock}
-variables: {f: {unit: N, size: 2}, torque: {unit: N*m}}
-equations:
-  - f = stiffness*sample(a.x - b.x)
-  - torque = twist*sample(a.angle - b.angle)
-  - a.f = hold(f)
-  - b.f = -a.f
-  - a.torque = hold(torque)
-  - b.torque = -a.torque
-""",
-)
-
-
-def test_a_connector_may_have_several_pairs_vectors_among_them(tmp_path: Path) -> None:
-    """Two bodies on springs: what one pair does, no other feels, and each does the work of its own."""
-    text = (
-        "topology: slab\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\nmasses:\n"
-        "  one: {type: Slab, mass: 2 kg, inertia: 0.1 kg*m^2, x: [1 mm, 0 m], angle: 0.2 rad}\n"
-        "  two: {type: Slab, mass: 5 kg, inertia: 0.3 kg*m^2}\n"
-        "couplers: {tie: {type: Mount, a: one, b: two, stiffness: 70 N/m, twist: 9 N*m, clock: tick}}\n"
-    )
-    system = compiled(text, library(tmp_path, *SLAB))
-    found = forces(system, {"one.x[1]": 0.5, "two.x[2]": 0.25, "one.angle": 0.125})
-    assert found == pytest.approx({"tie.f[1]": 35.0, "tie.f[2]": -17.5, "tie.torque": 1.125}, rel=EXACT)
-    (kind,) = system.kinds
-    p = [values(system)[name] for name in kind.parameters]
-    u = {hold.name: 1.0 + k for k, hold in enumerate(kind.holds)}
-    x = [0.0] * len(kind.states)
-    rate = dict(
-        zip(
-            (state.name for state in kind.states),
-            casadi.DM(kind.derivative(x, list(u.values()), p, 0)).full().ravel().tolist(),
-            strict=True,
-        )
-    )
-    for pair, divided in (("x", 2.0), ("angle", 0.1)):
-        for name in u:
-            if (pair == "angle") == ("torque" in name):
-                index = name.removeprefix("tie.f").removeprefix("tie.torque")
-                state = "one.rate" if pair == "angle" else f"one.v{index}"
-                assert rate[state] == pytest.approx(-u[name] / divided, rel=EXACT)
-    # A port for each pair and end whose flow follows from what is held: x[1], x[2] and the angle, at a and b.
-    assert kind.ports is not None
-    assert len(kind.ports.parts) == 6
-    run = apc.simulate(system, duration="20 ms", jit=False)
-    work = dict(run.summary.work)["tie"]
-    names = [signal.name for signal in run.signals]
-    kinetic = 0.0
-    for body, mass, inertia in (("one", 2.0, 0.1), ("two", 5.0, 0.3)):
-        v = {n: run.values[-1, names.index(f"user[1].{body}.{n}")] for n in ("v[1]", "v[2]", "rate")}
-        kinetic += mass * (v["v[1]"] ** 2 + v["v[2]"] ** 2) / 2 + inertia * v["rate"] ** 2 / 2
-    assert work == pytest.approx(kinetic, rel=1e-9)  # nothing else takes work up
-
-
-CHAIN = """\
-component: Chain
-about: Masses in a row with springs between them.
-connectors: {first: Flange, last: Flange}
-parameters: {mass: {unit: kg, above: 0}, stiffness: {unit: N/m, min: 0}}
-parts:
-  link: {type: Mass, count: 3, mass: mass}
-  pad: {type: SpringDamper, count: 2, a: "link[1:2]", b: "link[2:3]", stiffness: stiffness}
-connect: {first: "link[1].flange", last: "link[3].flange"}
-"""
-ROW = """\
-topology: row
-peers: {user: {count: 1}}
-masses: {chain: {type: Chain, mass: 2 kg, stiffness: 50 N/m}}
-couplers: {tie: {type: SpringDamper, a: chain.last, b: ground, stiffness: 9 N/m, damping: 1 N*s/m}}
-"""
-
-
-def test_an_array_inside_a_component_is_the_row_that_a_topology_writes_out(tmp_path: Path) -> None:
-    found = compiled(ROW, library(tmp_path, CHAIN))
-    names = [state.name for state in found.kinds[0].states]
-    assert sorted(names) == sorted(f"chain.link[{k}].{n}" for k in (1, 2, 3) for n in "xv")
-    k = 50 * np.array([[1.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
-    k[2, 2] += 9
-    a = np.block([[np.zeros((3, 3)), np.eye(3)], [-k / 2, -np.diag([0, 0, 1]) / 2]])
-    known = np.exp(np.linalg.eigvals(a).real).max()
-    assert apc.analyze(found).spectral_radius == pytest.approx(known, rel=1e-9)
-
-
-def test_numbers_of_an_array_inside_a_component_are_set_for_all_or_one_by_one(tmp_path: Path) -> None:
-    group = "peers: {user: {count: 1, set: {%s}}}"
-    for one, all_ in (("chain.link.mass: 3 kg", [3, 3, 3]), ('"chain.link[2].mass": 3 kg', [2, 3, 2])):
-        text = replaced(ROW, ("peers: {user: {count: 1}}", group % one))
-        system = compiled(text, library(tmp_path, CHAIN))
-        found = {one.name: one.value for one in system.groups[0].values}
-        assert [found.get(f"chain.link[{k}].mass", 2.0) for k in (1, 2, 3)] == all_
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('"link[2:3]"', '"link[3:4]"', "link is an array of 3: its elements are link[1] to link[3]."),
-        (
-            'a: "link[1:2]"',
-            'a: "link[1:3]"',
-            'pad is an array of 2 and link[1:3] has 3 elements. Write: a: "link[1]"',
-        ),
-        (
-            '"link[3].flange"',
-            '"link[4].flange"',
-            "connect names link[4].flange, which is no connector of an inner part",
-        ),
-        ("count: 3", "count: 0", "the count of link wants a whole number from 1 to 500, got 0."),
-        ("count: 3", "count: 501", "the count of link wants a whole number from 1 to 500, got 501."),
-    ],
-)
-def test_a_slip_with_an_array_inside_a_component_is_told(
-    old: str, new: str, message: str, tmp_path: Path
-) -> None:
-    text = replaced(CHAIN, (old, new))
-    with pytest.raises(ApcError) as caught:
-        compiled(ROW, library(tmp_path, text))
-    assert any(message in str(one) for one in caught.value.mistakes), str(caught.value)
+def test_what_is_stable_all_along_has_no_crossing() -> None:
+    found = cross([Pull(300, pole=0.5)], np.geomspace(1e-3, 0.49, 20), 1e-3)
+    assert found.whole and not found.roots and found.stable.all()
