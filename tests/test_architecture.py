@@ -118,7 +118,7 @@ HOUSE = (
         "apc.present",
         """
         forms pictures network hands analysis vary comparison_picture comparison region_picture region
-        plane simulation still recording bench
+        planar simulation still recording bench
         """,
     ),
     # what a person calls

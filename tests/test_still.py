@@ -11,7 +11,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
-from apc.present.plane import Disc, Line, Spot, paths_of, spots_of
+from apc.present.planar import Disc, Line, Spot, paths_of, spots_of
 from apc.present.still import Body, Wall, bodies_of, draw_still, save_still
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 

@@ -23,7 +23,7 @@ from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text, note
 from apc.present.pictures import check_format, write_figure
-from apc.present.plane import draw_paths, paths_of
+from apc.present.planar import draw_paths, paths_of
 from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """A picture of how a scene begins: every peer's bodies side by side, and the surfaces between them.
 
 Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `draw_still`, `save_still`; of bodies that
-move in a plane the picture of `plane`.
+move in a plane the picture of `planar`.
 Guarantees: everything is found in the equations: a body is a position (a state in metres); where something is
 decided by the distance of two of them, or of one from a fixed place, in metres, there is a surface.
 Does not: play the scene, or know what a part is called.
@@ -28,7 +28,7 @@ from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.optional import need
 from apc.present.pictures import check_format, write_figure
-from apc.present.plane import draw_plane, moves_in_plane, spots_of
+from apc.present.planar import draw_plane, moves_in_plane, spots_of
 from apc.simulation.signals import sent_states
 
 Floats = NDArray[np.float64]
