@@ -233,8 +233,8 @@ COMPONENT = [
 ]  # fmt: skip
 
 TOPOLOGY = [
-    ("x: [1 mm, 2 mm]", "x: 1 mm", "5:45: E203 x wants a list of 2 values, got 1 mm. Write: x: [0 m, 0 m]"),
-    ("x: [1 mm, 2 mm]", "x: [1 mm]", "5:45: E203 x wants a list of 2 values, got 1. Write: x: [0 m, 0 m]"),
+    ("x: [1 mm, 2 mm]", "x: 1 mm", "5:45: E203 x wants a list of 2 values, got 1 mm. Write: x: [1 m, 1 m]"),
+    ("x: [1 mm, 2 mm]", "x: [1 mm]", "5:45: E203 x wants a list of 2 values, got 1. Write: x: [1 m, 1 m]"),
     ("x: [1 mm, 2 mm]", "x: [1 mm, 2 kg]", "5:52: E204 x[2] wants m, got 2 kg. Write: x[2]: 2 m"),
     ("x: [1 mm, 2 mm]", '"x[1]": 1 mm',
      "5:42: E202 device (PlanarMass) has no key x[1]; there are: type, at, shared, count, flange, mass, damping, x, v."),
@@ -245,9 +245,9 @@ TOPOLOGY = [
     ("{count: 2}", "{set: {device.x: [1 m, 0 m]}}",
      "3:32: E201 device.x is a vector of 2, and its list doesn't tell how many peers there are. Write: count: 3"),
     ("{count: 2}", "{count: 2, set: {device.x: 1 m}}",
-     "3:42: E203 device.x wants a list of 2 values, got 1 m. Write: device.x: [0 m, 0 m]"),
+     "3:42: E203 device.x wants a list of 2 values, got 1 m. Write: device.x: [1 m, 1 m]"),
     ("{count: 2}", "{count: 2, set: {device.x: [[1 m, 0 m], [1 m]]}}",
-     "3:55: E203 device.x wants a list of 2 values, got 1. Write: device.x: [0 m, 0 m]"),
+     "3:55: E203 device.x wants a list of 2 values, got 1. Write: device.x: [1 m, 1 m]"),
 ]  # fmt: skip
 
 
@@ -269,6 +269,21 @@ def test_a_vector_in_a_topology_is_a_list_of_its_size(
     files = {"scene.yaml": SCENE.replace(old, new), "parts/pad.yaml": PAD}
     found = [one.splitlines()[0] for one in told(tmp_path, monkeypatch, files)]
     assert found == [f"scene.yaml:{one}" for one in message.split("\n")]
+
+
+def test_a_vector_that_is_missing_or_at_fault_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = SCENE.partition("couplers:")[0] + "hands: {push: {type: PlanarConstantForce, flange: device%s}}\n"
+    for given, message in (
+        ("", "6:9: E201 push has no force. Write: force: [1 N, 1 N]"),
+        (", force: 3 N", "6:66: E203 force wants a list of 2 values, got 3 N. Write: force: [1 N, 1 N]"),
+        (", force: [3 N, 0]", "6:72: E204 force[2] wants N, got 0 (no unit). Write: force[2]: 0 N"),
+    ):
+        files = {"scene.yaml": scene % given, "parts/pad.yaml": PAD}
+        assert [one.splitlines()[0] for one in told(tmp_path, monkeypatch, files)] == [
+            f"scene.yaml:{message}"
+        ]
 
 
 def test_a_vector_that_is_declared_again_keeps_its_size(

@@ -104,16 +104,18 @@ def read_entry(
     connectors = dict(component.connectors)
     numbers = {p.name: p.unit.text for p in component.parameters if isinstance(p, Number)}
     numbers |= {v.name: v.unit.text for v in component.variables if v.start is not None}
-    words = [p.name for p in component.parameters if not isinstance(p, Number)]
-    known = dict.fromkeys(whole_and_index(key)[0] for key in numbers)
+    known = dict.fromkeys(
+        whole_and_index(key)[0] for key in (*(p.name for p in component.parameters), *numbers)
+    )
     body = check_keys(
         body,
-        ("type", *more_keys, *connectors, *words, *known),
+        ("type", *more_keys, *connectors, *known),
         f"{name} ({component.name})",
         mistakes,
     )
-    body = with_entries(body, numbers, scope, mistakes)
-    reader = _EntryReader(name, body, place, scope, mistakes, index, count)
+    vectors = {parts[0]: size for parts, size in sizes_of((one,) for one in numbers).items()}
+    body, faulty = _entry_by_entry(body, numbers, vectors, scope, mistakes)
+    reader = _EntryReader(name, body, place, scope, mistakes, index, count, vectors, faulty)
     told = reader.parameters(component)
     starts = reader.starts(component)
     connections = tuple(
@@ -127,9 +129,13 @@ def read_entry(
     return Entry(told.values, told.options, told.references, told.described, starts, connections)
 
 
-def with_entries(
-    body: MappingNode, numbers: Mapping[str, str], scope: Scope, mistakes: Mistakes
-) -> MappingNode:
+def _entry_by_entry(
+    body: MappingNode,
+    numbers: Mapping[str, str],
+    vectors: Mapping[str, int],
+    scope: Scope,
+    mistakes: Mistakes,
+) -> tuple[MappingNode, Collection[str]]:
     """Return an entry in which each entry of a vector has a key, `x[1]`, in the place of `x: [1 m, 0 m]`.
 
     Parameters
@@ -138,22 +144,30 @@ def with_entries(
         The entry.
     numbers
         The numbers, and entries of vectors, that it may give, and the unit of each.
+    vectors
+        The vectors among them, and their sizes.
     scope
         What it can refer to: `x: x0` takes a vector of a component around it.
     mistakes
         Takes E203 a list of another length, or none.
+
+    Returns
+    -------
+    The entry, and the vectors that are at fault, which is told.
     """
-    vectors = {parts[0]: size for parts, size in sizes_of((name,) for name in numbers).items()}
     if not vectors:
-        return body
+        return body, ()
     found: list[tuple[Scalar, Node]] = []
+    faulty = []
     for key, node in body.entries:
         size = vectors.get(key.text, 0)
         unit = numbers.get(entry(key.text, 1), "")
         values = _vector(node, key.text, size, unit, scope, mistakes) if size else (node,)
+        if not values:
+            faulty.append(key.text)
         for one, value in zip(entries(key.text, size), values, strict=False):
             found.append((replace(key, text=one), value))
-    return replace(body, entries=tuple(found))
+    return replace(body, entries=tuple(found)), faulty
 
 
 def _vector(
@@ -171,7 +185,7 @@ def _vector(
             return ()
         if isinstance(found, tuple) and len(found) == size:
             return tuple(replace(node, text=format_expression(one)) for one in found)
-    return listed(node, what, size, f"0 {unit}".removesuffix(" 1"), mistakes) or ()
+    return listed(node, what, size, f"1 {unit}".removesuffix(" 1"), mistakes) or ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +199,10 @@ class _Told:
 
 
 class _EntryReader:
-    """Reads one entry, value by value; what is missing or at fault is reported and left out."""
+    """Reads one entry, value by value; what is missing or at fault is reported and left out.
+
+    `vectors` are the sizes of those among its numbers, `faulty` those that were reported already.
+    """
 
     def __init__(
         self,
@@ -196,7 +213,11 @@ class _EntryReader:
         mistakes: Mistakes,
         index: int,
         count: int | None,
+        vectors: Mapping[str, int],
+        faulty: Collection[str],
     ) -> None:
+        self.vectors = vectors
+        self.faulty = faulty
         self.name = name
         self.body = body
         self.place = place
@@ -261,8 +282,12 @@ class _EntryReader:
             )
         if parameter.default is not None:
             return Binding(parameter.default, None, parameter.unit.dimension, self.place)
-        hint = f"{parameter.name}: 1 {parameter.unit.text}".removesuffix(" 1")
-        self.mistakes.add("E201", self.place, f"{self.name} has no {parameter.name}", hint=hint)
+        whole, index = whole_and_index(parameter.name)
+        if whole not in self.faulty and index <= 1:
+            one = f"1 {parameter.unit.text}".removesuffix(" 1")
+            value = f"[{', '.join([one] * self.vectors[whole])}]" if index else one
+            hint = f"{whole}: {value}"
+            self.mistakes.add("E201", self.place, f"{self.name} has no {whole}", hint=hint)
         return None
 
     def option(self, parameter: Option) -> str | None:

@@ -242,7 +242,7 @@ def _entry_by_entry(
             yield key, node
             continue
         unit = next(i.unit.text for _, i in settable[entry(key.text, 1)] if isinstance(i, Number | Variable))
-        one = f"0 {unit}".removesuffix(" 1")
+        one = f"1 {unit}".removesuffix(" 1")
         nested = isinstance(node, Sequence) and any(isinstance(item, Sequence) for item in node.items)
         rows = node.items if nested and isinstance(node, Sequence) else (node,)
         values = [listed(row, key.text, size, one, mistakes) for row in rows]
