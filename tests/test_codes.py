@@ -33,7 +33,7 @@ E204 compiler/components compiler/language runtime/regions: a quantity has anoth
 E205 compiler/components compiler/scene compiler/source: a name is taken, or a word of the language
 E206 compiler/components compiler/language compiler/scene: a name names nothing that is there
 E207 compiler/language compiler/scene: a number is out of its bounds
-E208 compiler/scene: a number of peers, or of numbers for them, does not fit
+E208 compiler/components compiler/scene: a number of peers or parts, or of numbers for them, does not fit
 E209 compiler/language: parameters depend on one another in a circle
 E210 compiler/components compiler/equations compiler/scene: a connector is joined to what it can't be
 E211 compiler/equations compiler/scene: a parameter can't have a value of its own there
@@ -71,6 +71,9 @@ E402 compiler/language: the terms of a sum differ in unit
 E403 compiler/language: a quantity with a unit stands where a plain number is due
 E404 compiler/language: what is compared or chosen between differs in unit
 E405 compiler/language: a time is due where something of another unit stands
+E406 compiler/language: vectors, or a vector and a number, are not of one size
+E407 compiler/language: a vector stands where a number is due, or the reverse
+E408 compiler/components: an index names no entry of a vector
 E501 compiler/components: a component has not as many equations as unknowns
 E502 compiler/equations: equations contradict or repeat one another
 E503 compiler/equations: variables depend on one another in a loop that can't be solved

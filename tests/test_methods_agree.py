@@ -50,6 +50,7 @@ WIDE = {
     "defective": 1e-2,
     "nearly-defective": 1e-2,
     "ninety-hertz": 1e-2,
+    "planar-users": 1e3,
     "stiff-contact": 1e-9,
 }
 

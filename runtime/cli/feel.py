@@ -34,7 +34,10 @@ _SPANNED = {"low": "--from", "high": "--to", "points": "--points"}
 @file_argument
 @set_option
 @click.option(
-    "--at", default="", metavar="PEER.PART", help="The device a hand holds: left[1].device. The first peer's."
+    "--at",
+    default="",
+    metavar="PEER.PART",
+    help="The device a hand holds: left[1].device, or an axis of it, left[1].device.x[2]. The first peer's.",
 )
 @click.option(
     "--between",
