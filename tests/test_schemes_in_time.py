@@ -181,6 +181,16 @@ def test_a_linearization_says_unstable_of_what_settles() -> None:
     assert without.summary.verdict == "shakes"
 
 
+def test_the_linearization_is_of_the_average_without_its_brake() -> None:
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        push, pull = contact(x), 500 * (x[1][0] - mean(heard, 0))
+        return [-push, push - pull], memory, []
+
+    bodies = [[(0.1, 5.0 + 2.0, 100.0), (0.3, 1.0, 0.0)]] * 2
+    expected = magnitudes(ByHand(bodies, everybody(2), law, told=1, late=50))[1]
+    assert apc.analyze(compiled(TWO)).spectral_radius == pytest.approx(expected, abs=1e-10)
+
+
 # ---- set positions ----
 
 
@@ -304,9 +314,26 @@ def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
     same(run_of(text, "500 ms"), played(hand, starts, [[0.0] * 4] * 2, 500), "device", "cube")
 
 
+def test_before_anything_is_told_nobody_is_pulled() -> None:
+    """To first order the memory of what was told stays as it is, and a copy moves as its damper lets it."""
+    found = apc.analyze(compiled(RECKONED))
+    assert found.verdict.startswith("undecided")
+    assert str(found).startswith(f"two-users-dead-reckoning: {found.verdict}, linearized at its start\n")
+    all_told = apc.analyze(compiled(RECKONED), set={"coordination.threshold": "0 m"})
+    assert all_told.stable, "what is always told is a prediction"
+
+
 # ---- god-object ----
 
 ROUGH = scene("god-object")
+
+
+def test_god_object_holds_as_a_spring_each_way_while_it_sticks() -> None:
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        return [-1000 * x[0][0]], memory, []
+
+    expected = magnitudes(ByHand([[(0.1, 5.0, 0.0)]], [[]], law, told=0, ratio=1, late=0))[1]
+    assert apc.analyze(compiled(ROUGH)).spectral_radius == pytest.approx(expected, abs=1e-10)
 
 
 @pytest.mark.parametrize("sideways", [0.0, 0.8, -0.99])
