@@ -47,6 +47,7 @@ REFUSED = {
 # Linearizations of which no truth is to be had event by event, and why; `test_schemes_in_time` has them.
 UNTOLD = {
     "god-object": "hold functions whose values are rounded",
+    "limited-motor": "is not linear",
     "two-users-dead-reckoning": "not linear in what it hears",
     "two-users-passivity": "not linear in what it hears",
     "two-users-set-position": "hold functions whose values are rounded",

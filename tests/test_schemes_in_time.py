@@ -403,3 +403,26 @@ def test_users_rest_against_each_others_proxies() -> None:
     assert (left[-1], right[-1]) == (pytest.approx(y, abs=1e-8), pytest.approx(-y, abs=1e-8))
     assert near[-1] == pytest.approx(-y + p, abs=1e-8)
     assert d > 0
+
+
+# ---- a motor's limit ----
+
+LIMITED = replaced(scene("limited-motor"), ("type: RampForce", "type: ConstantForce"), (", rise: 1 s", ""))
+
+
+def test_limited_motor_holds_up_to_its_limit_and_gives_way_beyond() -> None:
+    """3 N rest 3/500 m deep; of 5 N the motor takes 3.3 N, and the damper the rest: (5 − 3.3)/b."""
+    held = run_of(replaced(LIMITED, ("force: 5 N", "force: 3 N")), "2 s")
+    assert held["user[1].device.x"][-1] == pytest.approx(3 / 500, abs=1e-9)
+    beyond = run_of(LIMITED, "2 s")
+    assert beyond["user[1].device.v"][-1] == pytest.approx((5 - 3.3) / 1, abs=1e-8)
+
+
+def test_limited_motor_without_its_limit_is_not_there() -> None:
+    free = replaced(LIMITED, ("force_limit: 3.3 N", "force_limit: 3.3 N, limits: off"))
+    none = replaced(
+        LIMITED,
+        ("  motor: {type: LimitedMotor, flange: device, force_limit: 3.3 N}\n", ""),
+        ("flange: motor.port", "flange: device"),
+    )
+    assert run_of(free, "1 s").values == pytest.approx(run_of(none, "1 s").values, abs=1e-13)
