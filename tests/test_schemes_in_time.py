@@ -175,7 +175,12 @@ def test_a_linearization_says_unstable_of_what_settles() -> None:
     system = compiled(TWO)
     found = apc.analyze(system)
     assert found.verdict == "unstable"
-    assert str(found).startswith("two-users-passivity: unstable, linearized at its start\n")
+    assert str(found).startswith(
+        "two-users-passivity: unstable, linearized at its start\n"
+        "  left out: the scene is not linear, and this holds near its start values only\n\n"
+        "  To first order, some motion grows until the devices shake or hit their limits.\n"
+        "  What it does in time is played: apc simulate\n"
+    )
     assert apc.simulate(system, jit=False).summary.verdict == "settles"
     without = apc.simulate(system, set={"coordination.largest": "0 N*s/m"}, duration="3 s", jit=False)
     assert without.summary.verdict == "shakes"
