@@ -6,6 +6,7 @@ through one frame together: a number is a row, what it is of each state at the b
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -41,46 +42,102 @@ class ByHand:
     period: float = 1e-3
 
 
+@dataclass
+class _Playing:
+    """What all peers hold: newest first what is computed and waits, and packets."""
+
+    motion: list[Any]
+    forces: list[Any]
+    memory: list[Any]
+    out: list[Any]
+    packets: list[Any]
+
+
+def _kept(scheme: ByHand) -> int:
+    """Return how many packets of a peer are kept."""
+    return -(-scheme.late // scheme.ratio) + 1
+
+
+def _tick(scheme: ByHand, now: _Playing, tick: int) -> None:
+    """Play a tick of a frame, and the time to the next."""
+    peers = range(len(scheme.bodies))
+    if tick == 0:
+        for i in peers:
+            now.packets[i] = [[*now.motion[i][scheme.told], *now.out[i]], *now.packets[i][:-1]]
+    age = max(-((tick - scheme.late) // scheme.ratio), 0)  # packets sent since the newest that is here
+    acting: list[Any] = []
+    for i in peers:
+        heard = {j: now.packets[j][age] for j in scheme.hears[i]}
+        new, now.memory[i], now.out[i] = scheme.law(i, now.motion[i], heard, now.memory[i])
+        queue = [list(new), *now.forces[i]]
+        acting.append(queue[scheme.comp])
+        now.forces[i] = queue[: scheme.comp]
+    for i in peers:
+        now.motion[i] = [
+            _coast(x, v, force, *body, scheme.period)
+            for (x, v), force, body in zip(now.motion[i], acting[i], scheme.bodies[i], strict=True)
+        ]
+
+
 def frame_matrix(scheme: ByHand) -> NDArray[np.float64]:
     """Return the one-frame matrix of all peers."""
-    peers = range(len(scheme.bodies))
-    kept = -(-scheme.late // scheme.ratio) + 1
+    kept = _kept(scheme)
     sizes = [
         2 * len(own) + scheme.comp * len(own) + scheme.memory + scheme.out + kept * (2 + scheme.out)
         for own in scheme.bodies
     ]
     rows = iter(np.eye(sum(sizes)))
-    motion, forces, memory, out, packets = [], [], [], [], []
+    now = _Playing([], [], [], [], [])
     for own in scheme.bodies:
-        motion.append([(next(rows), next(rows)) for _ in own])
-        forces.append([[next(rows) for _ in own] for _ in range(scheme.comp)])  # newest first
-        memory.append([next(rows) for _ in range(scheme.memory)])
-        out.append([next(rows) for _ in range(scheme.out)])
-        packets.append([[next(rows) for _ in range(2 + scheme.out)] for _ in range(kept)])  # newest first
+        now.motion.append([(next(rows), next(rows)) for _ in own])
+        now.forces.append([[next(rows) for _ in own] for _ in range(scheme.comp)])
+        now.memory.append([next(rows) for _ in range(scheme.memory)])
+        now.out.append([next(rows) for _ in range(scheme.out)])
+        now.packets.append([[next(rows) for _ in range(2 + scheme.out)] for _ in range(kept)])
     assert next(rows, None) is None
     for tick in range(scheme.ratio):
-        if tick == 0:
-            for i in peers:
-                packets[i] = [[*motion[i][scheme.told], *out[i]], *packets[i][:-1]]
-        age = max(-((tick - scheme.late) // scheme.ratio), 0)  # packets sent since the newest that is here
-        acting: list[Any] = []
-        for i in peers:
-            heard = {j: packets[j][age] for j in scheme.hears[i]}
-            new, memory[i], out[i] = scheme.law(i, motion[i], heard, memory[i])
-            queue = [list(new), *forces[i]]
-            acting.append(queue[scheme.comp])
-            forces[i] = queue[: scheme.comp]
-        for i in peers:
-            motion[i] = [
-                _coast(x, v, force, *body, scheme.period)
-                for (x, v), force, body in zip(motion[i], acting[i], scheme.bodies[i], strict=True)
-            ]
+        _tick(scheme, now, tick)
     rows_out = []
-    for i in peers:
-        rows_out += [value for pair in motion[i] for value in pair]
-        rows_out += [value for one in forces[i] for value in one]
-        rows_out += [*memory[i], *out[i], *(value for one in packets[i] for value in one)]
+    for i in range(len(scheme.bodies)):
+        rows_out += [value for pair in now.motion[i] for value in pair]
+        rows_out += [value for one in now.forces[i] for value in one]
+        rows_out += [*now.memory[i], *now.out[i], *(value for one in now.packets[i] for value in one)]
     return np.array(rows_out)
+
+
+def played(
+    scheme: ByHand,
+    starts: Sequence[Sequence[tuple[float, float]]],
+    memory: Sequence[Sequence[float]],
+    ticks: int,
+) -> NDArray[np.float64]:
+    """Return the positions at each tick (ticks, bodies of all peers), of a law that need not be linear.
+
+    Parameters
+    ----------
+    scheme
+        The scheme.
+    starts
+        By peer the position and velocity of each body; who is not heard yet stands there.
+    memory
+        By peer its memory at first.
+    ticks
+        How many.
+    """
+    nought = [[0.0] * len(own) for own in scheme.bodies]
+    silent = [0.0] * scheme.out
+    now = _Playing(
+        motion=[list(own) for own in starts],
+        forces=[[own] * scheme.comp for own in nought],
+        memory=[list(own) for own in memory],
+        out=[silent for _ in starts],
+        packets=[[[*own[scheme.told], *silent]] * _kept(scheme) for own in starts],
+    )
+    found = []
+    for tick in range(ticks):
+        found.append([x for own in now.motion for x, _ in own])
+        _tick(scheme, now, tick % scheme.ratio)
+    return np.array(found)
 
 
 def _coast(
@@ -93,12 +150,16 @@ def _coast(
         far = (time - mass * rise) / damping if damping else time**2 / (2 * mass)
         return x + mass * rise * v + far * force, decay * v + rise * force
     half, rest = damping / (2 * mass), force / spring
-    turn = math.sqrt(spring / mass - half**2)
-    decay, cos, sin = math.exp(-half * time), math.cos(turn * time), math.sin(turn * time)
+    turn = cmath.sqrt(spring / mass - half**2)  # imaginary where damping keeps it from turning
+    decay, cos, sine = (
+        math.exp(-half * time),
+        cmath.cos(turn * time).real,
+        (cmath.sin(turn * time) / turn).real,
+    )
     y = x - rest
     return (
-        rest + decay * (y * (cos + half / turn * sin) + v * sin / turn),
-        decay * (v * (cos - half / turn * sin) - y * (spring / mass) / turn * sin),
+        rest + decay * (y * (cos + half * sine) + v * sine),
+        decay * (v * (cos - half * sine) - y * (spring / mass) * sine),
     )
 
 

@@ -73,6 +73,51 @@ def test_with_passive_hands_stable_means_that() -> None:
     assert found.stiffness == apc.critical(system, "coordination.stiffness", criterion="passive")
 
 
+# ---- in time ----
+
+BOUNCING = """\
+topology: bouncing
+clocks: {tick: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 1 N*s/m}}
+couplers:
+  wall: {type: VirtualWall, flange: device, position: 5 mm, stiffness: 500 N/m, clock: tick, period: 1 ms}
+hands: {push: {type: ConstantForce, flange: device, force: 1 N}}
+"""
+
+
+def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization() -> None:
+    """A wall is in no linearization about a start before it; in time 1 N rests 2 mm in 500 N/m."""
+    system = compiled(f"{BOUNCING}experiment: {{duration: 3 s}}\n")
+    found = compare([system, compiled(AVERAGE)])
+    (one, linear) = found.schemes
+    assert one.analysis.linearized
+    assert linear.played is None
+    assert one.played is not None
+    run = apc.simulate(system)
+    assert one.played.to_dict() == run.to_dict()
+    assert one.played.summary.verdict == "settles"
+    words = str(found).splitlines()
+    place = words.index("     in time                            played")
+    settled = f"settles at {run.summary.settled:.3g} s"
+    assert words[place + 1 : place + 3] == [
+        f"  1  {settled:<33}  3 s",
+        "  2  as its verdict says: it is linear",
+    ]
+    column = found.to_dataframe()["in time"]
+    assert column[0] == "settles"
+    assert column.isna()[1]
+
+
+def test_without_an_experiment_nothing_is_played_and_linear_schemes_need_none() -> None:
+    (one,) = compare([compiled(BOUNCING)]).schemes
+    assert one.played is None
+    assert dict(one.missing)["played"] == (
+        'apc simulate: the scene says no duration. Write: experiment: {duration: 3 s}  (or --duration "3 s")'
+    )
+    assert "in time" not in str(both())
+
+
 # ---- what it costs ----
 
 

@@ -82,7 +82,7 @@ def test_every_component_loads() -> None:
 
 
 def test_every_component_is_tested() -> None:
-    tests = ("models", "schemes", "planar", "library_models")
+    tests = ("models", "schemes", "schemes_in_time", "planar", "library_models")
     pages = [ROOT / "tests" / f"test_{name}.py" for name in tests]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     for name in Library().component_names:

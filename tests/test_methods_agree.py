@@ -35,11 +35,22 @@ REFUSED = {
         "hole": "no peer hears another",
         "island": "no peer hears another",
         "million-peers": "nothing is sparse",
+        "stiff-wall-passivity": "not linear",
         "three-large-groups": "nothing is sparse",
+        "two-users-proxies": "not linear",
     },
     "determinant": {
         "non-commensurate": "hides the peers' own eigenvalues",
     },
+}
+
+# Linearizations of which no truth is to be had event by event, and why; `test_schemes_in_time` has them.
+UNTOLD = {
+    "god-object": "hold functions whose values are rounded",
+    "limited-motor": "is not linear",
+    "two-users-dead-reckoning": "not linear in what it hears",
+    "two-users-passivity": "not linear in what it hears",
+    "two-users-set-position": "hold functions whose values are rounded",
 }
 
 # Bounds of the determinant that are wide all the same: of what their ticks round in a frame, of eigenvalues
@@ -76,18 +87,24 @@ def _compiled(path: Path) -> CompiledSystem:
 
 
 @cache
-def _truth(path: Path) -> tuple[flint.arb, int, str | None]:
-    """Return the radius, how many motions are rigid, and the verdict where it is stored."""
+def _truth(path: Path) -> tuple[flint.arb, int, str | None] | None:
+    """Return the radius, how many motions are rigid, and the verdict where it is stored; None of `UNTOLD`."""
     if path.stem in STORED:
         stored = STORED[path.stem]
         return flint.arb(stored["spectral_radius"]), stored["rigid_modes"], stored["verdict"]
     found = spectral_truth(_compiled(path))
+    if path.stem in UNTOLD:
+        assert UNTOLD[path.stem] in str(found)
+        return None
     assert isinstance(found, Truth), found
     return found.radius, found.rigid, None
 
 
 def _check(path: Path, method: str, useful: float) -> None:
-    radius, rigid, verdict = _truth(path)
+    truth = _truth(path)
+    if truth is None:
+        return
+    radius, rigid, verdict = truth
     try:
         found = analyze(_compiled(path), method=method)
     except ApcError as error:

@@ -108,6 +108,12 @@ def test_a_contact_is_named_by_what_it_computes_and_a_continuous_one_by_its_part
     assert {decision.changes for decision in find_switches(kind).decisions} == {("contact",)}
 
 
+def test_a_continuous_decision_of_several_parts_is_named_by_them_all() -> None:
+    """A motor's limit of what a wall asks for: the wall's side stands in it, too."""
+    limited = compiled((SCENES / "limited-motor.yaml").read_text(encoding="utf-8"))
+    assert [one.name for one in parts(limited)] == ["motor, wall", "wall.push"]
+
+
 def test_the_pieces_of_a_contact_are_the_spring_and_nothing() -> None:
     system = compiled((SCENES / "experiment-average.yaml").read_text())
     [kind] = system.kinds

@@ -215,7 +215,7 @@ def switching_parts(switched: SwitchedKind, parameters: NDArray[np.float64]) -> 
     parts = []
     for places in _together(switched.decisions):
         names = list(dict.fromkeys(name for place in places for name in switched.decisions[place].changes))
-        owners = {one.rpartition(".")[0] for one in names}
+        owners = {one.rpartition(".")[0] or one for one in names}
         name = owners.pop() if len(names) > 1 and len(owners) == 1 else ", ".join(names)
         if len(places) > MOST_DECISIONS:
             what = (

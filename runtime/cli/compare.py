@@ -54,12 +54,14 @@ def compare_command(
     """Put schemes side by side: the same questions asked of several scenes.
 
     Of each FILE, a topology or a compiled model: the verdict and spectral
-    radius of `apc analyze`; the largest stable stiffness of what couples it
-    to others, and the delay and loss of the link that break it, as `apc
-    critical` finds them; what the first peer's hand feels at 1 and 10 Hz, of
-    `apc feel`; how much a tick computes and how many numbers are sent. --set,
-    --in and --hands hold for all files. (To lay the stable regions of scenes
-    over each other: apc region --compare.)
+    radius of `apc analyze`; what `apc simulate` says of its experiment, if it
+    is not linear and the verdict is that of its linearization; the largest
+    stable stiffness of what couples it to others, and the delay and loss of
+    the link that break it, as `apc critical` finds them; what the first
+    peer's hand feels at 1 and 10 Hz, of `apc feel`; how much a tick computes
+    and how many numbers are sent. --set, --in and --hands hold for all files.
+    (To lay the stable regions of scenes over each other: apc region
+    --compare.)
 
     \b
         apc compare average.yaml mesh.yaml --set "lan.delay=16 ms" \\

@@ -2,8 +2,8 @@
 
 Takes: `CompiledSystem`s.
 Gives: `Comparison`, `Scheme`, `compare`; `FREQUENCIES`.
-Guarantees: every number is that of `analysis`, `vary.critical`, `hands.feel` or `effort`; what can't be had
-says why and keeps nothing else from being told.
+Guarantees: every number is that of `analysis`, `vary.critical`, `hands.feel`, `simulation` or `effort`; what
+can't be had says why and keeps nothing else from being told.
 Does not: compute any of it itself, or say which scheme is the better one.
 """
 
@@ -24,6 +24,9 @@ from apc.frame.parameters import resolve
 from apc.hands.feel import Feel, feel
 from apc.moments.network import NetworkVerdict, judge_network
 from apc.result import Result
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare as prepare_to_play
+from apc.simulation.trajectory import Played, duration_of, play, provenance_of
 from apc.vary.critical import Critical, critical
 from apc.vary.growth import NOMINAL, PASSIVE, criterion_of
 from apc.vary.search import Told
@@ -44,9 +47,10 @@ class Scheme:
     """One scene of a comparison, each part as the command gives it that is named.
 
     `analysis` and `network` (None where all packets are on time, or are taken to be) are those of `analyze`;
-    `passive` that of `analyze --hands passive`, where stable means that. `stiffness`, `delay` and `loss` are
-    those of `critical`; `feel` that of `feel` at `FREQUENCIES`, at the device of the first peer that has one.
-    `missing` says why a part is None, by its name.
+    `passive` that of `analyze --hands passive`, where stable means that. `played` is what `simulate` tells of
+    a scene that is not linear, where all else is of its linearization; None of one that is. `stiffness`,
+    `delay` and `loss` are those of `critical`; `feel` that of `feel` at `FREQUENCIES`, at the device of the
+    first peer that has one. `missing` says why a part is None, by its name.
     """
 
     topology: str
@@ -54,6 +58,7 @@ class Scheme:
     analysis: Analysis
     network: NetworkVerdict | None
     passive: PassiveHands | None
+    played: Played | None
     stiffness: Critical | None
     delay: Critical | None
     loss: Critical | None
@@ -175,18 +180,32 @@ def _scheme(
     network = judge_network(system, prepared) if criterion not in (NOMINAL, PASSIVE) else None
     if network is not None and network.mean_square_radius is None:
         missing["verdict"] = "; ".join(network.notes)
+    analysis = analyze(system, prepared=prepared)
     return Scheme(
         topology=system.name,
         peers=system.peers,
-        analysis=analyze(system, prepared=prepared),
+        analysis=analysis,
         network=network,
         passive=_passive(system, prepared) if criterion == PASSIVE else None,
+        played=had("played", "apc simulate", lambda: _played(system, say)) if analysis.linearized else None,
         stiffness=crossing(STIFFNESS),
         delay=crossing(DELAY),
         loss=crossing(LOSS),
         feel=had("feel", "apc feel", lambda: _feel(system, prepared)),
         effort=effort(system),
         missing=tuple(missing.items()),
+    )
+
+
+def _played(system: CompiledSystem, say: Told) -> Played:
+    """Return what a scene does in time, by its experiment."""
+    simulation = prepare_to_play(system, Settings(duration_of(system, None)))
+    say(f"{system.name}: apc simulate")
+    summary, interrupted = play(simulation, [])
+    if interrupted:
+        raise KeyboardInterrupt
+    return Played(
+        topology=system.name, summary=summary, provenance=provenance_of(simulation), interrupted=False
     )
 
 

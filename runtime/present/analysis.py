@@ -125,7 +125,9 @@ def analysis_text(result: Analysis) -> str:
     lines.append("")
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
     if result.linearized:
-        words = words.replace("Nothing ties", "To first order, nothing ties", 1)
+        words = f"To first order, {words[0].lower()}{words[1:]}"
+    if result.linearized and result.stable is not True:
+        words += "\nWhat it does in time is played: apc simulate"
     if not result.states_per_peer:
         words = "Nothing here is free to move."
     lines += [f"  {line}" for line in words.splitlines()]

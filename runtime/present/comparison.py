@@ -67,6 +67,8 @@ def comparison_text(found: Comparison) -> str:
     named = [(f"{one.topology}, {counted(one.peers, 'peer', ',d')}",) for one in schemes]
     lines += _table(("",), named)
     lines += _table(("verdict", "spectral radius a frame"), [_verdict(one, feet) for one in schemes])
+    if any(one.analysis.linearized for one in schemes):
+        lines += _table(("in time", "played"), [_in_time(one, feet) for one in schemes])
     for key, heading in VARIED:
         lines += _table((heading, "of"), [_varied(one, key, feet) for one in schemes])
     headings = ("felt at 1 Hz", "at 10 Hz", "of the hand at")
@@ -133,6 +135,17 @@ def _verdict(one: Scheme, feet: _Footnotes) -> tuple[str, str]:
     return verdict, f"{radius}{feet.mark(told)}"
 
 
+def _in_time(one: Scheme, feet: _Footnotes) -> tuple[str, str]:
+    """Return the verdict of a simulation, where that of an analysis is of a linearization."""
+    if not one.analysis.linearized:
+        return "as its verdict says: it is linear", ""
+    if one.played is None:
+        return f"{NONE}{feet.mark(_why(one, 'played'))}", NONE
+    summary = one.played.summary
+    at = {"settles": summary.settled, "diverges": summary.stopped_at}.get(summary.verdict)
+    return f"{summary.verdict}{'' if at is None else f' at {at:.3g} s'}", f"{summary.end:g} s"
+
+
 def _varied(one: Scheme, key: str, feet: _Footnotes) -> tuple[str, str]:
     found: Critical | None = getattr(one, key)
     if found is None:
@@ -176,7 +189,7 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
 
 
 def _document(one: Scheme) -> dict[str, Any]:
-    parts = ("analysis", "network", "passive", "stiffness", "delay", "loss", "feel")
+    parts = ("analysis", "network", "passive", "played", "stiffness", "delay", "loss", "feel")
     told = {key: None if getattr(one, key) is None else getattr(one, key).to_dict() for key in parts}
     return {
         "topology": one.topology,
@@ -234,6 +247,7 @@ def _columns() -> list[Column]:
         Column("topology", kind="text"),
         Column("peers", kind="count"),
         Column("verdict", kind="text"),
+        Column("in time", kind="text"),
         Column("frame", "s"),
         Column("spectral radius"),
         Column("spectral radius error"),
@@ -273,6 +287,7 @@ def _row(one: Scheme) -> Row:
         one.topology,
         one.peers,
         one.verdict,
+        None if one.played is None else one.played.summary.verdict,
         one.analysis.frame_s,
         one.analysis.spectral_radius,
         one.analysis.spectral_radius_error,

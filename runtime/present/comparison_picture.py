@@ -123,8 +123,11 @@ def _write(ax: Any, text: str, x: float, y: int) -> None:
 
 
 def _judge(ax: Any, schemes: Sequence[Scheme]) -> None:
-    """Draw where the boundary is, and write which scheme is not stable."""
+    """Draw where the boundary is; write which scheme is not stable, and what one does that isn't linear."""
     ax.axvline(1.0, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
     for place, one in enumerate(schemes):
-        if one.stable is not True:
-            _write(ax, "unstable" if one.stable is False else "undecided", 0.0, place)
+        said = [] if one.stable else ["unstable" if one.stable is False else "undecided"]
+        if one.played is not None:
+            said.append(f"{one.played.summary.verdict} in time")
+        if said:
+            _write(ax, ", ".join(said), 0.0, place)

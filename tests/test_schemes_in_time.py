@@ -1,0 +1,433 @@
+"""Schemes of the library that no frame stands for: played, against their laws by hand and against energy.
+
+Energy is weighed from outside: what hands put in, less what moves, whatever the scheme says of itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import apc
+from tests.schemes import ByHand, everybody, magnitudes, mean, played
+from tests.topologies import SCENES, compiled, replaced
+
+Floats = NDArray[np.float64]
+Packets = dict[int, Sequence[Any]]
+
+TICK = 1e-3
+# Of positions of some millimetres after hundreds of ticks in floats.
+SAME = 1e-10
+
+
+def scene(name: str) -> str:
+    return (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def run_of(text: str, duration: str, *signals: str) -> apc.Trajectory:
+    return apc.simulate(compiled(text), duration=duration, signals=signals or ["*.x", "*.v"], jit=False)
+
+
+def of_all(run: apc.Trajectory, name: str) -> list[Floats]:
+    """Return a signal of every peer, in their order."""
+    return [run[one.name] for one in run.signals if one.name.endswith(f".{name}")]
+
+
+def same(run: apc.Trajectory, expected: Floats, *bodies: str) -> None:
+    """Compare the positions of all peers' bodies with those played by hand, and see that they move."""
+    by_body = [of_all(run, f"{body}.x") for body in bodies]
+    found = np.array([one for own in zip(*by_body, strict=True) for one in own]).T
+    assert np.ptp(expected, axis=0).min() > 1e-4
+    assert found[: len(expected)] == pytest.approx(expected, abs=SAME)
+
+
+def paid(debt: float, step: float, largest: float) -> float:
+    """Return the damping that takes an energy within a tick, if the next step is as long as the last."""
+    if debt * TICK > largest * step**2:
+        return largest
+    return debt * TICK / step**2 if debt > 0 else 0.0
+
+
+# ---- one port ----
+
+WALL = scene("stiff-wall-passivity")
+
+
+@pytest.mark.parametrize("largest", [0.0, 2.0, 30.0])
+def test_passivity_controller_is_its_law(largest: float) -> None:
+    """A device on a spring bounces in and out of the wall; at 2 N·s/m the limit is met again and again."""
+
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        before, energy, force = memory
+        step = x[0][0] - before
+        energy += force * step
+        force = max(0.0, 8000 * x[0][0]) + paid(-energy, step, largest) * step / TICK
+        return [-force], [x[0][0], energy, force], []
+
+    text = replaced(
+        WALL,
+        ("largest: 30", f"largest: {largest}"),
+        (
+            "type: ConstantForce, flange: device, force: 2 N",
+            "type: SpringDamperArm, flange: device, stiffness: 100 N/m",
+        ),
+    )
+    hand = ByHand([[(0.1, 0.2, 100.0)]], [[]], law, told=0, memory=3, comp=0)
+    same(run_of(text, "500 ms"), played(hand, [[(-0.01, 0.0)]], [[-0.01, 0.0, 0.0]], 500), "device")
+
+
+def test_a_passivity_controller_lets_no_more_out_than_a_step_takes() -> None:
+    """By what the hand gives and what moves, F (x − x₀) − m v²/2: a wall of 8000 N/m gives energy at 1 kHz.
+
+    With the controller the port is short by no more than comes out in a tick, as it pays in the next; and
+    what it says of itself is what was weighed.
+    """
+    smooth = replaced(WALL, ("damping: 0.2 N*s/m", "damping: 0 N*s/m"))
+    energies = {}
+    for largest in ("0", "100"):
+        text = replaced(smooth, ("largest: 30", f"largest: {largest}"))
+        run = run_of(text, "3 s", "*.x", "*.v", "*.energy")
+        (x,), (v,), (told,) = of_all(run, "device.x"), of_all(run, "device.v"), of_all(run, "watch.energy")
+        energies[largest] = 2 * (x - x[0]) - 0.1 * v**2 / 2
+        assert told[1:] == pytest.approx(energies[largest][:-1], abs=1e-12), "told is that of the tick before"
+    out = np.diff(energies["100"]).min()
+    assert energies["100"].min() >= out
+    assert energies["0"].min() < -100 * -out
+
+
+def test_the_stiff_wall_settles_with_its_controller_and_shakes_without() -> None:
+    system = compiled(WALL)
+    assert apc.simulate(system, jit=False).summary.verdict == "settles"
+    assert apc.simulate(system, set={"watch.largest": "0 N*s/m"}, jit=False).summary.verdict == "shakes"
+
+
+# ---- two ports ----
+
+TWO = scene("two-users-passivity")
+COPIES = """\
+topology: two-copies
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {left: {count: 1, set: {push.force: 1 N}}, right: {count: 1}}
+masses: {cube: {mass: 1 kg}}
+couplers:
+  it: {type: TYPE, object: cube, stiffness: 500 N/m, clock: haptic, period: 1 ms, link: lan}
+links: {lan: {clock: network, delay: 50 ms}}
+hands: {push: {type: ConstantForce, flange: cube, force: 0 N}}
+"""
+
+
+def contact(x: Sequence[tuple[Any, Any]]) -> Any:
+    return 1000 * (x[0][0] - x[1][0])
+
+
+@pytest.mark.parametrize(("delay", "largest"), [(0, 30.0), (50, 30.0), (50, 3.0), (200, 30.0)])
+def test_passivity_controlled_average_is_its_law(delay: int, largest: float) -> None:
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        before, taken, given, saved, pull, brake, *acting = memory
+        step = x[1][0] - before
+        taken += max(0.0, acting[0] * step)
+        given += max(0.0, -acting[0] * step)
+        saved += acting[1] * step
+        extra = paid(given - saved - mean(heard, 2), step, largest)
+        now = 500 * (x[1][0] - mean(heard, 0))
+        damped = extra * step / TICK
+        push = contact(x)
+        # What was computed at the tick before acts from now on.
+        kept = [x[1][0], taken, given, saved, now, damped, pull, brake]
+        return [-push, push - now - damped], kept, [taken]
+
+    text = replaced(
+        TWO,
+        ("largest: 30", f"largest: {largest}"),
+        ("delay: 50 ms", f"delay: {delay} ms"),
+        ("push.force: 2 N", "push.force: 0 N, device.x: 20 mm"),
+    )
+    body = [(0.1, 5.0 + 2.0, 100.0), (0.3, 1.0, 0.0)]
+    hand = ByHand([body] * 2, everybody(2), law, told=1, memory=8, out=1, late=delay)
+    starts = [[(0.02, 0.0), (0.0, 0.0)], [(0.0, 0.0)] * 2]
+    same(run_of(text, "600 ms"), played(hand, starts, [[0.0] * 8] * 2, 600), "device", "cube")
+
+
+def test_two_ports_give_no_more_than_went_in() -> None:
+    """What a hand gives less what moves is what went in, F (x − x₀) − m v²/2 at one, −m v²/2 at the other.
+
+    Together never less than nothing but for what comes out in a tick, where a spring alone gives without end.
+    """
+
+    def stored(most: str) -> tuple[Floats, Floats]:
+        kind = f"PassivityControlledAverage, largest: {most}"
+        run = run_of(replaced(COPIES, ("TYPE", kind)), "4 s")
+        (left, _), (v, w) = of_all(run, "cube.x"), of_all(run, "cube.v")
+        return left - v**2 / 2, -(w**2) / 2
+
+    here, there = stored("600 N*s/m")
+    assert (here + there).min() >= np.diff(here).min() + np.diff(there).min()
+    assert sum(stored("0 N*s/m")).min() < -1e3
+
+
+def test_a_linearization_says_unstable_of_what_settles() -> None:
+    """`analyze` says of what its verdict is; the scene settles, and shakes without its controllers."""
+    system = compiled(TWO)
+    found = apc.analyze(system)
+    assert found.verdict == "unstable"
+    assert str(found).startswith(
+        "two-users-passivity: unstable, linearized at its start\n"
+        "  left out: the scene is not linear, and this holds near its start values only\n\n"
+        "  To first order, some motion grows until the devices shake or hit their limits.\n"
+        "  What it does in time is played: apc simulate\n"
+    )
+    assert apc.simulate(system, jit=False).summary.verdict == "settles"
+    without = apc.simulate(system, set={"coordination.largest": "0 N*s/m"}, duration="3 s", jit=False)
+    assert without.summary.verdict == "shakes"
+
+
+def test_the_linearization_is_of_the_average_without_its_brake() -> None:
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        push, pull = contact(x), 500 * (x[1][0] - mean(heard, 0))
+        return [-push, push - pull], memory, []
+
+    bodies = [[(0.1, 5.0 + 2.0, 100.0), (0.3, 1.0, 0.0)]] * 2
+    expected = magnitudes(ByHand(bodies, everybody(2), law, told=1, late=50))[1]
+    assert apc.analyze(compiled(TWO)).spectral_radius == pytest.approx(expected, abs=1e-10)
+
+
+# ---- set positions ----
+
+
+@pytest.mark.parametrize("delay", [0, 50, 200])
+@pytest.mark.parametrize("energy", [1e-5, 10.0])
+def test_set_position_modulation_gives_no_energy(delay: int, energy: float) -> None:
+    """Σ m v²/2 + K (x − goal)²/2 + kept + on its way never grows, whatever the delay, packets lost or not.
+
+    It begins as what the copies are apart and what is kept. Between ticks the damper takes at least what is
+    harvested, by Cauchy and Schwarz; at ticks nothing is made.
+    """
+    text = replaced(
+        COPIES.replace("period: 1 ms, link", "period: 1 ms, damping: 2 N*s/m, link"),
+        ("TYPE", "SetPositionModulation, ceiling: 0.02 J"),
+        ("push.force: 1 N", "push.force: 0 N, cube.x: 10 mm, it.x: 10 mm, it.goal: 10 mm"),
+        ("delay: 50 ms", f"delay: {delay} ms, loss: 20 %"),
+        ("link: lan}", f"link: lan, energy: {energy} J}}"),
+    )
+    run = run_of(text, "3 s", "*")
+    x, v = np.array(of_all(run, "cube.x")), np.array(of_all(run, "cube.v"))
+    goal, kept, spare, heard = (
+        np.array(of_all(run, f"it.{one}")) for one in ("goal", "energy", "spare", "heard")
+    )
+    # What is told at a row is that of the tick before: as it stands there, after that tick.
+    x, v = x[:, :-1], v[:, :-1]
+    goal, kept, spare, heard = goal[:, 1:], kept[:, 1:], spare[:, 1:], heard[:, 1:]
+    total = (v**2 / 2 + 250 * (x - goal) ** 2 + kept + spare - heard[::-1]).sum(axis=0)
+    assert total[0] <= 2 * energy + 1e-12
+    assert np.diff(total).max() <= 1e-15 + 1e-13 * total[0]
+    assert np.ptp(x) > 1e-3
+    assert (kept >= 0).all()
+    assert (np.diff(spare) >= 0).all()
+
+
+def test_set_position_modulation_with_energy_enough_is_a_spring_and_damper() -> None:
+    """A million joules are never used up: then the goal is what is heard, and the law is linear."""
+
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        return [500 * mean(heard, 0)], memory, []
+
+    text = replaced(
+        COPIES.replace("period: 1 ms, link", "period: 1 ms, damping: 6 N*s/m, link"),
+        ("TYPE", "SetPositionModulation, energy: 1e6 J, ceiling: 1e7 J"),
+    )
+    hand = ByHand([[(1.0, 6.0, 500.0)]] * 2, everybody(2), law, told=0, late=50, comp=0)
+    found = apc.analyze(compiled(text))
+    assert found.spectral_radius == pytest.approx(magnitudes(hand)[1], abs=1e-10)
+    assert found.linearized
+
+
+def test_set_position_modulation_settles_where_its_spring_would_shake() -> None:
+    system = compiled(scene("two-users-set-position"))
+    assert apc.simulate(system, jit=False).summary.verdict == "settles"
+    free = {"coordination.energy": "1e6 J", "coordination.ceiling": "1e7 J"}
+    assert apc.simulate(system, set=free, jit=False).summary.verdict == "shakes"
+
+
+# ---- send on change ----
+
+RECKONED = scene("two-users-dead-reckoning")
+ALONE = """\
+topology: one-tells
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {teller: {count: 1, set: {MOTION}}, hearer: {count: 1}}
+masses: {cube: {mass: 2 kg}}
+couplers:
+  it: {type: DeadReckoning, object: cube, stiffness: 0 N/m, threshold: 0.5 mm, age: 8 ms, clock: haptic,
+       period: 1 ms, link: lan}
+links: {lan: {clock: network, delay: 8 ms}}
+hands: {push: {type: ConstantForce, flange: cube, force: 0 N}}
+"""
+
+
+def test_a_constant_velocity_is_told_once_and_heard_as_it_is() -> None:
+    """At 0.3 m/s, 0.5 mm are passed at the second tick; from the packet after it on nothing is wrong."""
+    run = run_of(ALONE.replace("MOTION", "cube.v: 0.3 m/s"), "2 s", "*")
+    (told, _), (_, ahead), (x, _) = of_all(run, "it.told"), of_all(run, "it.ahead"), of_all(run, "cube.x")
+    assert np.flatnonzero(np.diff(told)).tolist() == [2]
+    # Told at 2 ms, sent at 8 ms, here at 16 ms; a row has what was computed at the tick before.
+    assert ahead[18:] == pytest.approx(x[17:-1], abs=1e-12)
+    assert not ahead[:17].any()
+
+
+def test_a_constant_acceleration_is_told_every_root_of_twice_the_threshold_over_it() -> None:
+    """Wrong by a s²/2 after s seconds, told at the first tick from √(2·0.5 mm/a) seconds on."""
+    for acceleration in (0.5, 2.0, 11.0):
+        run = run_of(ALONE.replace("MOTION", f"push.force: {2 * acceleration} N"), "2 s", "*")
+        told = np.flatnonzero(np.diff(of_all(run, "it.told")[0]))
+        assert len(told) > 10
+        expected = math.ceil(math.sqrt(2 * 0.5e-3 / acceleration) / TICK)
+        assert set(np.diff(told).tolist()) == {expected}
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1e-4])
+@pytest.mark.parametrize("delay", [0, 8, 48])
+def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
+    """The hearer knows when a packet was sent: it goes on from there by its age at each tick."""
+
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        course, told, before, ahead = memory
+        by_then = course + TICK * told
+        if abs(x[1][0] - by_then) < threshold:
+            course = by_then
+        else:
+            course, told = x[1]
+        ((_, _, line, speed),) = heard.values()
+        ahead = ahead + TICK * speed if line == before else line + delay * TICK * speed
+        pull = 200 * (x[1][0] - ahead) + 5 * (x[1][1] - speed)
+        push = contact(x)
+        return [-push, push - pull], [course, told, line, ahead], [course + TICK * told, told]
+
+    text = replaced(
+        RECKONED,
+        ("late: 8 ms", f"late: {delay} ms"),
+        ("threshold: 0.1 mm", f"threshold: {threshold} m"),
+        ("push.force: 2 N", "push.force: 0 N, device.x: 20 mm"),
+    )
+    body = [(0.1, 5.0 + 2.0, 100.0), (0.3, 5.0, 0.0)]
+    hand = ByHand([body] * 2, everybody(2), law, told=1, memory=4, out=2, late=delay)
+    starts = [[(0.02, 0.0), (0.0, 0.0)], [(0.0, 0.0)] * 2]
+    same(run_of(text, "500 ms"), played(hand, starts, [[0.0] * 4] * 2, 500), "device", "cube")
+
+
+def test_before_anything_is_told_nobody_is_pulled() -> None:
+    """To first order the memory of what was told stays as it is, and a copy moves as its damper lets it."""
+    found = apc.analyze(compiled(RECKONED))
+    assert found.verdict.startswith("undecided")
+    assert str(found).startswith(f"two-users-dead-reckoning: {found.verdict}, linearized at its start\n")
+    all_told = apc.analyze(compiled(RECKONED), set={"coordination.threshold": "0 m"})
+    assert all_told.stable, "what is always told is a prediction"
+
+
+# ---- god-object ----
+
+ROUGH = scene("god-object")
+
+
+def test_god_object_holds_as_a_spring_each_way_while_it_sticks() -> None:
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        return [-1000 * x[0][0]], memory, []
+
+    expected = magnitudes(ByHand([[(0.1, 5.0, 0.0)]], [[]], law, told=0, ratio=1, late=0))[1]
+    assert apc.analyze(compiled(ROUGH)).spectral_radius == pytest.approx(expected, abs=1e-10)
+
+
+@pytest.mark.parametrize("sideways", [0.0, 0.8, -0.99])
+def test_god_object_sticks_within_its_cone(sideways: float) -> None:
+    """|F_t| < μ |F_n|: the device rests F_t/K from where the god-object sticks, F_n/K deep."""
+    text = replaced(ROUGH, ("force: [0.8 N, -2 N]", f"force: [{sideways} N, -2 N]"))
+    run = run_of(text, "2 s", "*")
+    (along,), (deep,), (stuck,) = (
+        of_all(run, "device.x[1]"),
+        of_all(run, "device.x[2]"),
+        of_all(run, "table.stuck"),
+    )
+    assert deep[-1] == pytest.approx(-2 / 1000, abs=1e-9)
+    assert along[-1] - stuck[-1] == pytest.approx(sideways / 1000, abs=1e-9)
+    assert stuck[-1] == stuck[-200]
+
+
+@pytest.mark.parametrize("sideways", [1.3, -2.0])
+def test_god_object_slides_beyond_its_cone(sideways: float) -> None:
+    """|F_t| > μ |F_n|: in the end at (|F_t| − μ |F_n|)/b, the god-object μ times the depth behind."""
+    text = replaced(ROUGH, ("force: [0.8 N, -2 N]", f"force: [{sideways} N, -2 N]"))
+    run = run_of(text, "2 s", "*")
+    (v,), (x,), (stuck,) = of_all(run, "device.v[1]"), of_all(run, "device.x[1]"), of_all(run, "table.stuck")
+    assert v[-1] == pytest.approx(math.copysign((abs(sideways) - 0.5 * 2) / 5, sideways), abs=1e-9)
+    assert x[-2] - stuck[-1] == pytest.approx(math.copysign(0.5 * 2 / 1000, sideways), abs=1e-9)
+
+
+def test_god_object_on_a_slope_holds_what_friction_can() -> None:
+    """Pressed straight down on a slope of angle θ, it sticks where tan θ < μ and slides where it is more."""
+    for slope, rests in ((0.45, True), (0.55, False)):
+        text = replaced(ROUGH, ("normal: [0, 1]", f"normal: [{slope}, 1]"), ("force: [0.8 N", "force: [0 N"))
+        run = run_of(text, "3 s", "*")
+        (stuck,) = of_all(run, "table.stuck")
+        assert bool(stuck[-1] == stuck[-200]) is rests
+
+
+# ---- remote proxies ----
+
+
+@pytest.mark.parametrize("delay", [0, 8, 50, 200])
+def test_remote_proxy_is_its_law(delay: int) -> None:
+    """Each device feels the proxy it touches; the proxy follows the other's device as heard."""
+
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        push = 1000 * (x[0][0] - x[1][0])
+        follow = 300 * (x[1][0] - mean(heard, 0)) + 5 * (x[1][1] - mean(heard, 1))
+        return [-push, push - follow], memory, []
+
+    text = replaced(scene("two-users-proxies"), ("delay: 8 ms, loss", f"delay: {delay} ms, loss"))
+    bodies = [[(0.1, 5.0 + 2.0, 50.0), (0.1, 1.0, 0.0)]] * 2
+    rigid, radius = magnitudes(ByHand(bodies, everybody(2), law, told=0, late=delay))
+    found = apc.analyze(compiled(text))
+    assert found.rigid_modes == rigid == 0
+    assert found.spectral_radius == pytest.approx(radius, abs=1e-10)
+
+
+def test_users_rest_against_each_others_proxies() -> None:
+    """At rest the proxy is K_c d/K_p off, d deep, and the arm takes what of the push the contact leaves.
+
+    By symmetry the devices are at ±y, the proxies at ∓(y − p): F = 50 y + 1000 d, 1000 d = 300 p and
+    d = 20 mm + y + (y − p), y measured towards the other.
+    """
+    y, d, p = np.linalg.solve([[50.0, 1000, 0], [0, 1000, -300], [-2, 1, 1]], [2.0, 0, 0.02])
+    run = run_of(scene("two-users-proxies"), "3 s")
+    left, right = of_all(run, "device.x")
+    (near, _) = of_all(run, "proxy.x")
+    assert (left[-1], right[-1]) == (pytest.approx(y, abs=1e-8), pytest.approx(-y, abs=1e-8))
+    assert near[-1] == pytest.approx(-y + p, abs=1e-8)
+    assert d > 0
+
+
+# ---- a motor's limit ----
+
+LIMITED = replaced(scene("limited-motor"), ("type: RampForce", "type: ConstantForce"), (", rise: 1 s", ""))
+
+
+def test_limited_motor_holds_up_to_its_limit_and_gives_way_beyond() -> None:
+    """3 N rest 3/500 m deep; of 5 N the motor takes 3.3 N, and the damper the rest: (5 − 3.3)/b."""
+    held = run_of(replaced(LIMITED, ("force: 5 N", "force: 3 N")), "2 s")
+    assert held["user[1].device.x"][-1] == pytest.approx(3 / 500, abs=1e-9)
+    beyond = run_of(LIMITED, "2 s")
+    assert beyond["user[1].device.v"][-1] == pytest.approx((5 - 3.3) / 1, abs=1e-8)
+
+
+def test_limited_motor_without_its_limit_is_not_there() -> None:
+    free = replaced(LIMITED, ("force_limit: 3.3 N", "force_limit: 3.3 N, limits: off"))
+    none = replaced(
+        LIMITED,
+        ("  motor: {type: LimitedMotor, flange: device, force_limit: 3.3 N}\n", ""),
+        ("flange: motor.port", "flange: device"),
+    )
+    assert run_of(free, "1 s").values == pytest.approx(run_of(none, "1 s").values, abs=1e-13)
