@@ -194,7 +194,7 @@ def test_a_trace_that_is_not_there_is_told_where_it_is_named() -> None:
             ],
         ),
         ("jitter: -5 ms", ["46: E207 jitter wants 0 s or more, got -0.005 s."]),
-        ("jitter: 5", ["46: E204 jitter wants s, got 5 (no unit). Write: jitter: 5 s"]),
+        ("jitter: 5", ["46: E204 jitter wants s, got 5 (no unit). Write: jitter: 5 ms"]),
         (
             "jitter: 5 ms, distribution: gauss",
             [

@@ -59,7 +59,7 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic: 1",
-        "4:11: E204 haptic wants s, got 1 (no unit). Write: haptic: 1 ms, or 1 s",
+        "4:11: E204 haptic wants s, got 1 (no unit). Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
@@ -532,7 +532,7 @@ TOPOLOGY = [
     (
         "studies:",
         "experiment: {duration: 3}\nstudies:",
-        "16:24: E204 duration wants s, got 3 (no unit). Write: duration: 3 ms, or 3 s",
+        "16:24: E204 duration wants s, got 3 (no unit). Write: duration: 3 s",
     ),
     (
         "studies:",

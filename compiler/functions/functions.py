@@ -45,6 +45,7 @@ from apc.compiler.functions.exchange import (
 )
 from apc.compiler.functions.reached import Reached, reached_together
 from apc.compiler.language.dimensions import Dimension
+from apc.compiler.language.expression import names
 from apc.compiler.language.recordings import TimeTable
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.scene.instances import Part
@@ -175,6 +176,7 @@ class _KindBuilder:
                 if part.section == "hands"
                 and "." not in part.name
                 and part.name in self.kind.clocked.flat.parts
+                and _answers(part)
             ),
         )
 
@@ -356,6 +358,18 @@ def _held_ports(scene: Scene, kind: SortedKind) -> tuple[_Port, ...]:
             if own and not others and not at.free_symbols & held.keys():
                 found.append(_Port(part.name, at, through))
     return tuple(found)
+
+
+def _answers(part: Part) -> bool:
+    """Say whether a hand answers to how it is moved; one that only pushes as it likes changes no stability."""
+    component = part.component
+    moved = {
+        (name, potential.name)
+        for name, connector in component.connectors
+        for potential in connector.potentials
+    }
+    sides = [side for equation in component.equations for side in (equation.left, equation.right)]
+    return bool(component.inner) or any(name.parts in moved for side in sides for name in names(side))
 
 
 def _connector_pairs(part: Part) -> list[tuple[str, str]]:

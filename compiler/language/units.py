@@ -123,9 +123,9 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     elif (confused := _confused(found.unit, wanted.dimension)) is not None:
         name, right = confused
         got += f" ({name} is {spelled(name)}: case matters)"
+    if found.unit == NO_UNIT and right == "s" and "duration" not in what:
+        right = "ms"  # the size of a scene's delays and periods
     hint = f"{what}: {number.group().strip()}" + ("" if wanted.text == "1" else f" {right}")
-    if found.unit == NO_UNIT and right == "s":  # of either size there are times in a scene
-        hint = f"{what}: {number.group().strip()} ms, or {number.group().strip()} s"
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 
 

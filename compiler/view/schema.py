@@ -87,7 +87,12 @@ def topology_schema(library: Library) -> Schema:
         "group": _group(),
         "part": _by_type({name: {"$ref": f"#/$defs/{name}"} for name in parts}),
         "joined_part": _by_type(
-            {c.name: {"required": [name for name, _ in c.connectors]} for c in components if c.connectors}
+            # A connector that another part names may be left out, but hardly all of them.
+            {
+                c.name: {"anyOf": [{"required": [name]} for name, _ in c.connectors]}
+                for c in components
+                if c.connectors
+            }
         ),
         "graph": _graph(),
         "delays": _named(_named(quantities.of(_unit("s")))),

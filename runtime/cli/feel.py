@@ -99,6 +99,8 @@ def feel_command(
         named = " or ".join(_SPANNED[name] for name in given)
         raise click.UsageError(f"--frequencies names every frequency there is: no {named} with it")
     first, colon, second = between.partition(":")
+    if between and not (first and colon and second and first != second):
+        raise click.UsageError('--between names two hands: --between "left[1].device:right[1].device"')
     if at and colon and at != first:
         raise click.UsageError("--between A:B names the hand's device, A: no --at with it")
     if nyquist and (out is None or out.suffix.lower() not in FORMATS):

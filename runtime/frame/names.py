@@ -28,6 +28,9 @@ from apc.compiler.words import with_unit
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
 
+# The numbers of the hand that `--hands held` puts on each device.
+HELD = ("hand.mass", "hand.damping", "hand.stiffness")
+
 # Where a mistake in an override stands, when it came from no line of a file.
 OVERRIDE = Place("override")
 
@@ -100,6 +103,9 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
     if name.startswith(COUNT):
         what = f"{written} is how many peers are heard, by their weights: from {sizes[0]} and the graph"
         raise ApcError(Mistake("E623", place, what))
+    if name in HELD and not any(one.startswith("hand.") for one in known):
+        what = f"{written} is of the hand that --hands held puts on each device"
+        raise ApcError(Mistake("E622", place, what, hint=f"--hands held --set {name}=…"))
     if name not in known:
         near = nearest(name, sorted(known))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))

@@ -56,9 +56,13 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
         raise ApcError(Mistake("E621", place, "an override", "NAME=VALUE", text[:80], form))
     free = find(system, name, place, counts=True)
     unit = unit_of(system, free.name)
-    found = quantity(
-        value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
-    )
+    try:
+        found = quantity(
+            value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
+        )
+    except ApcError as error:  # what is to be written is a setting, too
+        mistakes = [replace(one, hint=one.hint.replace(f"{name}: ", f"{name}=", 1)) for one in error.mistakes]
+        raise ApcError(mistakes) from None
     return Override(free, found.value)
 
 

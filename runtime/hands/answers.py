@@ -80,8 +80,11 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
             if not isinstance(device, Device):
                 what = device or f"{group.name} has no device"
                 moving = [state.name for state in group.jacobians.kind.states]
-                meant = next((n for n in moving if whole_and_index(n)[1] == 1 and n in what), "device")
-                hint = f"--at with the part that is held, as {group.name}[1].{meant}" if device else OWN_MASS
+                meant = next((n for n in moving if whole_and_index(n)[1] == 1 and n in what), "")
+                if not meant and any(n.startswith("device.") for n in moving) and named != "device":
+                    meant = "device"
+                hint = f"--at with the part that is held, as {group.name}[1].{meant}" if meant else ""
+                hint = hint if device else OWN_MASS
                 raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
             held[one] = device
         if device is None:

@@ -115,6 +115,8 @@ def read_frequencies(
         last = float(option_value("--to", high, what="frequency", unit="Hz"))
     if not 0 < first < last:
         what = f"from {first:.6g} Hz to {last:.6g} Hz there is nothing above 0 Hz"
+        if 0 < last <= first:
+            what = f"the span from {first:.6g} Hz to {last:.6g} Hz ends before it begins"
         hint = '--from "0.1 Hz" --to "60 Hz"'
         if first > 0 and high is None:
             what = f"{first:.6g} Hz is not below {last:.6g} Hz, where it ends without --to"
@@ -153,7 +155,7 @@ def check_frequencies(system: CompiledSystem, found: Floats) -> None:
     hint = f"{most:.6g} Hz at most"
     if not found.size or not np.isfinite(found).all() or found.min() <= 0:
         got = "none" if not found.size else f"{found.min():.6g} Hz"
-        raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, '--from "0.1 Hz"'))
+        raise ApcError(Mistake("E935", place, "a frequency", "above 0 Hz", got, "0.1 Hz"))
     if found.max() > most:
         what = f"{found.max():.6g} Hz is beyond half the fastest clock: samples take it for a slower one"
         raise ApcError(Mistake("E935", place, what, hint=hint))

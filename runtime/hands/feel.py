@@ -43,6 +43,9 @@ RADIUS, HALVINGS = 4.0, 14
 # By how much more than rounding means against negative powers may tell of a pole within a circle.
 DOUBTED = 10.0
 
+# A speed in 1/s of the slowest motions, and how nearly alike two devices move then.
+SLOWLY, ALIKE = 1e-3, 1e-2
+
 # What of slow motions two circles may tell differently, beside the largest.
 SETTLED = 1e-3
 
@@ -188,7 +191,8 @@ def feel(
             return None if own is None else (own.damping, own.errors[1])
 
         if slow is not None:
-            together = abs(slow.stiffness) <= slow.errors[2]
+            # Of slow motions all move alike: none holds back, and none stays behind.
+            together = abs(slow.stiffness) <= slow.errors[2] and _alike(responses)
             viscosity = network_viscosity(system, (slow.damping, slow.errors[1]), together, damping_of)
         hinf = _extremes(modes, responses) if steady else ()
         h2 = _noise(system, modes, responses) if steady else ()
@@ -224,6 +228,13 @@ def feel(
         left_out=left_out(system, linear=linear),
         notes=tuple(note for note, applies in notes.items() if applies),
     )
+
+
+def _alike(responses: Responses) -> bool:
+    """Say whether the other device moves as this one does as slowly as can be told."""
+    found = responses.steady(np.array([SLOWLY * 1j]), (0,))
+    own, across = found[0][0], found[1][0]
+    return bool(abs(across - own) < ALIKE * abs(own))
 
 
 def _unstable(system: CompiledSystem, radius: float) -> ApcError:

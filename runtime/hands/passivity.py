@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, analyze, lifted_groups, prepare
+from apc.analysis.contact_modes import contact_modes
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.dissipation import least_real, proves_positive
@@ -191,8 +193,24 @@ def passive_hands(
         why=why,
         proof=proof,
         linearized=not linear,
-        left_out=left_out(system, linear=linear),
+        left_out=(*left_out(system, linear=linear), *_as_at_start(system, prepared, linear=linear)),
     )
+
+
+def _as_at_start(system: CompiledSystem, prepared: Prepared, *, linear: bool) -> tuple[str, ...]:
+    """Say which contacts the answer takes as they are at the start, though hands may open and close them."""
+    if linear:
+        return ()
+    try:
+        parts = contact_modes(system, prepared=prepared).parts
+    except ApcError:  # too many to look at: that the scene isn't linear is said
+        return ()
+    if not parts:
+        return ()
+    told = (
+        f"left out: {', '.join(parts)} as at the start, whether they touch then or not; hands may change that"
+    )
+    return (told,)
 
 
 def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> Growth:

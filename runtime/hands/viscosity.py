@@ -21,6 +21,7 @@ import numpy as np
 from apc.analysis.analysis import lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Link, Timing, count_of
 from apc.compiler.frozen import dataclass
+from apc.compiler.language.vectors import whole_and_index
 from apc.eigen.peer_group import PeerGroup
 
 # The timing of packets that take no time.
@@ -86,6 +87,7 @@ def network_viscosity(
     if without is None:
         return None
     groups, _ = lifted_groups(system, prepared=prepare(system))
+    together = together and len(groups) == 1  # unlike ones may differ in what they hold
     shares = [_by_formula(system, link, group) for link in system.links for group in groups]
     known = [one for one in shares if one is not None]
     return Viscosity(
@@ -105,8 +107,10 @@ def _by_formula(system: CompiledSystem, link: Link, group: PeerGroup) -> float |
         return None
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     period = {clock.name: seconds[clock.period] for clock in system.clocks}
-    # All that has a place moves by 1.
-    moved = np.array([float(state.unit == "m") for state in kind.states])
+    # All that has a place moves by 1, of what moves along several axes along the first.
+    moved = np.array(
+        [float(one.unit == "m" and whole_and_index(one.name)[1] in (0, 1)) for one in kind.states]
+    )
     parameters = dict(zip(kind.parameters, group.parameters, strict=True))
     zero = [np.zeros(len(one)) for one in (kind.states, kind.holds)]
     pushed, others = kind.ports.port, group.parameters

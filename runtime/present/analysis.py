@@ -124,6 +124,11 @@ def analysis_text(result: Analysis) -> str:
         lines += note(text)
     lines.append("")
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
+    if result.rigid_modes > 1 and result.verdict == "stable up to a common translation":
+        words = (
+            f"{result.rigid_modes} motions are held back by nothing, of all peers together or of some\n"
+            "beside others: moved so they stay where they are. Every other motion dies out."
+        )
     if result.linearized:
         words = f"To first order, {words[0].lower()}{words[1:]}"
     if result.linearized and result.stable is not True:
@@ -325,7 +330,8 @@ def box_proof_text(found: BoxProof) -> str:
         said = "not stable in all of the box"
         lines += ["proved unstable at", *where]
     else:
-        said = f"undecided, {found.open_share:.2g} of the box is left open ({counted(found.cells, 'cell')})"
+        share = f"{100 * found.open_share:.2g} %"
+        said = f"undecided, {share} of the box is left open ({counted(found.cells, 'cell')})"
         lines += ["among others around", *where] if found.point else []
     lines += [f"  {text}" for text in found.notes]
     return "\n".join([f"{found.topology}:", *wrapped(said), *lines])

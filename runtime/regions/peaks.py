@@ -314,7 +314,10 @@ def _on_circle(loops: _Loops, turn: NDArray[np.bool_], level: Floats) -> Floats:
     unit = np.eye(n)
     sign = np.where(turn, -1.0, 1.0)[:, None, None]
     a, b = sign * loops.a, sign * loops.bf
-    inverse = np.linalg.inv(unit + a)
+    try:
+        inverse = np.linalg.inv(unit + a)
+    except np.linalg.LinAlgError:  # that end is a pole of some map: none of them is told of there
+        return np.full((count, 1), np.nan)
     c, d = -2 * loops.b * loops.fc, 2 * loops.b * loops.f - np.eye(loops.f.shape[-1])
     a_c, b_c, c_c = inverse @ (a - unit), np.sqrt(2) * inverse @ b, np.sqrt(2) * c @ inverse
     d_c = d - c @ inverse @ b

@@ -269,7 +269,16 @@ def region(
         counts = [place for place, one in enumerate(free) if reaches_count(system, one)]
         if counts and (len(counts) == 2 or times or not affine or meant in BY_GROWTH):
             label = axes[counts[0]].free.label
-            what = f"{label} is a number of peers, which beside this axis, or by this criterion, has no steps"
+            why = (
+                "two numbers of peers"
+                if len(counts) == 2
+                else "a time beside it"
+                if times
+                else f"what is stable {BY_GROWTH[meant]}"
+                if meant in BY_GROWTH
+                else "a scene that is not linear"
+            )
+            what = f"{label} is a number of peers: no steps are drawn for {why}"
             raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {label}"))
         times += counts
         source: Source

@@ -24,6 +24,9 @@ from apc.vary.search import COUNT, SPAN, Crossing, Search, Told
 # So many counts from the lowest on are each looked at; then each is so many times the one before.
 EVERY, FURTHER = 32, 1.25
 
+# Without a limit, so many times the present count on graphs that aren't complete.
+PLACED_SPAN = 10
+
 # Strips of a region over a count.
 MOST_STRIPS = 200
 
@@ -49,7 +52,7 @@ def search_counts(
         The compiled scene, and a count of it or what counts follow from.
     limits
         The lowest and highest count, two; where not given, the least that a scene may have, and `SPAN` times
-        the present count.
+        the present count, `PLACED_SPAN` on a graph that isn't complete.
     present
         The present count.
     judge
@@ -73,13 +76,15 @@ def search_counts(
     of_group = any(free.name == group_count(group.name) for group in system.groups)
     others = system.peers - int(present) if of_group else 0
     first = _whole(low, max(1, least_peers(system.kinds) - others), place)
-    last = _whole(high, max(math.ceil(SPAN * present), first + 1), place)
+    placed = any(link.graph.shape != "complete" for link in system.links)
+    span = PLACED_SPAN if placed else SPAN  # there each peer has a place of its own
+    last = _whole(high, max(math.ceil(span * present), first + 1), place)
     known: dict[int, bool | None] = {}
 
     def at(count: int) -> bool | None:
         if count not in known:
             if told is not None:
-                told(f"{count:,}")
+                told(f"looking at {free.label} = {count:,}")
             known[count] = judge(apply(system, [Override(free, Fraction(count))]))
         return known[count]
 

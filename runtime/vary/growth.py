@@ -110,7 +110,8 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place, criterion: str
     if reaches_time(system, free) and free.name not in jitter:
         what = f"{free.label} can't be varied {BY_GROWTH[criterion]}: what happens when would change with it"
         if criterion == PASSIVE:
-            raise ApcError(Mistake("E930", place, what, hint="--hands clamped"))
+            hint = f'apc analyze --hands passive --set {free.label}="…", one value after the other'
+            raise ApcError(Mistake("E930", place, what, hint=hint))
         raise ApcError(Mistake("E898", place, what, hint=f"--in {NOMINAL}"))
     if criterion == PASSIVE and free.name in channel_numbers(system):
         what = f"{free.label} can't be varied with passive hands: every packet takes its nominal delay there"
@@ -280,7 +281,8 @@ def search_growth(
         whole=True,
         known=False,
         looked=len(known),
-        enters=len(radii) > 1,
+        # Beyond where clamped devices shake all values are one: they tell nothing of what enters.
+        enters=len(radii) > 1 or criterion == PASSIVE,
     )
 
 
