@@ -361,7 +361,7 @@ def _held_ports(scene: Scene, kind: SortedKind) -> tuple[_Port, ...]:
 
 
 def _answers(part: Part) -> bool:
-    """Say whether a hand answers to how it is moved; one that only pushes as it likes changes no stability."""
+    """Say whether a hand answers to how it is moved; one that only pushes changes no stability."""
     component = part.component
     moved = {
         (name, potential.name)
