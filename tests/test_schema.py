@@ -102,7 +102,7 @@ def test_all_that_the_language_has_fits() -> None:
         ("type: AveragePosition", "type: AveragePositon", "couplers/coordination/type"),
         ("{type: SampledSpringDamper, ", "{", "couplers/contact"),
         ("a: device", "a: [device]", "couplers/contact/a"),
-        ("a: device, ", "", "couplers/contact"),
+        ("a: device, b: cube, ", "", "couplers/contact"),
         ("haptic: 1 ms", "haptic: 1", "clocks/haptic"),
         ("haptic: 1 ms", "haptic: 1 mm", "clocks/haptic"),
         ("haptic: 1 ms", "2haptic: 1 ms", "clocks"),

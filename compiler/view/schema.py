@@ -87,7 +87,12 @@ def topology_schema(library: Library) -> Schema:
         "group": _group(),
         "part": _by_type({name: {"$ref": f"#/$defs/{name}"} for name in parts}),
         "joined_part": _by_type(
-            {c.name: {"required": [name for name, _ in c.connectors]} for c in components if c.connectors}
+            # The others may be what another part is joined to.
+            {
+                c.name: {"anyOf": [{"required": [n]} for n, _ in c.connectors]}
+                for c in components
+                if c.connectors
+            }
         ),
         "graph": _graph(),
         "delays": _named(_named(quantities.of(_unit("s")))),
