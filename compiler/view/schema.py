@@ -87,15 +87,9 @@ def topology_schema(library: Library) -> Schema:
         "group": _group(),
         "part": _by_type({name: {"$ref": f"#/$defs/{name}"} for name in parts}),
         "joined_part": _by_type(
-<<<<<<< HEAD
             # A connector that another part names may be left out, but hardly all of them.
             {
                 c.name: {"anyOf": [{"required": [name]} for name, _ in c.connectors]}
-=======
-            # The others may be what another part is joined to.
-            {
-                c.name: {"anyOf": [{"required": [n]} for n, _ in c.connectors]}
->>>>>>> rb
                 for c in components
                 if c.connectors
             }

@@ -314,15 +314,13 @@ def _on_circle(loops: _Loops, turn: NDArray[np.bool_], level: Floats) -> Floats:
     unit = np.eye(n)
     sign = np.where(turn, -1.0, 1.0)[:, None, None]
     a, b = sign * loops.a, sign * loops.bf
-    try:
-        inverse = np.linalg.inv(unit + a)
-    except np.linalg.LinAlgError:  # that end is a pole of some map: none of them is told of there
-        return np.full((count, 1), np.nan)
+    inverse, known = _inverse(unit + a)
     c, d = -2 * loops.b * loops.fc, 2 * loops.b * loops.f - np.eye(loops.f.shape[-1])
     a_c, b_c, c_c = inverse @ (a - unit), np.sqrt(2) * inverse @ b, np.sqrt(2) * c @ inverse
     d_c = d - c @ inverse @ b
     across = np.swapaxes(d_c, -1, -2)
-    r = np.linalg.inv(level[:, None, None] ** 2 * np.eye(d_c.shape[-1]) - across @ d_c)
+    r, told = _inverse(level[:, None, None] ** 2 * np.eye(d_c.shape[-1]) - across @ d_c)
+    known &= told  # a gain that is the same at all frequencies is at its level nowhere or everywhere
     a_h = a_c + b_c @ r @ across @ c_c
     lower = np.swapaxes(c_c, -1, -2) @ (np.eye(d_c.shape[-1]) + d_c @ r @ across) @ c_c
     whole = np.concatenate(
@@ -333,10 +331,20 @@ def _on_circle(loops: _Loops, turn: NDArray[np.bool_], level: Floats) -> Floats:
         axis=-2,
     )
     at = np.linalg.eigvals(whole)
-    on = (np.abs(at.real) <= ON_AXIS * np.abs(at)) & (at.imag >= 0)
+    on = (np.abs(at.real) <= ON_AXIS * np.abs(at)) & (at.imag >= 0) & known[:, None]
     angles = 2 * np.arctan(at.imag)
     found = np.sort(np.where(on, np.where(turn[:, None], np.pi - angles, angles), np.nan), axis=1)
     return found[:, : max(int(on.sum(axis=1).max(initial=0)), 1)]
+
+
+def _inverse(matrices: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the inverses of many matrices (k, n, n), and which of them have one; I for those without."""
+    try:
+        return np.linalg.inv(matrices), np.ones(len(matrices), dtype=np.bool_)
+    except np.linalg.LinAlgError:
+        known = np.linalg.matrix_rank(matrices) == matrices.shape[-1]
+        unit = np.eye(matrices.shape[-1])
+        return np.linalg.inv(np.where(known[:, None, None], matrices, unit)), known
 
 
 def _middles(angles: Floats) -> Floats:
