@@ -148,7 +148,7 @@ def test_mistakes_say_what_to_write() -> None:
         "E621 an override wants NAME=VALUE, got contact.stiffness. Write: contact.stiffness=800 N/m"
     )
     assert _message(system, "contact.stiffness=800") == (
-        "E204 contact.stiffness wants N/m, got 800 (no unit). Write: contact.stiffness: 800 N/m"
+        "E204 contact.stiffness wants N/m, got 800 (no unit). Write: contact.stiffness=800 N/m"
     )
     assert _message(system, "peers=4").startswith("E623 peers is the number of all peers")
     assert _message(system, "cube.mass=0 kg") == "E624 cube.mass wants more than 0 kg, got 0 kg."

@@ -404,3 +404,32 @@ def test_a_scene_unstable_clamped_is_proved_so_in_balls() -> None:
     mesh = passive_hands(compiled(MESH), certify=True)
     assert mesh.stable is False
     assert mesh.proof.startswith("with its devices clamped it is unstable: proved unstable with ")
+
+
+def test_a_region_that_begins_where_nothing_holds_the_copies_is_drawn_all_the_same() -> None:
+    """Without contact clamped devices hold no copy: there is no map at that edge, and there is beside it."""
+    system = compiled(AVERAGE)
+    axes = parse_axes(system, "contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:1500 N/m")
+    found = region(system, axes, criterion="passive", cells=4)
+    assert found.contains(1000.0, 457.0)
+    assert not found.contains(1000.0, 459.0)
+
+
+def test_a_range_without_a_crossing_says_what_it_is_and_not_that_nothing_matters() -> None:
+    found = critical(compiled(AVERAGE), "coordination.stiffness", lower="600 N/m", criterion="passive")
+    assert (found.value, found.enters, found.verdict) == (None, True, "unstable at every value scanned")
+    assert found.scanned[0] == 600.0
+
+
+def test_contacts_that_hands_may_close_are_named(tmp_path: Path) -> None:
+    """A wall that the device starts beside decides nothing, and the answer says so first."""
+    text = (
+        "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+        "masses: {device: {mass: 0.1 kg, damping: 1 N*s/m}}\n"
+        "couplers:\n  wall: {type: VirtualWall, flange: device, stiffness: 20000 N/m, clock: tick, "
+        "period: 1 ms}\n"
+        "hands: {push: {type: ConstantForce, flange: device, force: 1 N}}\n"
+    )
+    found = passive_hands(compiled(text))
+    assert found.left_out[-1].startswith("left out: wall")
+    assert "as at the start" in found.left_out[-1]

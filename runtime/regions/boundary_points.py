@@ -78,7 +78,7 @@ def cross(deciding: Deciding, stable: Floats, unstable: Floats, growth: Floats) 
         again = rest[out]
         if len(again):
             points[again] = spots[out]
-            _put(pairs, again, deciding.leading(points[again]))
+            _put(pairs, again, deciding.leading(just_inside(points[again])))
         rest = rest[~good]
         if not len(rest):
             break

@@ -56,6 +56,10 @@ ALIKE = 1e-11
 MOST_GAIN = 1e2
 
 
+# How far beside a pole, relatively, what is asked for at it is told.
+BESIDE = 1e-14
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Loops:
     """Scattering of many maps: S = 2 b (F − F C (z − A_s)⁻¹ B F) − 1, one a point (k, …)."""
@@ -72,7 +76,7 @@ class _Loops:
 
     def x(self, angles: Floats) -> Complexes:
         """Return X at one angle a point (k, n, m)."""
-        return np.linalg.solve(self.inner(angles), self.bf + 0j)
+        return _solved(self.inner(angles), self.bf + 0j)
 
     def s(self, x: Complexes) -> Complexes:
         """Return S (k, m, m) of X."""
@@ -204,8 +208,8 @@ class Peaks:
         v = at.vectors[:, :, -1:]
         turn = 1j * np.exp(1j * angle)[:, None, None]
         inner = np.swapaxes(loops.inner(angle), -1, -2)
-        ends = [np.swapaxes(np.linalg.solve(inner, np.swapaxes(loops.fc, -1, -2) + 0j), -1, -2)]
-        ends.append(-turn * np.swapaxes(np.linalg.solve(inner, np.swapaxes(ends[0], -1, -2)), -1, -2))
+        ends = [np.swapaxes(_solved(inner, np.swapaxes(loops.fc, -1, -2) + 0j), -1, -2)]
+        ends.append(-turn * np.swapaxes(_solved(inner, np.swapaxes(ends[0], -1, -2)), -1, -2))
         # What a change of the map is multiplied by from both sides, and how that changes with θ.
         t, t_angle = loops.f - loops.fc @ at.x, -loops.fc @ at.x_angle
         left, right = np.concatenate([ends[0], t], axis=-1), np.concatenate([at.x, t], axis=-2)
@@ -260,9 +264,9 @@ def _at(loops: _Loops, angle: Floats) -> _Height:
     """Return the gain at an angle each (k,)."""
     turn = 1j * np.exp(1j * angle)[:, None, None]
     inner = loops.inner(angle)
-    x = np.linalg.solve(inner, loops.bf + 0j)
-    x_angle = -turn * np.linalg.solve(inner, x)
-    x_bend = 1j * x_angle - 2 * turn * np.linalg.solve(inner, x_angle)
+    x = _solved(inner, loops.bf + 0j)
+    x_angle = -turn * _solved(inner, x)
+    x_bend = 1j * x_angle - 2 * turn * _solved(inner, x_angle)
     s, s_angle, s_bend = loops.s(x), -2 * loops.b * loops.fc @ x_angle, -2 * loops.b * loops.fc @ x_bend
     adjoint = np.swapaxes(s, -1, -2).conj()
     squares, vectors = np.linalg.eigh(adjoint @ s)
@@ -335,6 +339,15 @@ def _on_circle(loops: _Loops, turn: NDArray[np.bool_], level: Floats) -> Floats:
     angles = 2 * np.arctan(at.imag)
     found = np.sort(np.where(on, np.where(turn[:, None], np.pi - angles, angles), np.nan), axis=1)
     return found[:, : max(int(on.sum(axis=1).max(initial=0)), 1)]
+
+
+def _solved(matrices: Complexes, right: Complexes) -> Complexes:
+    """Solve many systems (k, n, n); of one that is singular, at a pole itself, a hair beside it."""
+    try:
+        return np.asarray(np.linalg.solve(matrices, right))
+    except np.linalg.LinAlgError:
+        aside = BESIDE * np.abs(matrices).max(axis=(-2, -1), keepdims=True, initial=1.0)
+        return np.asarray(np.linalg.solve(matrices + aside * np.eye(matrices.shape[-1]), right))
 
 
 def _inverse(matrices: Floats) -> tuple[Floats, NDArray[np.bool_]]:

@@ -25,7 +25,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
-from apc.hands.passivity import passive_growth
+from apc.hands.passivity import passive_growth, passive_hands
 from apc.moments.network import Growth, growth, unreliable
 from apc.network.nominal import channel_numbers
 from apc.vary.evaluator import reaches_time
@@ -281,8 +281,8 @@ def search_growth(
         whole=True,
         known=False,
         looked=len(known),
-        # Beyond where clamped devices shake all values are one: they tell nothing of what enters.
-        enters=len(radii) > 1 or criterion == PASSIVE,
+        # Beyond where clamped devices shake all values are one, and tell nothing of what enters.
+        enters=len(radii) > 1 or (criterion == PASSIVE and not passive_hands(system, prepared).why),
     )
 
 
