@@ -353,11 +353,11 @@ def _solved(matrices: Complexes, right: Complexes) -> Complexes:
 def _inverse(matrices: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the inverses of many matrices (k, n, n), and which of them have one; I for those without."""
     try:
-        return np.linalg.inv(matrices), np.ones(len(matrices), dtype=np.bool_)
+        return np.asarray(np.linalg.inv(matrices), np.float64), np.ones(len(matrices), dtype=np.bool_)
     except np.linalg.LinAlgError:
         known = np.linalg.matrix_rank(matrices) == matrices.shape[-1]
         unit = np.eye(matrices.shape[-1])
-        return np.linalg.inv(np.where(known[:, None, None], matrices, unit)), known
+        return np.asarray(np.linalg.inv(np.where(known[:, None, None], matrices, unit)), np.float64), known
 
 
 def _middles(angles: Floats) -> Floats:
