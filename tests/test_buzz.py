@@ -16,7 +16,7 @@ from apc.analysis.describing import Predicted, gain_of, load_of, predict
 from apc.analysis.opened import contact_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.simulation.buzz import _lines, buzz
+from apc.simulation.buzz import LET_GO, _lines, buzz
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
 AT_ONCE = ("delay: 8 ms}            # negligible", "delay: 0 ms}            # negligible")
@@ -221,3 +221,25 @@ def test_it_is_shown_where_it_is_asked_for(
     Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
     assert run(["analyze", "--buzz"]) == 1
     assert "E864 no buzz to predict: nothing touches" in capsys.readouterr().err
+
+
+PRESSED = """\
+topology: wall
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 1 N*s/m, x: 1 mm}}
+couplers:
+  wall: {type: VirtualWall, flange: device, stiffness: 5000 N/m, clock: haptic, period: 1 ms, x: 1 mm}
+hands: {push: {type: ConstantForce, flange: device, force: FORCE}}
+"""
+
+
+def test_a_load_that_pulls_away_lets_go_and_a_poor_prediction_is_called_one() -> None:
+    away = buzz(compiled(PRESSED.replace("FORCE", "-1 N")))
+    assert away.notes == (LET_GO,)
+    assert not away.lines
+    assert not away.settles
+    held = buzz(compiled(PRESSED.replace("FORCE", "1 N")))
+    assert held.predicted is not None
+    assert abs(held.lines[0].frequency_hz / held.predicted.frequency_hz - 1) > 0.2
+    assert any("far from what is predicted" in note for note in held.notes)

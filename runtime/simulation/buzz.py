@@ -41,6 +41,11 @@ Floats = NDArray[np.float64]
 # these seconds; and the part of it, at the end, that is measured.
 GROWTHS, SHORTEST, LONGEST, MEASURED = 40, 8.0, 80.0, 4
 
+# Below this share of the time nothing touches; from this far on, relatively, frequencies are far apart.
+TOUCHED, APART = 1e-3, 0.2
+
+LET_GO = "the loads hold no contact closed: what touched at the start has let go, and there is no buzz"
+
 # Peers whose contacts are measured; ticks of all peers that are played, some ten seconds' worth.
 MOST_PEERS, MOST_PLAYED = 20, 2 * 10**7
 
@@ -241,7 +246,11 @@ def _compare(
     steady = bounded and (quiet or abs(halves[1] - halves[0]) <= SETTLED * max(halves))
     lines = _lines(time, swing) if steady and not quiet else ()
     reason = "" if known else str(predicted)
-    notes = tuple(_notes(known, bounded=bounded, steady=steady, lines=lines))
+    if bounded and max(one.in_contact for one in contacts) < TOUCHED:
+        lines, steady = (), False
+        notes: tuple[str, ...] = (LET_GO,)
+    else:
+        notes = tuple(_notes(known, bounded=bounded, steady=steady, lines=lines))
     end = float(played.time[-1])
     return Buzz(topology, known, reason, end, bounded, steady, lines, contacts, notes)
 
@@ -258,6 +267,11 @@ def _notes(known: Predicted | None, *, bounded: bool, steady: bool, lines: Seque
         found.append(
             f"lines stand in the spectrum at {several}, none of which repeats another: one sinusoid says "
             "nothing of such a motion, and what was played counts"
+        )
+    if known and lines and abs(lines[0].frequency_hz / known.frequency_hz - 1) > APART:
+        found.append(
+            "what was played is far from what is predicted: the motion is no sinusoid, and what was played "
+            "counts"
         )
     if known and not known.attracts:
         found.append("the cycle predicted is one that motions leave: what swings less dies out, more grows")
