@@ -87,7 +87,7 @@ def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
         ({"device.mass": "0 kg"}, "override: E624 device.mass wants more than 0 kg, got 0 kg."),
         (
             {"device.mass": "1"},
-            "override: E204 device.mass wants kg, got 1 (no unit). Write: device.mass: 1 kg",
+            "override: E204 device.mass wants kg, got 1 (no unit). Write: device.mass=1 kg",
         ),
         (
             {"peers": "4"},
