@@ -31,7 +31,7 @@ STYLES = (
 )
 COLUMNS = 4  # panels beside each other
 PANEL, BAR = 2.4, 0.28  # inches: the width of a panel, the height of a bar
-FURTHER = 1.25  # times the longest bar that ends, to which one that doesn't is drawn at most
+FURTHER = 4.0  # times the longest bar that ends, to which one that does not is drawn at most
 LABEL = 24  # letters of a scheme's name in a line
 
 # A bar: its length, and whether it goes on beyond that; or a word where there is none.
