@@ -27,7 +27,7 @@ from apc.vary.critical import critical
 from tests.handled import Users, work
 from tests.joined import LIBRARY, MS, Group, Hands, Table, moved, radii
 from tests.random_hands import exceptions, tuned
-from tests.topologies import AVERAGE, MESH, compiled, library, replaced, wall
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced, wall
 
 
 def users(count: int, stiffness: float, text: str = AVERAGE) -> str:
@@ -398,6 +398,12 @@ def test_balls_prove_what_floats_say_and_never_the_opposite(stiffness: float, st
         assert bits.count(True) == 1, own.name
         proved.append(bits[0])
     assert all(proved) is stable
+
+
+def test_a_box_says_that_it_is_not_proved_in_balls(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--hands", "passive", "--certify", "--box", "contact.stiffness=±1%"]
+    assert run(["analyze", str(SCENES / "three-users-average.yaml"), *words]) == 1
+    assert "E930 --certify, --box and --hands passive don't go together" in capsys.readouterr().err
 
 
 def test_a_scene_unstable_clamped_is_proved_so_in_balls() -> None:

@@ -133,6 +133,9 @@ def _judge_passive(
         options = " and ".join((*asked, "--hands passive"))
         what = f"{options} don't go together: what hands can draw has no modes of its own"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
+    if box and certify:
+        what = "--certify, --box and --hands passive don't go together: a box is proved by bounded floats"
+        raise ApcError(Mistake("E930", Place("--certify"), what, hint="--box without --certify"))
     if box:
         from apc.analysis.box import parse_range
         from apc.answer import proved_box
