@@ -439,3 +439,13 @@ def test_contacts_that_hands_may_close_are_named(tmp_path: Path) -> None:
     found = passive_hands(compiled(text))
     assert found.left_out[-1].startswith("left out: wall")
     assert "as at the start" in found.left_out[-1]
+
+
+def test_a_hand_of_the_library_says_where_its_usual_values_stand_for_its_range(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ["critical", "contact.stiffness", str(SCENES / "three-users-average.yaml")]
+    assert run([*words, "--hands", "StylusArmForward", "--upper", "900 N/m"]) == 0
+    assert "note: StylusArmForward by its usual values" in capsys.readouterr().err
+    assert run([*words, "--hands", "clamped", "--upper", "900 N/m"]) == 0
+    assert "usual values" not in capsys.readouterr().err

@@ -20,6 +20,8 @@ from apc.cli.options import (
     hands_option,
     in_option,
     json_option,
+    note_aside,
+    note_usual,
     print_result,
     set_option,
     tell,
@@ -76,7 +78,8 @@ def compare_command(
     if out is not None:
         check_result_path(out)
     asked = criterion_with(hands, criterion)
-    systems = [open_scene(file, settings, {"--out": out}, hands=hands) for file in files]
+    note_usual(hands)
+    systems = [open_scene(file, settings, {"--out": out}, hands=hands, told=note_aside) for file in files]
     with status_line() as told:
         found = compare(systems, over=over, criterion=asked, told=told)
     if out is not None:

@@ -20,6 +20,7 @@ from apc.cli.options import (
     in_option,
     json_option,
     note_aside,
+    note_usual,
     print_result,
     set_option,
 )
@@ -64,6 +65,7 @@ def critical_command(
 
     _check_order(path, file)
     asked = criterion_with(hands, criterion)
+    note_usual(hands)
     system = open_scene(file, settings, hands=hands, told=note_aside)
     with status_line() as told:
         found = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)

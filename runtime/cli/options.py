@@ -123,6 +123,14 @@ def note_aside(text: str) -> None:
     tell(f"note: {text}", err=True)
 
 
+def note_usual(hands: str) -> None:
+    """Say of a hand of the library that its usual values stand for the range that was measured."""
+    from apc.frame.devices import HANDS
+
+    if hands not in HANDS:
+        note_aside(f"{hands} by its usual values; apc analyze takes the range that was measured")
+
+
 def tell(text: str, *, err: bool = False) -> None:
     """Print a text, with characters that would act on the terminal written out."""
     click.echo(visible(text), err=err)

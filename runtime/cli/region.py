@@ -23,6 +23,7 @@ from apc.cli.options import (
     in_option,
     json_option,
     note_aside,
+    note_usual,
     print_result,
     set_option,
     tell,
@@ -111,6 +112,7 @@ def region_command(
         raise ApcError(Mistake("E907", Place("region"), what))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
     asked = criterion_with(hands, criterion)
+    note_usual(hands)
     systems = [
         open_scene(one, settings, {"--out": out}, hands=hands, told=note_aside) for one in (file, *compare)
     ]

@@ -25,6 +25,7 @@ from apc.cli.options import (
     in_option,
     json_option,
     note_aside,
+    note_usual,
     print_result,
     set_option,
     tell,
@@ -106,6 +107,7 @@ def sweep_command(
     waiting = Patience(_seconds(patience), lambda text: tell(text, err=True))
     values = _values(over)
     asked = criterion_with(hands, criterion)
+    note_usual(hands)
     system = open_scene(file, settings, {"--out": out}, hands=hands, told=note_aside)
     with _progress(out) as progress:
         result = sweep(
