@@ -8,7 +8,8 @@ source                      nodes, yaml_faults, compose: YAML to nodes; reading:
 language                    expression, lexer, grammar: text to trees; evaluation: trees to formulas and
                             values
                             dimensions, unit_grammar, unit_names, units, unit_text, unit_check; vectors
-                            values, tables, recordings: numbers of a scene, and in CSV files
+                            values, tables, recordings: numbers of a scene, and in CSV files;
+                            probes: of what ping and irtt wrote
 components                  component, parts, declarations, component_check, definitions, library
 scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
                             studies: a section each; scene: all of them

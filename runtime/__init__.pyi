@@ -33,6 +33,9 @@ from .api import (
     critical as critical,
 )
 from .api import (
+    describe_network as describe_network,
+)
+from .api import (
     feel as feel,
 )
 from .api import (
@@ -90,6 +93,7 @@ from .compiler.errors import ApcError as ApcError
 from .hands.feel import Feel as Feel
 from .hands.passivity import PassiveHands as PassiveHands
 from .moments.network import NetworkVerdict as NetworkVerdict
+from .network.recorded import NetworkRecording as NetworkRecording
 from .regions.region import Region as Region
 from .simulation.buzz import Buzz as Buzz
 from .simulation.trajectory import Trajectory as Trajectory

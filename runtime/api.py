@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from apc.hands.feel import Feel
     from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
+    from apc.network.recorded import NetworkRecording
     from apc.regions.region import Region
     from apc.simulation.buzz import Buzz
     from apc.simulation.trajectory import Trajectory
@@ -315,6 +316,34 @@ def feel(
     from apc.hands import feel as felt
 
     return felt.feel(_model(model, set), frequencies, at=at, between=between, unstable=unstable)
+
+
+def describe_network(recording: str | Path, *, interval: str | None = None) -> NetworkRecording:
+    """Say what a recorded network amounts to, as a link's own keys.
+
+    Parameters
+    ----------
+    recording
+        A file that ping or `irtt client -o` wrote, or a CSV table with a column `delay [ms]`.
+    interval
+        A time such as "8 ms" between two packets, where the file doesn't say.
+
+    Returns
+    -------
+    NetworkRecording
+        The share lost with its interval, bursts, delays, the nearest law of a jitter; printed, the link's
+        entry.
+
+    Raises
+    ------
+    ApcError
+        The file is none of these.
+    """
+    from apc.network import recorded
+    from apc.option_value import option_value
+
+    between = None if interval is None else option_value("interval=", interval, what="a time", unit="s")
+    return recorded.describe(recording, None if between is None else float(between))
 
 
 def judge_network(

@@ -25,7 +25,7 @@ HOUSE = (
         "apc.compiler.language",
         """
         expression lexer grammar evaluation dimensions unit_grammar unit_names units unit_text
-        unit_check vectors values tables recordings
+        unit_check vectors values tables probes recordings
         """,
     ),
     ("apc.compiler.components", "component parts declarations component_check definitions library"),
@@ -58,7 +58,7 @@ HOUSE = (
         lift ports batch_lift course residues
         """,
     ),
-    ("apc.network", "philox channel nominal timetable"),
+    ("apc.network", "philox channel nominal timetable recorded"),
     (
         "apc.eigen",
         """
@@ -118,16 +118,18 @@ HOUSE = (
     (
         "apc.present",
         """
-        forms pictures network hands analysis vary comparison_picture comparison region_picture region
-        planar simulation still recording bench
-        """,
+        forms pictures network recorded_network hands analysis vary comparison_picture comparison
+        region_picture region planar simulation still recording bench """,
     ),
     # what a person calls
     (
         "apc",
         "inputs api",
     ),
-    ("apc.cli", "options progress region simulate sweep compare critical feel bench analyze commands"),
+    (
+        "apc.cli",
+        "options progress region simulate sweep compare critical feel bench analyze network commands",
+    ),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())

@@ -32,7 +32,7 @@ E203 compiler/components compiler/scene compiler/source: a value has another for
 E204 compiler/components compiler/language runtime/regions: a quantity has another unit than is due
 E205 compiler/components compiler/scene compiler/source: a name is taken, or a word of the language
 E206 compiler/components compiler/language compiler/scene: a name names nothing that is there
-E207 compiler/language compiler/scene: a number is out of its bounds
+E207 compiler/language compiler/scene runtime/cli: a number is out of its bounds
 E208 compiler/components compiler/scene: a number of peers or parts, or of numbers for them, does not fit
 E209 compiler/language: parameters depend on one another in a circle
 E210 compiler/components compiler/equations compiler/scene: a connector is joined to what it can't be

@@ -1,4 +1,4 @@
-"""What was recorded of a quantity or of packets: time tables and traces in CSV files.
+"""What was recorded of a quantity or of packets: time tables, traces, what ping and irtt wrote.
 
 Takes: a path. Gives: `TimeTable`, `Trace`, in SI.
 Guarantees: times rise; a delay is 0 or more, or says that its packet was lost; a mistake names its file, line
@@ -19,11 +19,14 @@ from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.tables import MOST_MISTAKES, Headings, open_table, read_table
+from apc.compiler.language.probes import read_probe
+from apc.compiler.language.tables import MOST_MISTAKES, Headings, open_table, read_bytes, read_table
 from apc.compiler.language.units import NO_UNIT, Unit
 from apc.compiler.source.reading import brief
 
 DELAY = "delay"  # the column of a trace that is read
+TABLE_SUFFIX = ".csv"  # a file of another suffix may be what ping or irtt wrote
+RECORDINGS = "packets as ping or irtt wrote them, or a table with a column delay [ms]"
 LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with nothing in it
 
 
@@ -75,17 +78,21 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeT
 class Trace:
     """Recorded one-way delays: `delays` (n,) in seconds, one a packet, infinite for one that was lost.
 
-    `digest` is the SHA-256 of the file's bytes.
+    `digest` is the SHA-256 of the file's bytes; `program` wrote it, "" for a table; `interval` lies between
+    two packets, in seconds, not a number where the file doesn't say.
     """
 
     delays: NDArray[np.float64]
     digest: str
+    program: str = ""
+    interval: float = math.nan
 
 
 def read_trace(path: Path, named_at: Place) -> Trace:
     """Read the column `delay` of a CSV file: 0 or more a packet; `lost`, or nothing, if it was lost.
 
-    Other columns may say anything. A line without a character is no packet.
+    Other columns may say anything. A line without a character is no packet. What ping or irtt wrote is read
+    as `probes` tells.
 
     Parameters
     ----------
@@ -100,6 +107,13 @@ def read_trace(path: Path, named_at: Place) -> Trace:
         E701 it can't be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is at
         fault, or there is none.
     """
+    if path.suffix.lower() != TABLE_SUFFIX:
+        data, digest = read_bytes(path, named_at)
+        text = data.decode("utf-8-sig")
+        if (probe := read_probe(text)) is not None:
+            return Trace(probe.delays, digest, probe.program, probe.interval)
+        if DELAY not in text.partition("\n")[0]:
+            raise ApcError(Mistake("E702", Place(str(path), 1, 1), "a recording", RECORDINGS))
     mistakes = Mistakes()
     delays = array("d")
     with open_table(path, named_at, known=(DELAY,)) as opened:

@@ -1,6 +1,7 @@
 """Tables in CSV files: columns with their units in the headings.
 
-Takes: a path. Gives: `read_table`, a `Table` in SI; `open_table`, for files not all of numbers; `NamedFiles`.
+Takes: a path. Gives: `read_table`, a `Table` in SI; `open_table`, `read_bytes`, for files not all of numbers;
+`NamedFiles`.
 Guarantees: every cell is a finite number, or a mistake names its file, line and column; of a file that is no
 table no text is told, as it may be somebody's; a number takes eight bytes.
 Does not: know what a column means.
@@ -9,9 +10,11 @@ Does not: know what a column means.
 from __future__ import annotations
 
 import csv
+import gzip
 import hashlib
 import io
 import re
+import zlib
 from array import array
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -30,6 +33,7 @@ from apc.compiler.language.units import NO_UNIT, Unit, parse_unit
 from apc.compiler.source.reading import brief
 
 MAX_BYTES = 1 << 26  # 64 MiB: some eight million numbers, read in a few seconds
+PACKED = ".gz"  # the suffix of what gzip packed
 MOST_COLUMNS = 1000  # more than a scene has parameters that differ from peer to peer
 MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\[\]]*\Z")
@@ -170,13 +174,13 @@ def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iter
         E701 it can't be read, E702 its headings; E703 its rows are no CSV. What the body raises passes, but
         of a file that does not begin as a table does only that is told: its text may be somebody's.
     """
-    data = _bytes(path, named_at)
+    data, digest = read_bytes(path, named_at)
     file = str(path)
     rows: Reader = csv.reader(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig"))
     first: list[str] = []
     try:
         first = next(rows, [])
-        yield Opened(file, hashlib.sha256(data).hexdigest(), _headings(first, file), rows)
+        yield Opened(file, digest, _headings(first, file), rows)
     except csv.Error as error:
         raise ApcError(Mistake("E703", Place(file, rows.line_num or 1, 1), f"is no CSV: {error}")) from None
     except ApcError:
@@ -196,9 +200,24 @@ def _is_table(headings: list[str], known: Collection[str]) -> bool:
     )
 
 
-def _bytes(path: Path, named_at: Place) -> bytes:
+def read_bytes(path: Path, named_at: Place) -> tuple[bytes, str]:
+    """Return a file's bytes, unpacked if it is called .gz, and the SHA-256 of those on disk.
+
+    Raises
+    ------
+    ApcError
+        E701 it can't be read, or isn't UTF-8 text all of it.
+    """
     try:
         data = read_file(path, MAX_BYTES)
+        digest = hashlib.sha256(data).hexdigest()
+        if path.suffix.lower() == PACKED:
+            with gzip.open(io.BytesIO(data)) as packed:
+                data = packed.read(MAX_BYTES + 1)
+            if len(data) > MAX_BYTES:
+                raise ApcError(
+                    Mistake("E701", named_at, f"{path.name} unpacks to more than {MAX_BYTES >> 20} MiB")
+                )
         data.decode("utf-8-sig")  # all of it: what decodes piece by piece counts from where it is
     except RefusedError as refused:
         raise ApcError(Mistake("E701", named_at, f"the table {path} {refused.words}")) from None
@@ -206,7 +225,9 @@ def _bytes(path: Path, named_at: Place) -> bytes:
         raise ApcError(
             Mistake("E701", named_at, f"{path.name} is not UTF-8 text (byte {error.start})")
         ) from None
-    return data
+    except (OSError, EOFError, zlib.error):
+        raise ApcError(Mistake("E701", named_at, f"{path.name} is no whole gzip file")) from None
+    return data, digest
 
 
 def _headings(texts: list[str], file: str) -> Headings:

@@ -128,7 +128,7 @@ def deviates(distribution: str, one: Floats, two: Floats) -> Floats:
     ----------
     distribution
         "uniform": evenly from −1 to 1; "normal": of mean 0 and standard deviation 1; "pareto": netem's, from
-        −2/3 to 4, many a little early and few very late, of mean −0.033 and standard deviation 0.84.
+        −2/3 to 4, many a little early and few very late, of mean −0.033 and standard deviation 0.821.
     one, two
         Independent numbers (n,) from 0 to less than 1.
     """
