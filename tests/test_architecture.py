@@ -106,6 +106,7 @@ HOUSE = (
         """,
     ),
     ("apc", "answer"),
+    ("apc.loop", "packets realtime device peer run start beside"),
     ("apc.comparison", "effort choice comparison"),
     (
         "apc.regions",
@@ -118,7 +119,7 @@ HOUSE = (
     (
         "apc.present",
         """
-        forms pictures network recorded_network hands analysis vary comparison_picture comparison
+        forms pictures network recorded_network loop hands analysis vary comparison_picture comparison
         region_picture region planar simulation still recording bench """,
     ),
     # what a person calls
@@ -128,7 +129,7 @@ HOUSE = (
     ),
     (
         "apc.cli",
-        "options progress region simulate sweep compare critical feel bench analyze network commands",
+        "options progress region simulate sweep compare critical feel bench analyze network play commands",
     ),
     ("apc", "__main__"),
 )

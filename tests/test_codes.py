@@ -186,6 +186,13 @@ E935 runtime/hands: a frequency is none that a response is told of, or nothing t
 E936 runtime/hands: a device is named that is not there
 E940 runtime/comparison: what is to be compared is no stiffness, delay or loss
 E941 runtime/comparison: a scene has several stiffnesses, delays or losses to compare
+E960 runtime/loop: there is no such peer
+E961 runtime/loop runtime/cli: a peer has no address, or it is none
+E962 runtime/loop: nobody told a peer when its scene begins
+E963 runtime/loop runtime/cli: a folder is no run, or can't be one
+E964 runtime/loop runtime/cli: a peer can't listen there, or its secret is none
+E965 runtime/loop: a scene has more peers than processes, or one of these was lost
+E966 runtime/loop: a device outside has no function, or that is at fault
 """
 
 

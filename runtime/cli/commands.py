@@ -20,6 +20,7 @@ from apc.cli.critical import critical_command
 from apc.cli.feel import feel_command
 from apc.cli.network import network_command
 from apc.cli.options import Group, beside, file_argument, file_option, tell
+from apc.cli.play import play_command
 from apc.cli.progress import at_work
 from apc.cli.region import region_command
 from apc.cli.simulate import simulate_command
@@ -72,6 +73,7 @@ def apc() -> None:
         apc region         where it is stable over two parameters: curves, areas
         apc sweep          any of it at many values of some parameters
         apc network        what a recording of ping or irtt amounts to
+        apc play           the same in real time, over a network
         apc show           what the scene is made of, as text or a picture
 
     Without FILE a command takes the only topology of the folder.
@@ -85,6 +87,7 @@ apc.add_command(critical_command)
 apc.add_command(feel_command)
 apc.add_command(simulate_command)
 apc.add_command(network_command)
+apc.add_command(play_command)
 apc.add_command(region_command)
 apc.add_command(sweep_command)
 

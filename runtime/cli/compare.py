@@ -65,11 +65,17 @@ def compare_command(
     (To lay the stable regions of scenes over each other: apc region
     --compare.)
 
+    A folder NAME.run of `apc play` is laid beside what simulate and analyze
+    say for the delays and losses that were measured.
+
     \b
         apc compare average.yaml mesh.yaml --set "lan.delay=16 ms" \\
                     --out schemes.svg
     """
     start_single_threaded()
+    if len(files) == 1 and Path(files[0]).is_dir():
+        _compare_run(Path(files[0]), as_json=as_json)
+        return
     from apc.comparison.comparison import compare
     from apc.inputs import open_scene
     from apc.present.comparison import write_comparison
@@ -87,3 +93,11 @@ def compare_command(
     print_result(found, as_json=as_json, err=beside(out))
     if out is not None and not as_json:
         tell(f"\n{out} is written", err=beside(out))
+
+
+def _compare_run(folder: Path, *, as_json: bool) -> None:
+    """Lay a run of `apc play` beside what is said of its scene."""
+    from apc.loop.beside import compare_run
+    from apc.loop.run import read_run
+
+    print_result(compare_run(read_run(folder)), as_json=as_json)

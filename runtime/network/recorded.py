@@ -1,6 +1,6 @@
 """What a recording of packets amounts to, and the keys of a link that say so.
 
-Takes: recorded delays. Gives: `NetworkRecording`, `describe`, `Share`, `Law`.
+Takes: recorded delays. Gives: `NetworkRecording`, `describe`, `describe_delays`, `Share`, `Law`.
 Guarantees: a share has an interval that holds its probability in 95 of 100 recordings (Clopper and Pearson
 1934), whatever that is; what a link's keys can't say of the recording stands in `left_out`.
 Does not: judge a scene (see `moments`).
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from apc.compiler.errors import Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.probes import HALVED
-from apc.compiler.language.recordings import Trace, read_trace
+from apc.compiler.language.recordings import read_trace
 from apc.network.channel import LATEST, deviates
 from apc.result import Result
 
@@ -123,7 +123,23 @@ def describe(path: str | Path, interval: float | None = None) -> NetworkRecordin
     """
     trace = read_trace(Path(path), Place(str(path)))
     between = trace.interval if interval is None else interval
-    delays = trace.delays
+    return describe_delays(trace.delays, str(path), program=trace.program, interval=between)
+
+
+def describe_delays(
+    delays: Floats, name: str, *, program: str = "", interval: float = math.nan
+) -> NetworkRecording:
+    """Say what recorded delays amount to.
+
+    Parameters
+    ----------
+    delays
+        Of each packet (n,), in seconds, infinite for one that was lost.
+    name, program
+        What they are called, and the program that recorded round trips, if one did.
+    interval
+        What lies between two packets, in seconds, not a number where that isn't known.
+    """
     gone = np.isinf(delays)
     arrived = delays[~gone]
     after, before = gone[1:], gone[:-1]
@@ -135,11 +151,11 @@ def describe(path: str | Path, interval: float | None = None) -> NetworkRecordin
     law = _law(arrived)
     runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], gone, [False]]))))[::2]
     return NetworkRecording(
-        file=str(path),
-        program=trace.program,
+        file=name,
+        program=program,
         packets=len(delays),
-        interval=between,
-        left_out=_left_out(trace, law, correlation, bool(len(arrived)), between),
+        interval=interval,
+        left_out=_left_out(program, len(delays), law, correlation, interval),
         lost=lost,
         turns_bad=turns_bad,
         turns_good=turns_good,
@@ -154,25 +170,25 @@ def describe(path: str | Path, interval: float | None = None) -> NetworkRecordin
             (share, _quantile(arrived, share)) for share in QUANTILES if len(arrived) * (1 - share) >= LATER
         ),
         correlation=correlation,
-        overtaken=None if math.isnan(between) else _overtaken(delays, between),
+        overtaken=None if math.isnan(interval) else _overtaken(delays, interval),
         law=law,
         delays=delays,
     )
 
 
 def _left_out(
-    trace: Trace, law: Law | None, correlation: float, some: bool, between: float
+    program: str, packets: int, law: Law | None, correlation: float, between: float
 ) -> tuple[str, ...]:
     """Return what the keys of a link say nothing of, or take for granted."""
-    told = [HALVED] if trace.program else []
-    if not some:
+    told = [HALVED] if program else []
+    if law is None:
         return (*told, "every packet was lost: nothing is known of delays")
-    if law is not None and abs(correlation) > 0:
+    if correlation:
         told.append(
             f"delays follow one another (correlation {correlation:.2f} from packet to packet), and a jitter "
             "is drawn for each packet on its own; a trace has them as they were"
         )
-    if law is not None and law.distance > MISFIT / math.sqrt(trace.delays.size):
+    if law.distance > MISFIT / math.sqrt(packets):
         told.append(
             "delays are spread as none of the distributions that a jitter can have; a trace has them as they "
             "were"

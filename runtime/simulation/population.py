@@ -1,7 +1,8 @@
 """All peers of a scene over one frame: each one's program, and what they hear of each other.
 
 Takes: a `CompiledSystem`, who hears whom, and the members, with their programs.
-Gives: `Population`, `build_population`; `Played`, `Player`; `exchanges_within`, `refuse_unheard_of`.
+Gives: `Population`, `build_population`; `Played`, `Player`; `exchanges_within`, `instants_within`,
+`refuse_unheard_of`.
 Guarantees: what many peers have in common is kept once.
 Does not: play it (see `stepwise`, `machine`).
 
@@ -95,6 +96,19 @@ def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
         if sent in slots
     }
     return tuple(sorted(instants.union(*(_looks(schedule) for schedule in schedules))))
+
+
+def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
+    """Return the instants, in quanta, at which anything is computed or sent within the frame."""
+    found = set()
+    for schedule in schedules:
+        now = 0
+        for event in schedule.events:
+            if isinstance(event, Propagate):
+                now += event.duration
+            else:
+                found.add(now)
+    return tuple(sorted(found))
 
 
 def _looks(schedule: Schedule) -> set[int]:

@@ -61,13 +61,15 @@ class Layout:
 class Segment:
     """A stretch of the frame: `kernel` is the function above; `heard`, `sent` are rows of the schedule.
 
-    After those rows the kernel hears what comes of each of `pairs`.
+    After those rows the kernel hears what comes of each of `pairs`. `held` are the rows of the carry after it
+    with what each hold puts out then, −1 for what was never computed.
     """
 
     kernel: Any  # casadi.Function
     heard: tuple[int, ...]
     pairs: tuple[Pairwise, ...]
     sent: tuple[int, ...]
+    held: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)

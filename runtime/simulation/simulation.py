@@ -37,6 +37,7 @@ from apc.simulation.population import (
     Population,
     build_population,
     exchanges_within,
+    instants_within,
     refuse_unheard_of,
 )
 from apc.simulation.program import Member, Program, build_member
@@ -142,7 +143,12 @@ class Simulation:
 
 @part("prepare")
 def prepare(
-    system: CompiledSystem, settings: Settings, *, signals: Sequence[str] = (), runs: int = 1
+    system: CompiledSystem,
+    settings: Settings,
+    *,
+    signals: Sequence[str] = (),
+    runs: int = 1,
+    live: bool = False,
 ) -> Simulation:
     """Do what comes before the first instant.
 
@@ -156,6 +162,8 @@ def prepare(
         Patterns of the signals to record, all if there is none; see `signals.choose`.
     runs
         How many runs will stand side by side; it decides how machine code is made, not what comes out.
+    live
+        Whether it will be played instant by instant, as what is heard at one is known no sooner.
 
     Raises
     ------
@@ -168,7 +176,7 @@ def prepare(
     with finite_equations(system.name):
         plan = _plan(system, settings.method)
         choices = _choices(plan, signals)
-        members = _members(plan, choices, settings.method)
+        members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
     schedule = plan.schedules[0]
     marks = schedule.marks[:-1]
@@ -287,11 +295,11 @@ def _choices(plan: _Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
     return choices
 
 
-def _members(plan: _Plan, choices: Sequence[Choice], method: Method) -> list[Member]:
+def _members(plan: _Plan, choices: Sequence[Choice], method: Method, *, live: bool) -> list[Member]:
     """Return the groups as members of a population, those peers that are recorded apart from the others."""
     system, numbers, flows = plan.system, plan.numbers, plan.flows
     linear = [rates(kind, flow.rows if flow else ()) for kind, flow in zip(system.kinds, flows, strict=True)]
-    cuts = exchanges_within(plan.schedules)
+    cuts = instants_within(plan.schedules) if live else exchanges_within(plan.schedules)
     programs: dict[Any, Program] = {}
     members = []
     groups = zip(system.groups, plan.schedules, choices, strict=True)

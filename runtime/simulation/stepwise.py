@@ -1,7 +1,7 @@
 """All peers' frames one by one: CasADi's virtual machine moves the peers, NumPy what they hear.
 
 Takes: a `Population`, the packets of its unreliable links.
-Gives: `Stepwise`.
+Gives: `Stepwise`, `Told`.
 Guarantees: any kernel can be played, solvers too; a frame that can't be is told, and those before are kept.
 Does not: run fast: where there is a compiler and every kernel is straight code, see `machine`.
 """
@@ -11,12 +11,12 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.network.timetable import START, Seen, Timetable
+from apc.network.timetable import START, Seen
 from apc.simulation.hearing import Complete, Deliver, Look, OnWays, Operation, Sparse, Total, Weighed
 from apc.simulation.population import Played, Population
 from apc.simulation.program import Member, Segment, seconds_at
@@ -29,12 +29,24 @@ MOST_SEEN = 2**20  # packets that ticks see, drawn at once
 JOINS = {"max": np.fmax, "min": np.fmin}
 
 
+class Told(Protocol):
+    """What says which packets the ticks of each route see, as a `Timetable` does; time only goes forward."""
+
+    def take(self, until: int) -> tuple[Seen, ...]:
+        """Return what each route's ticks see, from where the last call ended to before `until`, in quanta."""
+
+
 class Stepwise:
     """The memory of all peers, and what moves them in it, one run at a time."""
 
     runs = 1
 
-    def __init__(self, population: Population, timetable: Callable[[int], Timetable] | None) -> None:
+    def __init__(
+        self,
+        population: Population,
+        timetable: Callable[[int], Told] | None,
+        moving: Sequence[int] | None = None,
+    ) -> None:
         """Make the memory.
 
         Parameters
@@ -43,8 +55,11 @@ class Stepwise:
             All peers.
         timetable
             Gives the packets of a run; None if every link is reliable.
+        moving
+            The members that are moved, all if not given: those who play the others bring their packets.
         """
         self.population, self.timetable = population, timetable
+        self.moving = tuple(range(len(population.members)) if moving is None else moving)
         self.segments = [[_Moving(m, one) for one in m.program.segments] for m in population.members]
         # Of each member the rows of its carry that are the work done, and which parts these are.
         layouts = [m.program.layout for m in population.members]
@@ -107,33 +122,49 @@ class Stepwise:
         """Play one frame; `rows` (marks, width) are filled in."""
         population, hearing = self.population, self.population.hearing
         marks, pushed = [0] * len(population.members), [0] * len(population.members)
+        for index in range(len(hearing.segments)):
+            self._segment(number, index, seen, rows, pushes, marks, pushed)
+
+    def _segment(
+        self,
+        number: int,
+        index: int,
+        seen: tuple[Seen, ...],
+        rows: Floats,
+        pushes: Sequence[Floats | None],
+        marks: list[int],
+        pushed: list[int],
+    ) -> None:
+        """Play a segment of a frame; `marks` and `pushed` count each member's rows and impulses so far."""
+        population, hearing = self.population, self.population.hearing
         now = self.packets[number % hearing.ring]
-        for index, operations in enumerate(hearing.segments):
-            heard = [
-                np.empty((one[index].heard, member.count))
-                for one, member in zip(self.segments, population.members, strict=True)
-            ]
-            for operation in operations:
+        heard = [
+            np.empty((one[index].heard, member.count))
+            for one, member in zip(self.segments, population.members, strict=True)
+        ]
+        for operation in hearing.segments[index]:
+            if isinstance(operation, Total | Deliver) or operation.member in self.moving:
                 self._hear(operation, number, heard, seen)
-            for g, member in enumerate(population.members):
-                moving, program = self.segments[g][index], member.program
-                push = pushes[g]
-                own = np.empty((0, member.count))
-                if push is not None:
-                    own = push[pushed[g] : pushed[g] + moving.impulses][:, member.rows]
-                pushed[g] += moving.impulses
-                after, sent, recorded = moving.move(self.carries[g], heard[g], own, number)
-                self.carries[g] = after
-                columns = slice(int(hearing.first[g]), int(hearing.first[g + 1]))
-                for row, one in zip(program.segments[index].sent, sent, strict=True):
-                    now[hearing.sent[g][row], columns] = one
-                if program.recorded:
-                    height = len(recorded) // len(program.recorded)
-                    to = slice(
-                        population.columns[g], population.columns[g] + len(program.recorded) * member.count
-                    )
-                    rows[marks[g] : marks[g] + height, to] = recorded.reshape(height, to.stop - to.start)
-                    marks[g] += height
+        for g in self.moving:
+            member = population.members[g]
+            moving, program = self.segments[g][index], member.program
+            push = pushes[g]
+            own = np.empty((0, member.count))
+            if push is not None:
+                own = push[pushed[g] : pushed[g] + moving.impulses][:, member.rows]
+            pushed[g] += moving.impulses
+            after, sent, recorded = moving.move(self.carries[g], heard[g], own, number)
+            self.carries[g] = after
+            columns = slice(int(hearing.first[g]), int(hearing.first[g + 1]))
+            for row, one in zip(program.segments[index].sent, sent, strict=True):
+                now[hearing.sent[g][row], columns] = one
+            if program.recorded:
+                height = len(recorded) // len(program.recorded)
+                to = slice(
+                    population.columns[g], population.columns[g] + len(program.recorded) * member.count
+                )
+                rows[marks[g] : marks[g] + height, to] = recorded.reshape(height, to.stop - to.start)
+                marks[g] += height
 
     def _packet(self, number: int, key: int, lag: int) -> Floats:
         return np.asarray(self.packets[(number - lag) % self.population.hearing.ring, key])
@@ -152,7 +183,7 @@ class Stepwise:
             case Weighed(g, place, key, lag, weights):
                 heard[g][place] = _weighed(weights, self._packet(number, key, lag))
             case Deliver(route, tick):
-                self._deliver(route, seen[route], tick)
+                self._deliver(route, *self._sees(route, tick, seen))
             case OnWays(g, place, route, channel, gap, weights):
                 gone = self.missing[route]
                 what = gone.astype(np.float64) if gap else np.where(gone, 0.0, self.held[route][channel])
@@ -160,14 +191,18 @@ class Stepwise:
             case Look():
                 heard[one.member][one.row] = self._look(one, number)
 
-    def _deliver(self, place: int, seen: Seen, tick: int) -> None:
+    def _sees(self, place: int, tick: int, seen: tuple[Seen, ...]) -> tuple[Integers, Flags]:
+        """Return the packets that a tick sees on a route, and which are missing."""
+        return seen[place].packets[tick], seen[place].missing[tick]
+
+    def _deliver(self, place: int, packets: Integers, missing: Flags) -> None:
         """Bring in effect what a tick sees on a route."""
         hearing, route = self.population.hearing, self.population.hearing.routes[place]
         if route.zero:
-            self.missing[place] = seen.missing[tick]
-        new = np.flatnonzero(seen.packets[tick] != self.effective[place])
-        self.effective[place] = seen.packets[tick]
-        numbers = seen.packets[tick][new]
+            self.missing[place] = missing
+        new = np.flatnonzero(packets != self.effective[place])
+        self.effective[place] = packets
+        numbers = packets[new]
         keys = hearing.channels[place][:, numbers % route.slots]
         columns = hearing.column_of[route.pairs[new, 0]]
         self.held[place][:, new] = self.packets[numbers // route.slots % hearing.ring, keys, columns]

@@ -181,7 +181,9 @@ class _Writer:
             ["carry_after", "sent", "rows"],
         )
         assert not last or len(self.keys) == layout.size
-        return Segment(kernel, tuple(heard_rows), tuple(pairs.values()), tuple(sorted(self.sent)))
+        puts_out = [self.schedule.acting[h] if last else ("u", h) for h in range(len(self.kind.holds))]
+        held = tuple(-1 if one is None else self.keys.index(one) for one in puts_out)
+        return Segment(kernel, tuple(heard_rows), tuple(pairs.values()), tuple(sorted(self.sent)), held)
 
     def _pairs(self, now: int, tick: Tick) -> dict[Any, Pairwise]:
         """Return what a tick hears pair by pair, by (tick, receive): what matters of x, u, m and p."""

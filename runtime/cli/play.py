@@ -1,0 +1,186 @@
+"""The command `apc play`.
+
+Takes: words of a command line. Gives: text on stdout.
+Guarantees: with --json, stdout holds one JSON document and nothing else; Ctrl-C ends the run and keeps what
+is done.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from apc.cli.options import (
+    Command,
+    WholeNumber,
+    file_argument,
+    file_option,
+    json_option,
+    note_aside,
+    print_result,
+    set_option,
+    tell,
+)
+from apc.cli.progress import at_work
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.threads import start_single_threaded
+
+
+@click.command("play", cls=Command)
+@file_argument
+@click.option("--duration", metavar='"TIME"', help="How long; that of the scene's experiment if not given.")
+@set_option
+@click.option(
+    "--peer", metavar="PEER", help="Play this peer alone, such as left[1]; all of them if not given."
+)
+@click.option("--listen", metavar="HOST:PORT", help="Where this peer listens.")
+@click.option(
+    "--to", multiple=True, metavar="PEER=HOST:PORT", help="Where another peer is. Repeated for each."
+)
+@click.option(
+    "--emulate",
+    is_flag=True,
+    help="Hold back and lose packets at the sender, as the scene's links say, beside what the network does.",
+)
+@click.option(
+    "--seed",
+    type=WholeNumber(0, 2**63 - 1),
+    metavar="NUMBER",
+    help="Of packets that --emulate loses; the experiment's if not given.",
+)
+@click.option(
+    "--device",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A device in the place of this peer's simulated one: a function device(time, force) in a .py file, "
+    "double apc_device(double, const double *) in a .so.",
+)
+@file_option("--secret-file", "What only the peers know: datagrams without it are dropped.")
+@click.option(
+    "--wait", "patience", default="30 s", show_default=True, metavar='"TIME"', help="For the others."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the run is kept; NAME.run."
+)
+@json_option
+def play_command(
+    file: str | None,
+    duration: str | None,
+    settings: tuple[str, ...],
+    peer: str | None,
+    listen: str | None,
+    to: tuple[str, ...],
+    emulate: bool,
+    seed: int | None,
+    device: Path | None,
+    secret_file: Path | None,
+    patience: str,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Play a scene in real time, its peers as processes that exchange packets by UDP.
+
+    Each peer ticks at its clocks, with its simulated device, and hears what
+    has arrived. What was sent, heard and when is kept in a folder, NAME.run;
+    `apc compare NAME.run` lays it beside what simulate and analyze say.
+    Without --peer all peers are played on this machine.
+
+    \b
+        apc play scene.yaml --duration "60 s" --emulate
+        apc play scene.yaml --peer "left[1]" --listen 192.0.2.1:5000 \\
+                            --to "right[1]=192.0.2.2:5000"
+
+    Hosts that play together keep their clocks by NTP or PTP: how far apart
+    they are when the peers meet is taken off, what they drift is not.
+    """
+    start_single_threaded()
+    from apc.inputs import open_scene
+    from apc.loop.device import device_function
+    from apc.loop.run import read_run, write_scene
+    from apc.loop.start import Play, play_all, play_one
+    from apc.option_value import option_value
+    from apc.simulation.trajectory import duration_of, parse_duration
+
+    system = open_scene(file, settings, told=note_aside)
+    asked = parse_duration(duration) if duration is not None else None
+    folder = out or Path(f"{system.name}.run")
+    how = Play(
+        folder=folder,
+        duration=duration_of(system, asked),
+        secret=_secret(secret_file),
+        emulate=emulate,
+        seed=seed,
+        patience=float(option_value("--wait", patience, what="a time", unit="s")),
+    )
+    if peer is None:
+        if listen or to or device:
+            raise click.UsageError("--listen, --to and --device are of one peer: --peer says which")
+        _clear(folder)
+        write_scene(folder, system)
+        with at_work("playing"):
+            play_all(system, how)
+        from apc.loop.beside import compare_run
+
+        print_result(compare_run(read_run(folder)), as_json=as_json)
+    else:
+        listening, addresses = _addresses(listen, to, has_secret=bool(how.secret))
+        outside = None if device is None else device_function(device)
+        write_scene(folder, system)
+        with at_work("playing"):
+            play_one(system, peer, listening, addresses, how, device=outside)
+    if not as_json:
+        tell(f"\n{folder} holds the run; apc compare {folder}")
+
+
+def _clear(folder: Path) -> None:
+    """Refuse a folder that holds something else than a run; of a run take away the peers' files."""
+    from apc.loop.run import SCENE
+
+    if not folder.exists():
+        return
+    if not folder.is_dir() or (any(folder.iterdir()) and not (folder / SCENE).is_file()):
+        what = "is there already, and is no folder of a run"
+        raise ApcError(Mistake("E963", Place(str(folder)), what, hint="--out another.run"))
+    for path in (*folder.glob("*.npz"), *folder.glob("*-to-*.csv")):
+        path.unlink()
+
+
+def _secret(path: Path | None) -> bytes:
+    if path is None:
+        return b""
+    from apc.compiler.files import RefusedError, read_file
+
+    try:
+        secret = read_file(path, 1 << 16).strip()
+    except RefusedError as refused:
+        raise ApcError(Mistake("E964", Place("--secret-file"), f"{path} {refused.words}")) from None
+    if len(secret) < SHORTEST:
+        hint = f"head -c 32 /dev/urandom | base64 > {path}"
+        expected, got = f"{SHORTEST} bytes or more", str(len(secret))
+        raise ApcError(Mistake("E964", Place("--secret-file"), "a secret", expected, got, hint))
+    return secret
+
+
+SHORTEST = 16
+
+
+def _addresses(listen: str | None, to: tuple[str, ...], *, has_secret: bool):  # type: ignore[no-untyped-def]
+    """Return the socket and the others' addresses."""
+    from apc.loop.start import LOOPBACK, address_of, is_loopback, listen_at
+
+    others = {}
+    for text in to:
+        name, equals, address = text.partition("=")
+        if not equals:
+            expected, hint = "PEER=HOST:PORT", '--to "right[1]=192.0.2.7:5000"'
+            raise ApcError(Mistake("E961", Place("--to"), "an address", expected, text[:80], hint))
+        others[name.strip()] = address_of(address.strip(), "--to")
+    own = address_of(listen, "--listen") if listen else (LOOPBACK, 0)
+    socket = listen_at(own)
+    if not is_loopback(own) and not has_secret:
+        note_aside(
+            "packets carry no secret: whoever can send from a peer's address can play it; --secret-file"
+        )
+    return socket, others

@@ -1,0 +1,486 @@
+"""One peer of a scene in real time: it ticks, hears what has arrived, and sends.
+
+Takes: a compiled scene, which peer, addresses, how long. Gives: `Loop`, `live_scene`, `number_of`.
+Guarantees: every tick is done once, in order, however late; what a tick hears is what had arrived when it was
+done; a peer that begins late, or again, joins at the instant it is; others that fall silent are held or left
+out as the link says.
+Does not: move others, or keep hosts' clocks together: the difference between two clocks is measured as peers
+meet (half of the shortest round trip is its error), and what they drift apart afterwards is in the delays.
+
+A scene's time 0 is told by the peer with the lowest number once all it knows are there, unless one of them
+knows it already. What ticks at an instant is done as that is over, by the program of the simulation cut at
+every instant; the peer's device moves as it does there.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import re
+import select
+import socket
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from multiprocessing.connection import Connection
+from random import SystemRandom
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Channel, CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.words import cut
+from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.parameters import resolve
+from apc.loop.device import DeviceFunction, Outside
+from apc.loop.packets import Address, Answer, Data, Hello, Post
+from apc.loop.realtime import now
+from apc.network.channel import ChannelLaw, PacketSource, channel_law
+from apc.network.timetable import START, Seen
+from apc.simulation.blocks import pushes
+from apc.simulation.population import instants_within
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
+from apc.simulation.stepwise import Stepwise
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+NANO = 10**9
+# Seconds after which a packet that has not come is given up, and times its nominal delay if that is more.
+GIVEN_UP, TIMES = 1, 4
+KNOCK = NANO // 20  # from one hello to the next
+HEAD_START = NANO // 2  # between telling when a scene begins and its beginning
+LARGEST = 1 << 16  # bytes of a datagram
+AHEAD = 1024  # packets whose luck is drawn at once
+AT_ONCE = 1000  # datagrams taken in before a tick, so that a flood can't hold it up
+LUCK = SystemRandom()
+PEER = re.compile(r"(?P<group>[A-Za-z_][A-Za-z0-9_]*)\[(?P<place>[0-9]{1,9})\]\Z")
+
+
+def live_scene(system: CompiledSystem) -> CompiledSystem:
+    """Return a scene whose links take what the network does: each way's packets are heard as they come."""
+    timings = {one.name: one.value for one in system.timings}
+    links = []
+    for link in system.links:
+        usual = max(timings[one] for one in (link.delay, *(pair.delay for pair in link.delays)))
+        own = link.channel
+        channel = Channel(
+            loss=None,
+            jitter=None,
+            distribution="uniform",
+            reorder=own.reorder if own else "newest",
+            on_loss=own.on_loss if own else "hold",
+            trace=np.array([float(max(Fraction(GIVEN_UP), TIMES * usual))]),
+        )
+        links.append(replace(link, channel=channel))
+    return replace(system, links=tuple(links))
+
+
+class StoppedError(RuntimeError):
+    """The loop was told to end."""
+
+
+class Loop:
+    """A peer's loop: its clock, its socket, and its part of the scene."""
+
+    def __init__(
+        self,
+        system: CompiledSystem,
+        peer: str,
+        listening: socket.socket,
+        addresses: Mapping[str, Address],
+        *,
+        digest: bytes,
+        duration: Fraction,
+        secret: bytes = b"",
+        emulate: bool = False,
+        seed: int | None = None,
+        stop: Connection | None = None,
+        device: DeviceFunction | None = None,
+    ) -> None:
+        """Make it ready.
+
+        Parameters
+        ----------
+        system
+            The compiled scene, with its numbers.
+        peer
+            Which peer it is, such as "left[1]".
+        listening
+            A bound UDP socket.
+        addresses
+            Where the others are, by their names.
+        digest, secret
+            As for `Post`.
+        duration
+            How long, in seconds.
+        emulate
+            Whether packets are held back and lost at the sender as the scene's links say.
+        seed
+            Of what gets lost; that of the scene's experiment if not given.
+        stop
+            What can be read when the loop is to end.
+        device
+            What stands in the place of the peer's simulated device.
+
+        Raises
+        ------
+        ApcError
+            E960 there is no such peer, E961 one that it sends to or hears has no address; those of `prepare`.
+        """
+        self.system, self.name = system, peer
+        self.exchange = build_exchange(system, resolve(system).timings)
+        self.own = number_of(self.exchange, peer)
+        self.others = {number_of(self.exchange, one): address for one, address in addresses.items()}
+        settings = Settings(duration, jit=False, seed=seed)
+        self.simulation = prepare(live_scene(system), settings, signals=[f"{peer}.*"], live=True)
+        self.frame_ns = int(self.simulation.frame * self.simulation.quantum * NANO)
+        self.frames = -(-int(duration * NANO) // self.frame_ns)
+        self.post = Post(self.own, digest, secret, {address: one for one, address in self.others.items()})
+        self.socket = listening
+        self.socket.setblocking(False)
+        self.begins = 0  # when the scene begins, by this host's clock; 0 while not known
+        # Of each other the shortest round trip, and how far its clock was ahead then.
+        self.offsets: dict[int, tuple[int, int]] = {}
+        self.asked: dict[
+            int, tuple[int, int]
+        ] = {}  # of each other: what it is to answer, and when it was asked
+        self.present: set[int] = set()
+        self.first = 0  # the frame with which it joins
+        self.stopped = False
+        self.watched: list[socket.socket | Connection] = [listening, *([stop] if stop else [])]
+        self.rows: list[Floats] = []
+        self.player = _OnePeer(self, device, emulate=emulate)
+        self._check_addresses()
+
+    def _check_addresses(self) -> None:
+        pairs = {tuple(pair) for route in self.player.routes for pair in route.pairs.tolist()}
+        needed = {one for pair in pairs if self.own in pair for one in pair} - {self.own}
+        if not needed:
+            what = f"{self.name} sends nothing over a link and hears nothing: there is nobody to play with"
+            raise ApcError(Mistake("E961", Place(self.system.name), what, hint="apc simulate"))
+        missing = [self.exchange.peer_name(one) for one in sorted(needed - set(self.others))]
+        if missing:
+            hint = " ".join(f'--to "{one}=HOST:PORT"' for one in missing[:4])
+            what = f"{self.name} sends to or hears {', '.join(missing[:4])}, which have no address"
+            raise ApcError(Mistake("E961", Place("--to"), what, hint=hint))
+
+    # ---- meeting
+
+    def meet(self, patience: float) -> None:
+        """Find out when the scene begins. Raises ApcError E962 if nobody tells within so many seconds."""
+        end, leads = now() + int(patience * NANO), self.own < min(self.others)
+        self.player.warm_up()
+        while not self.begins:
+            for other, address in self.others.items():
+                self.asked[other] = LUCK.getrandbits(64), now()
+                self._send(self.post.hello(self.asked[other][1], self.asked[other][0]), address)
+            self.take_in(now() + KNOCK)
+            if leads and not self.begins and self.present == set(self.others):
+                self.begins = now() + HEAD_START
+            if not self.begins and now() > end:
+                raise self._alone(patience)
+        if now() > self.begins:  # who begins late, or again, comes in with the frame after the next
+            self.first = (now() - self.begins) // self.frame_ns + 2
+
+    def _alone(self, patience: float) -> ApcError:
+        missing = sorted(set(self.others) - self.present) or sorted(self.others)[:1]
+        names = ", ".join(self.exchange.peer_name(one) for one in missing)
+        told = "; ".join(f"{count} datagrams were dropped: {why}" for why, count in self.post.dropped.items())
+        what = f"{names} did not say within {patience:g} s when the scene begins" + (told and f" ({told})")
+        hint = "the same FILE, --set and --secret-file at every peer, started within --wait of each other"
+        return ApcError(Mistake("E962", Place(self.name), what, hint=hint))
+
+    # ---- running
+
+    def run(self) -> None:
+        """Play until the end, or until Ctrl-C."""
+        simulation, first = self.simulation, self.first
+        while first < self.frames and not self.stopped:
+            count = min(simulation.length, self.frames - first)
+            given = pushes(simulation, first)
+            played = self.player.play(first, count, given)
+            self.rows.append(played.rows[: played.frames * len(simulation.marks)].copy())
+            self.stopped |= played.frames < count
+            first += count
+
+    def wait(self, instant: int) -> int:
+        """Take in what comes until an instant of the scene, in nanoseconds; return how late it is then."""
+        if not self.begins:  # warming up
+            return 0
+        try:
+            self.take_in(self.begins + instant)
+        except KeyboardInterrupt:
+            raise StoppedError from None
+        return now() - self.begins - instant
+
+    # ---- the network
+
+    def take_in(self, until: int) -> None:
+        """Take in what comes, and send what is due, until an instant of this host's clock."""
+        held = self.player.held_back
+        while True:
+            while held and held[0][0] <= now():
+                _, _, datagram, address = heapq.heappop(held)
+                self._send(datagram, address)
+            self._read()
+            if (time := now()) >= until:
+                return
+            left = min(until, held[0][0] if held else until) - time
+            ready, _, _ = select.select(self.watched, [], [], max(left, 0) / NANO)
+            if ready and isinstance(ready[-1], Connection):
+                raise StoppedError
+
+    def _read(self) -> None:
+        for _ in range(AT_ONCE):
+            try:
+                datagram, address = self.socket.recvfrom(LARGEST)
+            except BlockingIOError:
+                return
+            except OSError:  # what was sent before found nobody: Linux tells it here
+                continue
+            came = now()
+            match self.post.read(datagram, address[:2]):
+                case Data() as packet:
+                    self.player.hear(packet, came - self.begins)
+                case Hello() as hello:
+                    self.present.add(hello.sender)
+                    self._send(self.post.answer(now(), hello, came, self.begins), address)
+                case Answer() as answer:
+                    self._met(answer, came)
+
+    def _met(self, answer: Answer, came: int) -> None:
+        """Learn another's clock, and when the scene begins, by a round trip (RFC 5905, section 8)."""
+        nonce, asked = self.asked.get(answer.sender, (None, 0))
+        if nonce != answer.nonce:
+            self.post.drop("unasked")
+            return
+        self.present.add(answer.sender)
+        trip = (came - asked) - (answer.time - answer.came)
+        ahead = ((answer.came - asked) + (answer.time - came)) // 2
+        self.offsets[answer.sender] = min(self.offsets.get(answer.sender, (trip, ahead)), (trip, ahead))
+        if answer.begins and not self.begins:
+            self.begins = answer.begins - self.offsets[answer.sender][1]
+
+    def _send(self, datagram: bytes, address: Address) -> None:
+        try:
+            self.socket.sendto(datagram, address)
+        except OSError:  # nobody is there, or no room: one packet more that is lost
+            self.post.drop("not sent")
+
+
+class _OnePeer(Stepwise):
+    """One peer of a population, instant by instant; what the others send comes from the network.
+
+    `log` has (due, late, took) of each instant, `arrivals` (link, sender, count, sent, arrived) of each
+    packet, all in nanoseconds of the scene; `seen`, a route each, what its ticks saw on the peer's own ways.
+    """
+
+    def __init__(self, loop: Loop, device: DeviceFunction | None, *, emulate: bool) -> None:
+        simulation, population = loop.simulation, loop.simulation.population
+        self.loop, self.routes = loop, population.hearing.routes
+        self.member = next(g for g, one in enumerate(population.members) if loop.own in one.peers)
+        super().__init__(population, None, moving=(self.member,))
+        self.quantum_ns = simulation.quantum * NANO
+        schedules = [one.program.schedule for one in population.members]
+        self.begin_at = [0, *(int(one * self.quantum_ns) for one in instants_within(schedules))]
+        self.links = [_OfLink(loop, place) for place in range(len(loop.system.links))]
+        self.newest = [np.full(len(route.pairs), START, np.int64) for route in self.routes]
+        self.mine = [np.flatnonzero(route.pairs[:, 1] == loop.own) for route in self.routes]
+        self.seen: list[list[tuple[Integers, Flags]]] = [[] for _ in self.routes]
+        self.network = _Emulated(loop) if emulate else None
+        member = population.members[self.member]
+        self.outside = Outside(loop.system, member, device) if device else None
+        self.ahead: list[
+            tuple[int, int, Data]
+        ] = []  # packets not heard yet, by the instants of their samples
+        self.held_back: list[tuple[int, int, bytes, Address]] = []
+        self.log: list[tuple[int, int, int]] = []
+        self.arrivals: list[tuple[int, int, int, int, int]] = []
+        self.sent: Counter[tuple[int, int]] = Counter()  # packets by link and receiver
+        self.instant = 0
+
+    def warm_up(self) -> None:
+        """Play a frame that nobody hears: what is loaded and built at a first call isn't in the second."""
+        self.play(0, 1, pushes(self.loop.simulation, 0))
+        self.begin(0)
+        self.log, self.seen = [], [[] for _ in self.routes]
+
+    def _segment(
+        self,
+        number: int,
+        index: int,
+        seen: tuple[Seen, ...],
+        rows: Floats,
+        pushes: Sequence[Floats | None],
+        marks: list[int],
+        pushed: list[int],
+    ) -> None:
+        """Wait for a segment's instant, play it, and hand over what it sends at its end."""
+        instant = number * self.loop.frame_ns + self.begin_at[index]
+        late, begun = self.loop.wait(instant), now()
+        self.instant = instant
+        outside = self.outside if self.loop.begins else None
+        if outside and (index == 0 or self.begin_at[index] > self.begin_at[index - 1]):
+            outside.measure(instant / NANO, self.carries[self.member])
+        super()._segment(number, index, seen, rows, pushes, marks, pushed)
+        if outside and index:  # before it nothing ticks: a frame begins with what is sent then
+            self._push(outside, index)
+        self._hand_over(number, index)
+        self.log.append((instant, late, now() - begun))
+
+    def _push(self, outside: Outside, index: int) -> None:
+        """Tell the device outside what force acts from this instant on."""
+        program = self.population.members[self.member].program
+        held = list(program.segments[index].held)
+        carry = self.carries[self.member][:, 0]
+        u = np.where(np.array(held) < 0, 0.0, carry[held])
+        outside.push(self.instant / NANO, carry[: program.layout.states], u)
+
+    def _sees(self, place: int, tick: int, seen: tuple[Seen, ...]) -> tuple[Integers, Flags]:
+        """Return the packets that are here, and which should be.
+
+        A peer that is late does not hear what was sampled after the instant that it is at.
+        """
+        while self.ahead and self.ahead[0][0] <= self.instant:
+            _, _, packet = heapq.heappop(self.ahead)
+            link = self.links[packet.link]
+            for at, way in link.ways[packet.sender]:
+                last = self.newest[at][way]
+                self.newest[at][way] = max(last, packet.count) if link.newest else packet.count
+        route, newest, luck = self.routes[place], self.newest[place], self.loop.simulation.lucks[place]
+        instant = int(self.instant // self.quantum_ns)
+        due = (instant - luck.nominal - luck.phase) // luck.period
+        missing = (newest < due) & (due >= 0) if route.zero else np.zeros(len(newest), np.bool_)
+        mine = self.mine[place]
+        self.seen[place].append((newest[mine].copy(), missing[mine].copy()))
+        return newest.copy(), missing
+
+    def _hand_over(self, number: int, index: int) -> None:
+        """Send what a segment has computed, each packet at its instant or, emulated, when it would arrive."""
+        loop, member = self.loop, self.population.members[self.member]
+        sent = member.program.schedule.sent
+        slots = {(sent[row].link, sent[row].slot) for row in member.program.segments[index].sent}
+        for name, slot in sorted(slots):
+            link = next(one for one in self.links if one.name == name)
+            count = number * link.slots + slot
+            keys = [link.keys[channel, slot] for channel in link.channels_of(loop.own)]
+            column = self.population.hearing.column_of[loop.own]
+            values = tuple(self.packets[number % self.population.hearing.ring, keys, column].tolist())
+            instant = link.instant(count)
+            for other in link.told:
+                delay = self.network.delay(link, other, count) if self.network else 0
+                self.sent[link.place, other] += loop.begins > 0
+                if delay is not None and loop.begins:
+                    at = loop.begins + instant + delay
+                    datagram = loop.post.data(at, link.place, count, values)
+                    heapq.heappush(self.held_back, (at, len(self.log), datagram, loop.others[other]))
+
+    def hear(self, packet: Data, came: int) -> None:
+        """Take in a packet that came at an instant of the scene, unless it can't be what it says."""
+        link = self.links[packet.link] if packet.link < len(self.links) else None
+        if why := "malformed" if link is None else self._refused(packet, came, link):
+            self.loop.post.drop(why)
+            return
+        assert link is not None
+        hearing, (frame, slot) = self.population.hearing, divmod(packet.count, link.slots)
+        link.counts.setdefault(packet.sender, set()).add(packet.count)
+        keys = [link.keys[channel, slot] for channel in link.channels_of(packet.sender)]
+        self.packets[frame % hearing.ring, keys, hearing.column_of[packet.sender]] = packet.values
+        heapq.heappush(self.ahead, (link.instant(packet.count), len(self.arrivals), packet))
+        self.arrivals.append((link.place, packet.sender, packet.count, link.instant(packet.count), came))
+
+    def _refused(self, packet: Data, came: int, link: _OfLink) -> str:
+        """Return why a packet is let go, empty if it isn't."""
+        if packet.sender not in link.ways or len(packet.values) != len(link.channels_of(packet.sender)):
+            return "malformed"
+        frame, frame_now = packet.count // link.slots, came // self.loop.frame_ns
+        if not self.loop.begins or frame > frame_now + 1:
+            return "early"
+        # Of the frames that are kept the oldest may be overwritten by one that is early.
+        if frame < frame_now - (self.population.hearing.ring - 3):
+            return "late"
+        return "heard before" if packet.count in link.counts.get(packet.sender, ()) else ""
+
+
+class _OfLink:
+    """What a peer needs of a link: `place` and `name`; `slots` a frame; whom it tells and whom it hears."""
+
+    def __init__(self, loop: Loop, place: int) -> None:
+        population, hearing = loop.simulation.population, loop.simulation.population.hearing
+        self.place, self.name = place, loop.system.links[place].name
+        over = [(at, one) for at, one in enumerate(hearing.routes) if one.link == self.name]
+        quantum_ns = loop.simulation.quantum * NANO
+        lucks = [loop.simulation.lucks[at] for at, _ in over]
+        self.phase = lucks[0].phase * quantum_ns if lucks else Fraction(0)
+        self.period = lucks[0].period * quantum_ns if lucks else Fraction(1)
+        self.newest = lucks[0].newest if lucks else True
+        self.slots = over[0][1].slots if over else 1
+        schedules = [one.program.schedule for one in population.members]
+        self.channels = [
+            sorted({one.channel for one in schedule.sent if one.link == self.name}) for schedule in schedules
+        ]
+        self.keys = {
+            (one.channel, one.slot): row for row, one in enumerate(hearing.keys) if one.link == self.name
+        }
+        self.member_of = {peer: g for g, one in enumerate(population.members) for peer in one.peers.tolist()}
+        self.told = sorted({int(r) for _, one in over for s, r in one.pairs if s == loop.own})
+        self.ways: dict[int, list[tuple[int, int]]] = {}
+        for at, one in over:
+            for way in np.flatnonzero(one.pairs[:, 1] == loop.own).tolist():
+                self.ways.setdefault(int(one.pairs[way, 0]), []).append((at, way))
+        self.counts: dict[int, set[int]] = {}
+
+    def channels_of(self, peer: int) -> list[str]:
+        """Return what a peer sends over the link, in the order of a packet's values."""
+        return self.channels[self.member_of[peer]]
+
+    def instant(self, count: int) -> int:
+        """Return when a packet's sample is taken, in nanoseconds of the scene."""
+        return int(self.phase + count * self.period)
+
+
+class _Emulated:
+    """The network that a scene says: what each packet is held back by, and which are lost."""
+
+    def __init__(self, loop: Loop) -> None:
+        self.loop = loop
+        self.timings = resolve(loop.system).timings
+        self.sources: dict[tuple[int, int], tuple[PacketSource, list[float]]] = {}
+
+    def delay(self, link: _OfLink, other: int, count: int) -> int | None:
+        """Return the delay of a packet in nanoseconds, None if it gets lost."""
+        source, delays = self.sources.setdefault((link.place, other), (self._source(link, other), []))
+        while source.taken <= count:
+            delays[:] = source.take(AHEAD)[0].tolist()
+        found = delays[count - source.taken]
+        return None if math.isinf(found) else int(found * NANO)
+
+    def _source(self, link: _OfLink, other: int) -> PacketSource:
+        loop, exchange = self.loop, self.loop.exchange
+        of, to = (int(np.searchsorted(exchange.starts, one, side="right")) - 1 for one in (loop.own, other))
+        delay, own = self.timings[exchange.delay(link.name, of, to)], loop.system.links[link.place]
+        law = (
+            ChannelLaw(0.0, 1.0, 1.0, 0.0, float(delay), 0.0, "uniform", None)
+            if own.channel is None
+            else channel_law(loop.system, own, delay)
+        )
+        return PacketSource(law, link.name, [[loop.own, other]], seed=loop.simulation.seed)
+
+
+def number_of(exchange: Exchange, name: str) -> int:
+    """Return the number of a peer called `left[1]`. Raises ApcError E960 if there is none."""
+    found = PEER.match(name)
+    group = exchange.groups.index(found["group"]) if found and found["group"] in exchange.groups else -1
+    place = int(found["place"]) if found else 0
+    if group >= 0 and 1 <= place <= exchange.starts[group + 1] - exchange.starts[group]:
+        return int(exchange.starts[group]) + place - 1
+    names = [exchange.peer_name(one) for one in range(min(exchange.peers, 4))]
+    expected = f"one of {', '.join(names)}{', …' if exchange.peers > len(names) else ''}"
+    raise ApcError(
+        Mistake("E960", Place(exchange.scene), "a peer", expected, cut(name) or "nothing", names[0])
+    )

@@ -1,0 +1,221 @@
+"""What a peer of a run did and heard, on disk: one file a peer, a trace a way, and the scene they played.
+
+Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `write_peer`, `write_scene`, `read_run`.
+Guarantees: a file is whole or not there; nothing of it is run when it is read.
+Does not: judge it (see `beside`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler import store
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import unwritable, write_file, write_text
+from apc.compiler.frozen import dataclass
+from apc.loop.peer import NANO, Loop
+from apc.simulation.blocks import instants_of
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+SCENE = "scene.apc"
+ARRAYS = ("time", "values", "late", "took", "arrivals")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeerRun:
+    """What one peer did.
+
+    `first` is the frame it joined with, of `frames`; `outside` says that it had a device outside. `values`
+    (rows, signals) are its `signals` at `time` (rows,) in seconds, as `simulate` gives them. `late` and
+    `took` (n,) are how long after its due each instant began and how long it was worked on, in seconds.
+    `arrivals` (n, 5) are link, sender, count of a packet, the instant of its sample and that of its coming,
+    in nanoseconds of the scene; `sent` counts packets by (link, receiver). `packets` and `missing` are, a
+    route of the scene each, what its ticks saw on its own ways (ticks, ways). `dropped` counts datagrams by
+    why; `not_given` is what the system did not give; `offsets` are, of each other, the shortest round trip
+    and how far its clock was ahead, in seconds.
+    """
+
+    name: str
+    number: int
+    digest: str
+    first: int
+    frames: int
+    stopped: bool
+    emulated: bool
+    outside: bool
+    signals: tuple[str, ...]
+    time: Floats
+    values: Floats
+    late: Floats
+    took: Floats
+    arrivals: Integers
+    sent: Mapping[tuple[int, int], int]
+    packets: tuple[Integers, ...]
+    missing: tuple[NDArray[np.bool_], ...]
+    dropped: Mapping[str, int]
+    not_given: tuple[str, ...]
+    offsets: Mapping[int, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """Several peers' part of one run of a scene."""
+
+    folder: str
+    system: CompiledSystem
+    peers: tuple[PeerRun, ...]
+
+
+def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
+    """Return what a loop that has ended did."""
+    simulation, player = loop.simulation, loop.player
+    rows = np.concatenate(loop.rows) if loop.rows else np.zeros((0, simulation.population.width))
+    last = int(simulation.settings.duration / simulation.quantum)
+    marks, played = len(simulation.marks), len(rows) // len(simulation.marks)
+    whole = [
+        instants_of(simulation, at, last) for at in range(loop.first, loop.first + played, simulation.length)
+    ]
+    instants, kept = (
+        np.concatenate([one[i] for one in whole])[: played * marks] if whole else np.zeros(0, np.int64)
+        for i in range(2)
+    )
+    kept = kept.astype(bool) & np.isfinite(rows).all(axis=1)
+    log = np.array(player.log, np.int64).reshape(-1, 3)
+    return PeerRun(
+        name=loop.name,
+        number=loop.own,
+        digest=digest.hex(),
+        first=loop.first,
+        frames=loop.frames,
+        stopped=loop.stopped,
+        emulated=loop.player.network is not None,
+        outside=loop.player.outside is not None,
+        signals=tuple(one.name for one in simulation.signals),
+        time=np.asarray(instants[kept] * float(simulation.quantum), np.float64),
+        values=rows[kept][:, simulation.order],
+        late=log[:, 1] / NANO,
+        took=log[:, 2] / NANO,
+        arrivals=np.array(player.arrivals, np.int64).reshape(-1, 5),
+        sent=dict(player.sent),
+        packets=tuple(np.array([one for one, _ in seen], np.int64) for seen in player.seen),
+        missing=tuple(np.array([one for _, one in seen], np.bool_) for seen in player.seen),
+        dropped=dict(loop.post.dropped),
+        not_given=not_given,
+        offsets={one: (trip / NANO, ahead / NANO) for one, (trip, ahead) in loop.offsets.items()},
+    )
+
+
+def write_scene(folder: Path, system: CompiledSystem) -> None:
+    """Make a run's folder and write the scene into it. Raises ApcError E601 if that can't be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(folder, error) from None
+    store.save(system, folder / SCENE)
+
+
+def write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
+    """Write what a peer did, and a trace of every way that it heard. Raises ApcError E601 if it can't."""
+    told = {
+        **{name: getattr(peer, name) for name in PLAIN},
+        "sent": [[*key, count] for key, count in peer.sent.items()],
+        "offsets": [[one, *both] for one, both in peer.offsets.items()],
+        "routes": len(peer.packets),
+    }
+    arrays = {name: getattr(peer, name) for name in ARRAYS}
+    arrays |= {f"packets{at}": one for at, one in enumerate(peer.packets)}
+    arrays |= {f"missing{at}": one for at, one in enumerate(peer.missing)}
+    arrays["told"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    write_file(folder / f"{file_name(peer.name)}.npz", write)
+    for link, sender in sorted({(int(link), int(sender)) for link, sender in peer.arrivals[:, :2]}):
+        rows = ("lost" if math.isinf(one) else f"{one * 1e3:.6f}" for one in delays_of(peer, link, sender))
+        write_text(folder / trace_name(system, link, sender, peer.number), "\n".join(["delay [ms]", *rows]))
+
+
+PLAIN = (
+    "name",
+    "number",
+    "digest",
+    "first",
+    "frames",
+    "stopped",
+    "emulated",
+    "outside",
+    "signals",
+    "dropped",
+    "not_given",
+)
+
+
+def delays_of(peer: PeerRun, link: int, sender: int) -> Floats:
+    """Return the delays (n,) of a way's packets, from the sample of each to its coming; infinite if lost.
+
+    They begin with the first that a peer could hear and end with the last that came.
+    """
+    rows = peer.arrivals[(peer.arrivals[:, 0] == link) & (peer.arrivals[:, 1] == sender)]
+    counts = rows[:, 2]
+    delays = np.full(int(counts.max()) - int(counts.min()) + 1, math.inf)
+    delays[counts - counts.min()] = np.maximum(rows[:, 4] - rows[:, 3], 0) / NANO
+    return delays
+
+
+def file_name(peer: str) -> str:
+    """Return `left-1` for `left[1]`, which a shell would take for a pattern."""
+    return peer.replace("[", "-").replace("]", "")
+
+
+def trace_name(system: CompiledSystem, link: int, sender: int, receiver: int) -> str:
+    """Return the name of the trace of a way."""
+    names = [f"{group.name}-{place + 1}" for group in system.groups for place in range(group.count)]
+    return f"{system.links[link].name}-{names[sender]}-to-{names[receiver]}.csv"
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run. Raises ApcError E963 if a folder is none, damaged, or of several scenes."""
+    files = sorted(folder.glob("*.npz"))
+    if not (folder / SCENE).is_file() or not files:
+        what = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
+        raise ApcError(Mistake("E963", Place(str(folder)), what, hint="apc play FILE --out RUN"))
+    system = store.load(folder / SCENE)
+    peers = tuple(sorted((_read_peer(path) for path in files), key=lambda one: one.number))
+    if len({one.digest for one in peers}) > 1:
+        what = "holds peers of different scenes, or with different --set"
+        raise ApcError(Mistake("E963", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
+    return Run(str(folder), system, peers)
+
+
+def _read_peer(path: Path) -> PeerRun:
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            told = json.loads(found["told"].tobytes())
+            routes = range(int(told["routes"]))
+            plain: dict[str, Any] = {
+                name: tuple(told[name]) if isinstance(told[name], list) else told[name] for name in PLAIN
+            }
+            arrays: dict[str, Any] = {name: found[name] for name in ARRAYS}
+            return PeerRun(
+                **plain,
+                **arrays,
+                sent={(link, other): count for link, other, count in told["sent"]},
+                packets=tuple(found[f"packets{at}"] for at in routes),
+                missing=tuple(found[f"missing{at}"] for at in routes),
+                offsets={one: (trip, ahead) for one, trip, ahead in told["offsets"]},
+            )
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise ApcError(Mistake("E963", Place(str(path)), f"is no peer of a run: {error}")) from None

@@ -1,0 +1,107 @@
+"""A run in real time as text and plain data: its ticks, its ways, and what is said of its scene.
+
+Takes: a `RunComparison`, `Ticks`. Gives: `run_comparison_text`, `run_comparison_document`, `ticks_text`.
+Guarantees: what is not compared says why.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from apc.compiler.words import counted, wrapped
+from apc.present.forms import document, note
+from apc.present.recorded_network import recording_document
+
+if TYPE_CHECKING:
+    from apc.loop.beside import Measured, RunComparison, Ticks, WayRun
+
+HEADINGS = ("50 %", "99 %", "99.9 %", "most")
+
+
+def run_comparison_text(found: RunComparison) -> str:
+    """Return what happened beside what is said of it."""
+    peers = counted(len(found.ticks), "peer")
+    lines = [f"{found.topology}: {peers}, {found.seconds:.6g} s in real time", ""]
+    if found.emulated:
+        lines += [*note("packets were held back and lost at the sender, as the scene's links say"), ""]
+    if found.why_not:
+        lines += [*note(f"not simulated beside it: {found.why_not}"), ""]
+    else:
+        lines += note("beside simulate, fed with the packets that each tick had, signals differ by at most")
+        for unit, (far, large) in found.apart.items():
+            lines.append(f"    {far:.0e} {unit}".ljust(18) + f" of up to {large:.4g} {unit}")
+        if not any(large for _, large in found.apart.values()):
+            lines += note("nothing moved: start values or a force in the scene would move it")
+        lines.append("")
+    lines += [*ticks_text(found.ticks), "", *_ways_text(found.ways)]
+    for one in found.measured:
+        lines += ["", *_measured_text(one)]
+    return "\n".join(lines)
+
+
+def ticks_text(ticks: Iterable[Ticks]) -> list[str]:
+    """Return how late ticks were, a row a peer."""
+    listed = list(ticks)
+    width = max([len(one.peer) for one in listed], default=0)
+    lines = []
+    for what, shares in (("late by", "late"), ("took", "took")):
+        heads = "".join(f"{heading:>10}" for heading in HEADINGS)
+        lines.append(f"  {what:<{width}}  {'ticks':>11}{heads}")
+        for one in listed:
+            cells = "".join(f"{f'{1e3 * value:.3f} ms':>10}" for value in getattr(one, shares))
+            lines.append(f"  {one.peer:<{width}}  {one.ticks:>11,}{cells}")
+    for one in listed:
+        said = [f"not given: {why}" for why in one.not_given]
+        said += [f"joined at {one.joined:.4g} s"] if one.joined else []
+        said += ["stopped before the end"] if one.stopped else []
+        said += [f"{count:,} datagrams dropped: {why}" for why, count in one.dropped.items()]
+        if said:
+            lines += wrapped(f"{one.peer}: {'; '.join(said)}", "  ", "    ")
+    return lines
+
+
+def _ways_text(ways: Iterable[WayRun]) -> list[str]:
+    listed = [(f"{one.link} {one.sender} to {one.receiver}", one) for one in ways]
+    width = max([len(name) for name, _ in listed], default=0)
+    lines = [f"  {'way':<{width}}  {'packets':>9}{'lost':>8}{'half within':>13}{'all within':>13}"]
+    for name, one in listed:
+        came = one.came
+        middle = f"{1e3 * dict(came.quantiles).get(0.5, came.mean):.3f} ms"
+        cells = f"{came.packets:>9,}{came.lost.count:>8,}{middle:>13}{f'{1e3 * came.longest:.3f} ms':>13}"
+        lines += [f"  {name:<{width}}  {cells}", f"    {one.trace}"]
+    return lines
+
+
+def _measured_text(one: Measured) -> list[str]:
+    after = f"with {one.link} heard after {1e3 * one.delay:.6g} ms, as most of {one.way} was"
+    verdict = f"{one.analysis.verdict}, spectral radius {one.analysis.spectral_radius:.6f} per frame"
+    lines = wrapped(f"analyze says, {after}: {verdict}", "  ", "    ")
+    if one.network is not None:
+        lines += wrapped(f"and with every packet of that way as it came: {one.network.verdict}", "  ", "    ")
+    else:
+        lines += note(
+            "not judged packet by packet, of which there are many: the link's trace: FILE asks for that"
+        )
+    return lines
+
+
+def run_comparison_document(found: RunComparison) -> dict[str, Any]:
+    """Return a run beside its scene as plain data; times in seconds."""
+    plain: dict[str, Any] = document(found, {"ways": None, "measured": None})
+    plain["ways"] = [
+        {**document(one, {"came": None}), "came": recording_document(one.came)} for one in found.ways
+    ]
+    plain["measured"] = [
+        {
+            "link": one.link,
+            "way": one.way,
+            "delay": one.delay,
+            "verdict": one.analysis.verdict,
+            "spectral_radius": one.analysis.spectral_radius,
+            "network": None if one.network is None else one.network.verdict,
+        }
+        for one in found.measured
+    ]
+    return plain

@@ -1,0 +1,345 @@
+"""Claims about peers in real time: their packets, what they hear, and that they do what is simulated.
+
+No claim is on how late anything was: a busy machine only makes what is heard later.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import random
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.loop.beside import compare_run
+from apc.loop.device import device_function
+from apc.loop.packets import Address, Answer, Data, Hello, Post
+from apc.loop.peer import Loop
+from apc.loop.run import delays_of, read_run, run_of, write_peer, write_scene
+from apc.network.recorded import describe
+from tests.topologies import AVERAGE, replaced
+
+DIGEST = hashlib.sha256(b"a scene").digest()
+HERE: Address = ("127.0.0.1", 5000)
+MOVING = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: 3 mm}}"))
+
+
+def post(own: int = 1, *, digest: bytes = DIGEST, secret: bytes = b"") -> Post:
+    return Post(own, digest, secret, {HERE: 2})
+
+
+@pytest.mark.parametrize("secret", [b"", b"sixteen bytes or more"])
+def test_what_is_written_is_read(secret: bytes) -> None:
+    sender, receiver = post(2, secret=secret), post(secret=secret)
+    datagrams = [
+        sender.data(17, 3, 4, (1.5, -0.0, 1e-300)),
+        sender.hello(18, 2**63),
+        sender.answer(19, Hello(1, 5, 7), 6, -1),
+    ]
+    assert [receiver.read(one, HERE) for one in datagrams] == [
+        Data(2, 17, 3, 4, (1.5, -0.0, 1e-300)),
+        Hello(2, 18, 2**63),
+        Answer(2, 19, 7, 6, -1),
+    ]
+    assert not receiver.dropped
+
+
+def test_what_is_not_a_peers_changes_nothing_but_a_counter() -> None:
+    """10⁵ datagrams of random bytes, and of each other kind: dropped by name."""
+    luck = random.Random(1)
+    secret = b"sixteen bytes or more"
+    good = post(2, secret=secret).data(17, 0, 4, (1.0,))
+    receiver = post(secret=secret)
+    for _ in range(100_000):
+        assert receiver.read(luck.randbytes(luck.randrange(200)), HERE) is None
+    assert receiver.dropped == {"malformed": 100_000}
+    for at in range(8 * len(good)):  # every bit of a good one turned
+        torn = bytearray(good)
+        torn[at // 8] ^= 1 << at % 8
+        assert receiver.read(bytes(torn), HERE) is None
+    assert receiver.read(good, ("127.0.0.1", 5001)) is None
+    assert receiver.read(post(2, digest=b"other" * 8, secret=secret).data(17, 0, 4, (1.0,)), HERE) is None
+    assert (
+        receiver.read(post(2, secret=b"another secret of some length").data(17, 0, 4, (1.0,)), HERE) is None
+    )
+    assert receiver.read(post(3, secret=secret).data(17, 0, 4, (1.0,)), HERE) is None
+    assert receiver.dropped["stranger"] == 1
+    assert receiver.dropped["other scene"] == 1 + 8 * 8
+    assert receiver.dropped["forged"] > 100
+    for value in (math.nan, math.inf):
+        assert receiver.read(post(2, secret=secret).data(17, 0, 4, (value,)), HERE) is None
+    assert receiver.read(good, HERE) is not None
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> CompiledSystem:
+    path = tmp_path_factory.mktemp("scene") / "three.yaml"
+    path.write_text(MOVING, encoding="utf-8")
+    return apc.compile(path)
+
+
+def loops(system: CompiledSystem, duration: str, *, emulate: bool = False) -> Iterator[Loop]:
+    names = [f"{group.name}[{at + 1}]" for group in system.groups for at in range(group.count)]
+    sockets = {name: socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for name in names}
+    for one in sockets.values():
+        one.bind(("127.0.0.1", 0))
+    where = {name: one.getsockname() for name, one in sockets.items()}
+    for name in names:
+        others = {other: at for other, at in where.items() if other != name}
+        yield Loop(
+            system, name, sockets[name], others, digest=DIGEST, duration=Fraction(duration), emulate=emulate
+        )
+
+
+def test_peers_do_what_is_simulated_with_the_packets_they_heard(
+    scene: CompiledSystem, tmp_path: Path
+) -> None:
+    """In one process, a thread each: every signal at every tick, to the last bits."""
+    lossy = apc.set_parameters(scene, {"lan.delay": "3 ms"})
+    every = list(loops(lossy, "1/4", emulate=True))
+    threads = [threading.Thread(target=lambda one=one: (one.meet(60), one.run())) for one in every]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    write_scene(tmp_path, lossy)
+    for loop in every:
+        write_peer(tmp_path, run_of(loop, DIGEST, ()), lossy)
+    found = read_run(tmp_path)
+    assert [one.name for one in found.peers] == ["user[1]", "user[2]", "user[3]"]
+    beside = compare_run(found)
+    assert not beside.why_not
+    assert max(far for far, _ in beside.apart.values()) <= 1e-12  # 250 ticks of roundings
+    assert beside.apart["N"][1] > 1
+    assert len(beside.ways) == 6
+    for way in beside.ways:
+        # Nothing is lost by us: what did not come by the end was still on its way.
+        assert way.came.lost.count == 0
+        assert way.came.shortest >= 0.003
+        assert describe(way.trace).to_dict()["packets"] == way.came.packets
+    assert json.dumps(beside.to_dict())
+    assert str(beside)
+
+
+def test_a_ticks_packets_are_those_that_had_come(scene: CompiledSystem) -> None:
+    """Without time: packets given by hand, out of order, twice, too early, too late, of another width."""
+    loop = next(loops(scene, "1"))
+    player = loop.player
+    loop.begins = 1
+    period, frame = 8_000_000, loop.frame_ns
+
+    def given(count: int, came: int, *values: float, sender: int = 1, link: int = 0) -> None:
+        player.hear(Data(sender, 0, link, count, values), came)
+
+    width = len(player.links[0].channels_of(1))
+    values = [0.25] * width
+    player.instant = 5 * period
+    given(3, 3 * period + 1, *values)
+    given(2, 3 * period + 2, *values)  # newest wins
+    player._sees(0, 0, ())
+    way = next(way for way, pair in enumerate(player.routes[0].pairs.tolist()) if pair == [1, 0])
+    assert player.newest[0][way] == 3
+    given(3, 3 * period + 3, *values)
+    given(90, 4 * period, *values)
+    given(0, 500 * frame, *values)
+    given(4, 4 * period, *values, 1.0)
+    given(4, 4 * period, *values, link=7)
+    given(4, 4 * period, *values, sender=0)
+    given(6, 6 * period, *values)  # of later than the instant that this peer is at
+    player._sees(0, 0, ())
+    assert player.newest[0][way] == 3
+    assert loop.post.dropped == {"heard before": 1, "early": 1, "late": 1, "malformed": 3}
+    assert [row[2] for row in player.arrivals] == [3, 2, 6]
+    player.instant = 6 * period
+    player._sees(0, 0, ())
+    assert player.newest[0][way] == 6
+
+
+def test_a_flood_of_packets_moves_counters_alone(scene: CompiledSystem) -> None:
+    """10⁵ of each: replayed, too early, too late; what is heard stays, and what is kept does not grow."""
+    loop = next(loops(scene, "1"))
+    loop.begins = 1
+    player, width = loop.player, len(loop.player.links[0].channels_of(1))
+    player.hear(Data(1, 0, 0, 0, (0.5,) * width), 0)
+    before = player.packets.copy()
+    luck = random.Random(2)
+    for _ in range(100_000):
+        player.hear(Data(1, 0, 0, 0, (luck.random(),) * width), 0)
+        player.hear(Data(1, 0, 0, luck.randrange(10, 2**60), (1.0,) * width), 0)
+        player.hear(Data(1, 0, 0, luck.randrange(1000), (1.0,) * width), 2000 * loop.frame_ns)
+    assert loop.post.dropped == {"heard before": 100_000, "early": 100_000, "late": 100_000}
+    assert (player.packets == before).all()
+    assert len(player.arrivals) == 1
+
+
+def command(folder: Path, *words: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "apc", "play", "three.yaml", *words],
+        cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def free_ports(count: int) -> list[int]:
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    for one in sockets:
+        one.bind(("127.0.0.1", 0))
+    ports = [one.getsockname()[1] for one in sockets]
+    for one in sockets:
+        one.close()
+    return ports
+
+
+def test_a_peer_that_is_killed_and_started_again_joins_the_others(tmp_path: Path) -> None:
+    (tmp_path / "three.yaml").write_text(replaced(MOVING, ("{count: 3,", "{count: 2,")), encoding="utf-8")
+    one, two = free_ports(2)
+    first = ("--peer", "user[1]", "--listen", f"127.0.0.1:{one}", "--to", f"user[2]=127.0.0.1:{two}")
+    second = ("--peer", "user[2]", "--listen", f"127.0.0.1:{two}", "--to", f"user[1]=127.0.0.1:{one}")
+    common = ("--duration", "12 s", "--wait", "120 s", "--out", "a.run")
+    staying = command(tmp_path, *first, *common)
+    killed = command(tmp_path, *second, *common)
+    with pytest.raises(subprocess.TimeoutExpired):  # until both have met, and play
+        staying.wait(6)
+    killed.kill()
+    killed.communicate()
+    again = command(tmp_path, *second, *common)
+    told = again.communicate(timeout=240)
+    assert again.returncode == 0, told[1]
+    told = staying.communicate(timeout=240)
+    assert staying.returncode == 0, told[1]
+    found = read_run(tmp_path / "a.run")
+    assert found.peers[0].first == 0
+    assert len(found.peers[0].time) == 12_000
+    if found.peers[1].first:  # it had begun before it was killed
+        assert "joined later" in compare_run(found).why_not
+
+
+def test_a_device_outside_is_measured_and_pushed(scene: CompiledSystem, tmp_path: Path) -> None:
+    """A wall of clay at 2 mm: its position is what is recorded, its force what the contact's spring says."""
+    (tmp_path / "clay.py").write_text(
+        "told = []\ndef device(time, force):\n    told.append((time, force))\n    return 0.002\n", "utf-8"
+    )
+    every = list(loops(scene, "1/10"))
+    device = device_function(tmp_path / "clay.py")
+    own = Loop(
+        scene,
+        "user[1]",
+        every[0].socket,
+        dict(zip(("user[2]", "user[3]"), every[0].others.values(), strict=True)),
+        digest=DIGEST,
+        duration=Fraction(1, 10),
+        device=device,
+    )
+    played = [own, *every[1:]]
+    threads = [threading.Thread(target=lambda one=one: (one.meet(60), one.run())) for one in played]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    found = run_of(own, DIGEST, ())
+    column = {name.removeprefix("user[1]."): at for at, name in enumerate(found.signals)}
+    assert (found.values[1:, column["device.x"]] == 0.002).all()
+    assert (found.values[2:, column["device.v"]] == 0).all()
+    acting = found.values[:, column["contact.f acting"]]
+    told = device.__globals__["told"]  # type: ignore[attr-defined]
+    forces = {round(time * 1000): force for time, force in told if force is not None}
+    # What acts from tick k on is recorded at tick k + 1, as it was just before that.
+    for tick in range(len(acting) - 1):
+        assert forces[tick] == pytest.approx(-acting[tick + 1], abs=1e-12)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_a_device_may_be_in_c(tmp_path: Path) -> None:
+    text = "double apc_device(double time, const double *force) { return force ? -*force : 2 * time; }"
+    (tmp_path / "d.c").write_text(text, encoding="utf-8")
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", "d.so", "d.c"], cwd=tmp_path, check=True)
+    device = device_function(tmp_path / "d.so")
+    assert device(1.5, None) == 3.0
+    assert device(1.5, 0.25) == -0.25
+    with pytest.raises(ApcError, match="E966"):
+        device_function(tmp_path / "d.txt")
+
+
+def test_all_peers_of_a_scene_on_this_machine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = replaced(MOVING, ("{count: 3,", "{count: 2,"), ("delay: 8 ms}", "delay: 8 ms, loss: 20 %}"))
+    Path("three.yaml").write_text(text, encoding="utf-8")
+    ran = subprocess.run(
+        [sys.executable, "-m", "apc", "play", "--duration", "2 s", "--emulate", "--json"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    told = json.loads(ran.stdout)
+    assert told["why_not"] == ""
+    assert max(far for far, _ in told["apart"].values()) <= 1e-9
+    for way in told["ways"]:
+        assert 0.05 < way["came"]["lost"]["share"] < 0.4  # of 250, of which 20 % are lost: 6 deviations
+    run_folder = next(Path().glob("*.run"))
+    assert run(["compare", str(run_folder)]) == 0
+    assert "packets were held back and lost at the sender" in capsys.readouterr().out
+    (run_folder / "user-1.npz").write_bytes(b"PK")
+    assert run(["compare", str(run_folder)]) == 1
+    assert "E963" in capsys.readouterr().err
+
+
+def test_what_cant_be_played_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("three.yaml").write_text(MOVING, encoding="utf-8")
+    taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    taken.bind(("127.0.0.1", 0))
+    port = taken.getsockname()[1]
+    other = ["--to", "user[2]=127.0.0.1:1", "--to", "user[3]=127.0.0.1:2"]
+    Path("own").mkdir()
+    Path("own/thesis.txt").write_text("mine", encoding="utf-8")
+    Path("short.txt").write_text("abc", encoding="utf-8")
+    listed = [
+        (["--peer", "user[4]", *other], "E960 a peer wants one of user[1], user[2], user[3], got user[4]."),
+        (["--peer", "user[1]", "--to", "user[2]=127.0.0.1:1"], 'Write: --to "user[3]=HOST:PORT"'),
+        (["--peer", "user[1]", "--listen", "nowhere", *other], "E961 an address wants HOST:PORT"),
+        (["--peer", "user[1]", "--to", "user[2]"], "E961 an address wants PEER=HOST:PORT"),
+        (["--peer", "user[1]", "--listen", f"127.0.0.1:{port}", *other], f"can't listen at 127.0.0.1:{port}"),
+        (["--peer", "user[1]", *other, "--wait", "100 ms"], "user[2], user[3] did not say within 0.1 s"),
+        (["--peer", "user[1]", *other, "--device", "no.py"], "E966"),
+        (["--out", "own"], "E963 is there already, and is no folder of a run"),
+        (["--secret-file", "short.txt"], "E964 a secret wants 16 bytes or more, got 3."),
+        (["--secret-file", "none.txt"], "E964"),
+    ]  # fmt: skip
+    for words, message in listed:
+        assert run(["play", "three.yaml", "--duration", "1 s", *words]) == 1, words
+        assert message in " ".join(capsys.readouterr().err.split()), words
+    assert Path("own/thesis.txt").read_text(encoding="utf-8") == "mine"
+    Path("empty").mkdir()
+    assert run(["compare", "empty"]) == 1
+    assert "E963" in capsys.readouterr().err
+    alone = replaced(MOVING, ("{count: 3,", "{count: 65,"))
+    Path("many.yaml").write_text(alone, encoding="utf-8")
+    assert run(["play", "many.yaml", "--duration", "1 s"]) == 1
+    assert "E965 65 peers would be as many processes: at most 64" in capsys.readouterr().err
+    taken.close()
+
+
+def test_a_ways_delays_begin_with_the_first_that_came_and_end_with_the_last(scene: CompiledSystem) -> None:
+    loop = next(loops(scene, "1"))
+    loop.player.arrivals = [(0, 1, 5, 40, 50), (0, 1, 7, 56, 70), (0, 2, 1, 8, 9)]
+    found = delays_of(run_of(loop, DIGEST, ()), 0, 1)
+    assert np.isinf(found[1])
+    assert found[[0, 2]] == pytest.approx([10e-9, 14e-9])
+    assert struct.calcsize("<d") == 8
