@@ -88,7 +88,7 @@ HOUSE = (
         hands errors network box
         """,
     ),
-    ("apc.hands", "port certify passivity box response norms asked answers viscosity feel"),
+    ("apc.hands", "port certify passivity box response norms asked answers populations viscosity feel"),
     (
         "apc.vary",
         """

@@ -28,6 +28,11 @@ SHORT = "simulate scene.yaml --duration 16ms"
             "analyze scene.yaml --method krylov",
             "E804 1 different peers of up to 8 states take about 6.4 kB",
         ),
+        (
+            AVERAGE,
+            "analyze scene.yaml --method determinant",
+            "E804 2 determinants of 2 peers that differ take about 49.6 kB",
+        ),
         (AVERAGE, SHORT, "E874 3 peers hold 213 numbers in a frame, which take about 13.6 kB"),
         (LOSSY, f"{SHORT} --runs 400", "E876 400 runs take about 120 kB"),
         (

@@ -327,6 +327,15 @@ def test_a_box_of_two_kinds_of_devices_is_proved() -> None:
     assert prove_box(system, [parse_range(system, "contact.stiffness=±0.5%")]).stable
 
 
+def test_cells_are_halved_where_that_makes_them_easier_to_prove() -> None:
+    """At so soft a contact it alone says what damping is needed, and the other range what can be proved."""
+    system = compiled(users(2, 75))
+    boxes = ("contact.stiffness=100 N/m:120 N/m", "coordination.stiffness=73 N/m:83 N/m")
+    found = prove_box(system, [parse_range(system, one) for one in boxes])
+    assert found.stable
+    assert found.cells < 40
+
+
 def test_no_box_is_proved_where_hands_pull_unevenly_or_a_velocity_is_sampled() -> None:
     with pytest.raises(ApcError, match=r"E930.*unevenly"):
         system = compiled(replaced(STAR, ("stiffness: 500", "stiffness: 100")))

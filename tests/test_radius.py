@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.frame.radius import FLOATS, RADII, radius_of, rounded, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, radius_of, rounded, solve, value_of, with_radius
 
 
 def _fractions(matrix: Any) -> Any:
@@ -75,3 +76,17 @@ def test_many_at_once_are_what_each_is_alone() -> None:
             np.testing.assert_allclose(many[one], alone, rtol=1e-14)
     one = RADII.exact(np.array(1.0))
     assert one.tolist() == [1.0, 0.0]
+
+
+def test_a_system_whose_states_are_of_unlike_units_is_solved_for_all_within_wide_radii() -> None:
+    """[1 ±50; ±0.001 1] x = 1: every determinant is within 0.05 of 1, though no row is small."""
+    wide = np.array([[0.0, 50.0], [1e-3, 0.0]])
+    found = solve(with_radius(np.eye(2), wide), RADII.exact(np.ones((2, 1))))
+    assert found is not None
+    for a, b in itertools.product((Fraction(-50), Fraction(0), Fraction(50)), (-1e-3, 0.0, 1e-3)):
+        c = Fraction(b)
+        true = np.array([[(1 - a) / (1 - a * c)], [(1 - c) / (1 - a * c)]], dtype=object)
+        assert _within(found, true)
+    # What there is at least: (1 − |F|)⁻¹ |F| 1, here (50.05, 0.051)/0.95.
+    np.testing.assert_allclose(radius_of(found)[:, 0], [50.05 / 0.95, 0.051 / 0.95], rtol=5e-3)
+    assert solve(with_radius(np.eye(2), 50 * wide), RADII.exact(np.ones((2, 1)))) is None

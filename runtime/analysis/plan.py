@@ -1,7 +1,7 @@
 """How a system is going to be analysed: by which method, as which systems.
 
 Takes: a `CompiledSystem` with its Jacobians, schedules and numbers, and the exchange between its peers.
-Gives: `Plan`, `make_plan`; `refuse_varying`, `is_large_ring`.
+Gives: `Plan`, `make_plan`; `refuse_varying`, `is_large_ring`, `not_populations`.
 Guarantees: nothing is solved, and no matrix of a whole system is built.
 Does not: analyse (see `analysis`).
 """
@@ -45,6 +45,8 @@ LONG_LINES = 60
 
 # Bytes of an entry of a system's matrix: of each system what is told of it, of the one at work all it needs.
 KEPT, AT_WORK = 200, 500
+# Bytes of an entry of a determinant's matrix, of what all send by what all hear: of each site, and at work.
+KEPT_OF_SITE, SITE_AT_WORK = 200, 6000
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +116,7 @@ def make_plan(
     assert method in METHODS and method != PAPER, f"no such method: {method}"
     refuse_varying(system, jacobians)
     if method in ("auto", "determinant", "krylov"):
-        reason = _not_populations(system, jacobians)
+        reason = not_populations(system, jacobians)
         if method == "krylov" and reason:
             raise cannot_serve(system, method, reason)
         whole = method == "krylov" or (method == "determinant" and _prompt(schedules, numbers, exchange))
@@ -150,7 +152,11 @@ def make_plan(
             KEPT * sum(loop.states**2 for loop in loops) + AT_WORK * max(loop.states for loop in loops) ** 2
         )
         what = f"{len(loops):,} systems of up to {max(loop.states for loop in loops):,} states"
-        refuse_beyond(needed, "E804", Place(exchange.scene), what, "fewer peers that differ, or fewer states")
+    else:
+        needed = sum(_determinant_bytes(loop) for loop in loops)
+        sites = sum(len(loop.sites) for loop in loops)
+        what = f"{len(loops):,} determinants of {sites:,} peers that differ"
+    refuse_beyond(needed, "E804", Place(exchange.scene), what, "fewer peers that differ, or fewer states")
     return Plan(found, groups, loops, False, _sizes(loops, found), notes)
 
 
@@ -179,6 +185,14 @@ def _sizes(loops: Sequence[Loop], method: str) -> tuple[tuple[int, int], ...]:
     return tuple((count, size) for size, count in found.items())
 
 
+def _determinant_bytes(loop: Loop) -> int:
+    """Return what the sites of a loop take, each known by what all send and hear."""
+    entries = sum(len(one.schedule.sent) for one in loop.sites) * sum(
+        len(one.schedule.heard) for one in loop.sites
+    )
+    return (KEPT_OF_SITE * len(loop.sites) + SITE_AT_WORK) * entries
+
+
 def _refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
     """Refuse so many peers before each of them is looked at."""
     states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
@@ -186,7 +200,7 @@ def _refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
         raise too_large(exchange, f"{exchange.peers:,} peers", states)
 
 
-def _not_populations(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> str:
+def not_populations(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> str:
     """Say why peers can't be taken by the thousand, "" if they can."""
     for kind, site in zip(system.kinds, jacobians, strict=True):
         if site.edges:

@@ -227,6 +227,6 @@ def too_large(exchange: Exchange, what: str, states: int) -> ApcError:
             "E804",
             Place(exchange.scene),
             f"{what} make one system of {states:,} states; the matrix of one may have {MOST_STATES:,}",
-            hint="--method auto: linear peers without edge functions need no such matrix",
+            hint="fewer peers that differ; apc analyze --method auto needs no such matrix of linear ones",
         )
     )

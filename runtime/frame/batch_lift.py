@@ -1,7 +1,8 @@
 """One frame of many sites of one kind as linear maps, all at once.
 
-Takes: the Jacobians of a kind, a `Schedule`, and the matrices of many sites as rows (see `linearize_rows`).
-Gives: `lift_rows`.
+Takes: the Jacobians of a kind, a `Schedule`, and the matrices of many sites as rows (see `linearize_rows`);
+or those of many sites as one `LinearSite`.
+Gives: `lift_rows`, `lift_sites`.
 Guarantees: the maps are those of `lift`, to rounding; every matrix comes with a bound on its error, entry by
 entry, wider than that of `lift`, as no ball arithmetic is done.
 Does not: decide which sites are alike (see `peers`), or close a loop (see `populations`).
@@ -58,6 +59,25 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedSi
         What happens in a frame.
     rows
         The sites' matrices (k, …), from `linearize_rows`.
+    """
+    check_packets(schedule)
+    parts = [
+        lift_sites(sites_of_rows(site, rows[start : start + CHUNK]), schedule)
+        for start in range(0, len(rows), CHUNK)
+    ]
+    whole, error = (_joined(maps) for maps in (parts, [one.error for one in parts]))
+    return named(site.kind, schedule, whole, error, estimated=any(one.estimated for one in parts))
+
+
+def lift_sites(sites: LinearSite, schedule: Schedule) -> LiftedSite:
+    """Compose the events of a frame for many sites, few enough for their maps to be at hand at once.
+
+    Parameters
+    ----------
+    sites
+        Their matrices (k, …).
+    schedule
+        What happens in a frame.
 
     Notes
     -----
@@ -65,21 +85,14 @@ def lift_rows(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedSi
     with the roundings it reports. Where stiffness and damping nearly cancel over many ticks that grows
     without measure, whatever the errors are: beyond `HOPELESS` they are estimated, see `_perturbed`.
     """
-    check_packets(schedule)
-    parts: list[tuple[FrameMap, FrameMap]] = []
-    estimated = False
-    for start in range(0, len(rows), CHUNK):
-        many = sites_of_rows(site, rows[start : start + CHUNK])
-        steps = {
-            duration: exponential_rows(many.a, many.b, float(duration * schedule.quantum))
-            for duration in step_durations(schedule)
-        }
-        frame, error = bounded(many, schedule, steps)
-        if not (error.largest <= HOPELESS).all():
-            error, estimated = _perturbed(many, schedule, steps, frame), True
-        parts.append((frame, error))
-    frames, errors = zip(*parts, strict=True)
-    return named(site.kind, schedule, _joined(frames), _joined(errors), estimated=estimated)
+    steps = {
+        duration: exponential_rows(sites.a, sites.b, float(duration * schedule.quantum))
+        for duration in step_durations(schedule)
+    }
+    frame, error = bounded(sites, schedule, steps)
+    if estimated := not (error.largest <= HOPELESS).all():
+        error = _perturbed(sites, schedule, steps, frame)
+    return named(sites.kind, schedule, frame, error, estimated=estimated)
 
 
 def _joined(frames: Sequence[FrameMap]) -> FrameMap:

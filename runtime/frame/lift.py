@@ -68,6 +68,17 @@ class BoundedMap(FrameMap):
 
     error: FrameMap
 
+    @property
+    def bounded(self) -> FrameMap:
+        """The map with its errors as radii."""
+        return self.mapped(with_radius, self.error)
+
+    def row(self, place: int) -> BoundedMap:
+        """Return one map of many."""
+        return BoundedMap(
+            *self.mapped(lambda block: block[place]).blocks, self.error.mapped(lambda block: block[place])
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class LiftedSite(BoundedMap):
@@ -80,11 +91,6 @@ class LiftedSite(BoundedMap):
     continuous: int  # the first so many entries of z are continuous states
     frame_s: float
     estimated: bool = False
-
-    @property
-    def bounded(self) -> FrameMap:
-        """The map with its errors as radii."""
-        return self.mapped(with_radius, self.error)
 
 
 def lift(site: LinearSite, schedule: Schedule, *, exact: LinearSite | None = None) -> LiftedSite:

@@ -28,6 +28,9 @@ from apc.frame.discretize import UNIT
 
 Matrix = NDArray[Any]
 
+# What a bound is larger than the least, relatively, so that rounding leaves no doubt of it.
+SPARED = 1e-3
+
 # Terms of a sum worth counting one by one, as many may be exactly zero.
 FEW = 16
 
@@ -114,8 +117,8 @@ def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
     Notes
     -----
     With an inverse Y in floats and F = I − Y M, an X in floats is off by E ≤ B + |F| E, B = |Y (R − M X)|.
-    For any T ≥ B with |F| T ≤ θ T, entry by entry, that is at most T/(1 − θ): T is B, or, where entries of B
-    are far apart, B and a little of the largest of its column.
+    For any T > 0 with B + |F| T ≤ T, entry by entry, E ≤ T (B being positive, |F| T < T, so that powers of
+    |F| die out). T is (I − |F|)⁻¹ B, which is the least there is, and the same of a little of itself.
     """
     n = matrix.shape[-1]
     try:
@@ -127,12 +130,13 @@ def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
     left = _multiply(exact, RADII.subtract(right, _multiply(matrix, _exact(found))))
     off = np.abs(value_of(left)) + radius_of(left) + np.finfo(np.float64).tiny
     size = (np.abs(value_of(wrong)) + radius_of(wrong)) * (1 + n * UNIT)
-    for spread in (0.0, 4 * float(size.sum(axis=1).max(initial=0.0))):
-        bound = off + spread * off.max(axis=0, initial=0.0)
-        share = float((size @ bound / bound).max(initial=0.0))
-        if share < 0.5:
-            return with_radius(found, bound * (1 + 8 * UNIT) / (1 - share))
-    return None
+    try:
+        grown = np.linalg.inv(np.eye(n) - size)
+        bound = grown @ (off + SPARED * (grown @ off))
+    except np.linalg.LinAlgError:
+        return None
+    serves = (bound > 0) & ((off + size @ bound) * (1 + (n + 4) * UNIT) <= bound)
+    return with_radius(found, bound) if serves.all() else None
 
 
 def _solve_floats(matrix: Matrix, right: Matrix) -> Matrix | None:

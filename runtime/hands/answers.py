@@ -1,7 +1,8 @@
 """How peers answer a push at one of them, put together from the answers of modes.
 
 Takes: a `CompiledSystem` with what `analysis.prepare` made of it, and two devices.
-Gives: `Modes`, `open_modes`; `Responses`, `Weights`.
+Gives: `AbstractResponses`; `many_differ`; `Modes`, `open_modes`; `Responses`, `Weights`; `held_device`,
+`check_kicks`, `copy_of`, `nothing`.
 Guarantees: an answer is exact for the sampled, held and sent signals of the scene, with a bound on its
 rounding.
 Does not: ask whether the scene is stable.
@@ -12,25 +13,30 @@ mean, a push at one of them is 1/n of the first and 1 − 1/n of the second.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.analysis import Prepared, lifted_groups, timed
+from apc.analysis.plan import not_populations
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.vectors import whole_and_index
 from apc.eigen.closing import Loop
 from apc.eigen.modes import arrange, dense_loop
-from apc.eigen.peer_group import MOST_STATES, PeerGroup
+from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, used_ways
+from apc.eigen.peers import more_differ
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import OWN_MASS, Device, find_device
 from apc.frame.discretize import UNIT
-from apc.frame.exchange import Exchange
+from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.parameters import resolve
+from apc.frame.schedule import Propagate
 from apc.hands.asked import Port
-from apc.hands.response import Carried, Pushed, add, open_site, pushed_loop, spectra
+from apc.hands.response import Carried, Pushed, add, open_site, pushed_loop, scaled, spectra
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -64,6 +70,29 @@ class Modes:
     other: Device
 
 
+def many_differ(system: CompiledSystem, prepared: Prepared) -> bool:
+    """Say whether more peers differ than one system holds, and all are linear and hear all others.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    """
+    numbers = resolve(system)
+    prepared = timed(system, prepared, numbers)
+    exchange = build_exchange(system, numbers.timings)
+    ways = used_ways(prepared.schedules)
+    if not_populations(system, prepared.jacobians) or not all(exchange.is_complete(one.link) for one in ways):
+        return False
+    largest = 1
+    for group, schedule in zip(system.groups, prepared.schedules, strict=True):
+        kind = system.kinds[group.kind]
+        each = 2 * len(kind.states) + 1 + len(kind.holds)  # what is kicked and read of an interval
+        intervals = sum(isinstance(event, Propagate) for event in schedule.events)
+        largest = max(largest, states_of(schedule, prepared.jacobians[group.kind]) + each * intervals)
+    return more_differ(system, prepared.jacobians, numbers, exchange, max(1, MOST_TOGETHER // largest))
+
+
 def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> tuple[Modes, Exchange]:
     """Open all peers of a scene, and put them together to modes."""
     groups, exchange = lifted_groups(system, prepared=prepared)
@@ -76,25 +105,12 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
                 continue
             along = port.peer in group.peers or whole_and_index(port.part)[1]
             named = one.part or (port.part if along else "")
-            device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=named)
-            if not isinstance(device, Device):
-                what = device or f"{group.name} has no device"
-                moving = [state.name for state in group.jacobians.kind.states]
-                meant = next((n for n in moving if whole_and_index(n)[1] == 1 and n in what), "")
-                if not meant and any(n.startswith("device.") for n in moving) and named != "device":
-                    meant = "device"
-                hint = f"--at with the part that is held, as {group.name}[1].{meant}" if meant else ""
-                hint = hint if device else OWN_MASS
-                raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
-            held[one] = device
+            held[one] = device = held_device(system, group, named, unit_of)
         if device is None:
-            device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
-        kicks = len(group.schedule.events) * len(group.site.a)
-        if kicks > MOST_KICKS:
-            what = f"a frame of {group.name} has too many events and states: {kicks:,} together"
-            hint = f"{MOST_KICKS:,} at most"
-            raise ApcError(Mistake("E933", Place(system.origin.topology), what, hint=hint))
-        own, site = open_site(group, device if isinstance(device, Device) else None)
+            found = find_device(group.jacobians, group.parameters, unit_of, group.listening)
+            device = found if isinstance(found, Device) else None
+        check_kicks(system, group)
+        own, site = open_site(group, device)
         opened.append(own)
         sites[id(own.schedule)] = site
     plain, wide = _arranged(system, groups, exchange), _arranged(system, opened, exchange)
@@ -120,6 +136,36 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
                 apart[place] = number
     bases = tuple(find_rigid_modes(loop).basis for loop in plain)
     return Modes(loops, bases, apart, class_of, counts, held[port], held[other]), exchange
+
+
+def held_device(system: CompiledSystem, group: PeerGroup, part: str, unit_of: Mapping[str, str]) -> Device:
+    """Return the device of a group that a hand holds, `part` of its peers or the only one; or refuse it.
+
+    Raises
+    ------
+    ApcError
+        E931 no device, or none that can be told.
+    """
+    device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=part)
+    if isinstance(device, Device):
+        return device
+    what = device or f"{group.name} has no device"
+    moving = [state.name for state in group.jacobians.kind.states]
+    meant = next((n for n in moving if whole_and_index(n)[1] == 1 and n in what), "")
+    if not meant and any(n.startswith("device.") for n in moving) and part != "device":
+        meant = "device"
+    hint = f"--at with the part that is held, as {group.name}[1].{meant}" if meant else ""
+    hint = hint if device else OWN_MASS
+    raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+
+
+def check_kicks(system: CompiledSystem, group: PeerGroup) -> None:
+    """Refuse a peer of too many events and states in a frame: ApcError E933."""
+    kicks = len(group.schedule.events) * len(group.site.a)
+    if kicks > MOST_KICKS:
+        what = f"a frame of {group.name} has too many events and states: {kicks:,} together"
+        hint = f"{MOST_KICKS:,} at most"
+        raise ApcError(Mistake("E933", Place(system.origin.topology), what, hint=hint))
 
 
 def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
@@ -149,42 +195,26 @@ class Weights:
     apart: dict[tuple[int, int], float]
 
 
-class Responses:
-    """The answers to a push of one peer, put together from those of modes."""
+class AbstractResponses(ABC):
+    """The answers to a push of one peer's `device`: its own, and what of it arrives at the `other` device.
 
-    def __init__(self, modes: Modes, peer: int, other: int) -> None:
-        self.modes = modes
-        self.peer, self.across = peer, other
-        self.own, self.to = modes.class_of[peer], modes.class_of[other]
-        self.device, self.other = modes.device, modes.other
-        _, axis = whole_and_index(modes.device.part)
-        self.copies = [_copy(site.group, axis) for site in modes.loops[0].sites]
-        named = self.copies[self.own]
-        self.copy = named[0] if named else ""
+    `copy` is what of the peer others are told of, "" if nothing; `exchange` are the links, `frame` is in s;
+    `drifting` says that the scene may rest anywhere.
+    """
 
-    def at(self, s: Complex, aliases: Sequence[int] = (0,)) -> list[Carried]:
-        """Return the velocity here at each alias, the velocity there, and the copy's error (k,)."""
-        common = self.modes.loops[0]
-        n = self.modes.members[self.own]
-        copies = [(place, one[1], 0) for place, one in enumerate(self.copies) if one]
-        here, there, own = self.device.velocity, self.other.velocity, self.copies[self.own]
-        wanted = [(self.own, here, alias) for alias in aliases]
-        wanted = [*wanted, (self.to, there, 0), *copies]
-        together = [_scaled(one, 1 / n) for one in spectra(common, self.own, wanted, s)]
-        velocity, (across, *rest) = together[: len(aliases)], together[len(aliases) :]
-        parts = dict(zip([place for place, _, _ in copies], rest, strict=True))
-        apart: list[Carried] = []
-        if n > 1:
-            loop = self.modes.loops[self.modes.apart[self.own]]
-            rows = [(0, here, alias) for alias in aliases]
-            rows += ([(0, there, 0)] if self.own == self.to else []) + ([(0, own[1], 0)] if own else [])
-            apart = spectra(loop, 0, rows, s)
-            velocity = [add(a, _scaled(b, 1 - 1 / n)) for a, b in zip(velocity, apart, strict=False)]
-            if self.own == self.to:
-                share = 1 - 1 / n if self.peer == self.across else -1 / n
-                across = add(across, _scaled(apart[len(aliases)], share))
-        error = self._error(parts, apart[-1] if own and n > 1 else None, len(s))
-        return [*velocity, across, error]
+    exchange: Exchange
+    device: Device
+    other: Device
+    copy: str
+    frame: float
+    drifting: bool
+
+    @abstractmethod
+    def at(self, s: Complex, aliases: Sequence[int] = (0,), *, apart: bool = True) -> list[Carried]:
+        """Return the velocity here at each alias, the velocity there, and the copy's error (k,).
+
+        The last is 0 unless it is asked how far copies are `apart`.
+        """
 
     def steady(self, s: Complex, aliases: Sequence[int]) -> list[Carried]:
         """Return the same on the imaginary axis, at multiples of the frame rate too.
@@ -195,10 +225,9 @@ class Responses:
         response has a value: the mean over a circle about s. Its mean against the direction is 0 if no pole
         is within.
         """
-        turns = s.imag * float(self.modes.loops[0].frame) / (2 * np.pi)
-        drifting = any(basis.size for basis in self.modes.bases)
-        near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5) & drifting
-        found = [(np.zeros(len(s), complex), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
+        turns = s.imag * self.frame / (2 * np.pi)
+        near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5) & self.drifting
+        found = [nothing(s) for _ in range(len(aliases) + 2)]
         if not near.all():
             for (value, off), (own, doubt) in zip(found, self.at(s[~near], aliases), strict=True):
                 value[~near], off[~near] = own, doubt
@@ -211,6 +240,46 @@ class Responses:
                 value[place] = inner.mean()
                 off[place] = abs(own[:AROUND].mean() - value[place]) + pole + doubt.max()
         return found
+
+
+class Responses(AbstractResponses):
+    """The answers to a push of one peer, put together from those of modes."""
+
+    def __init__(self, modes: Modes, exchange: Exchange, peer: int, other: int) -> None:
+        self.modes, self.exchange = modes, exchange
+        self.peer, self.across = peer, other
+        self.own, self.to = modes.class_of[peer], modes.class_of[other]
+        self.device, self.other = modes.device, modes.other
+        self.copies = [copy_of(site.group, modes.device) for site in modes.loops[0].sites]
+        named = self.copies[self.own]
+        self.copy = named[0] if named else ""
+        self.frame = float(modes.loops[0].frame)
+        self.drifting = any(basis.size for basis in modes.bases)
+
+    def at(self, s: Complex, aliases: Sequence[int] = (0,), *, apart: bool = True) -> list[Carried]:
+        """Return the velocity here at each alias, the velocity there, and the copy's error (k,)."""
+        common = self.modes.loops[0]
+        n = self.modes.members[self.own]
+        copies = [(place, one[1], 0) for place, one in enumerate(self.copies) if one and apart]
+        here, there, own = self.device.velocity, self.other.velocity, self.copies[self.own]
+        wanted = [(self.own, here, alias) for alias in aliases]
+        wanted = [*wanted, (self.to, there, 0), *copies]
+        together = [scaled(one, 1 / n) for one in spectra(common, self.own, wanted, s)]
+        velocity, (across, *rest) = together[: len(aliases)], together[len(aliases) :]
+        parts = dict(zip([place for place, _, _ in copies], rest, strict=True))
+        alone: list[Carried] = []
+        if n > 1:
+            loop = self.modes.loops[self.modes.apart[self.own]]
+            rows = [(0, here, alias) for alias in aliases]
+            rows += [(0, there, 0)] if self.own == self.to else []
+            rows += [(0, own[1], 0)] if own and apart else []
+            alone = spectra(loop, 0, rows, s)
+            velocity = [add(a, scaled(b, 1 - 1 / n)) for a, b in zip(velocity, alone, strict=False)]
+            if self.own == self.to:
+                share = 1 - 1 / n if self.peer == self.across else -1 / n
+                across = add(across, scaled(alone[len(aliases)], share))
+        error = self._error(parts, alone[-1] if own and n > 1 else None, s) if apart else nothing(s)
+        return [*velocity, across, error]
 
     @property
     def velocity_weights(self) -> Weights:
@@ -244,28 +313,28 @@ class Responses:
             if one and one[0] == self.copy
         }
 
-    def _error(self, parts: dict[int, Carried], apart: Carried | None, count: int) -> Carried:
+    def _error(self, parts: dict[int, Carried], apart: Carried | None, s: Complex) -> Carried:
         """Return how far the copy here is from the mean of all others' of its name."""
         others = self._others()
         total = sum(others.values())
-        nothing = np.zeros(count, complex), np.zeros(count)
         if not total:
-            return nothing
+            return nothing(s)
         found = parts[self.own]
         for place, many in others.items():
-            found = add(found, _scaled(parts[place], -many / total))
+            found = add(found, scaled(parts[place], -many / total))
         if apart is not None:
             # One peer less the mean of its class moves by 1 − 1/n here, and by −1/n at each of the others.
             n = self.modes.members[self.own]
-            found = add(found, _scaled(apart, (1 - 1 / n) * (1 + 1 / total)))
+            found = add(found, scaled(apart, (1 - 1 / n) * (1 + 1 / total)))
         return found
 
 
-def _copy(group: PeerGroup, axis: int) -> tuple[str, int] | None:
+def copy_of(group: PeerGroup, device: Device) -> tuple[str, int] | None:
     """Return what a peer tells others the position of, and which state that is; None if nothing.
 
-    Of a position with several axes it is the one along that of the device, or 0 for the only one.
+    Of a position with several axes it is the one along that of the device that is pushed.
     """
+    _, axis = whole_and_index(device.part)
     kind = group.jacobians.kind
     for send, sending in zip(group.site.sends, kind.sends, strict=True):
         for row, unit in zip(send.x, sending.units, strict=True):
@@ -277,5 +346,6 @@ def _copy(group: PeerGroup, axis: int) -> tuple[str, int] | None:
     return None
 
 
-def _scaled(one: Carried, share: float) -> Carried:
-    return one[0] * share, one[1] * abs(share) + 2 * UNIT * np.abs(one[0] * share)
+def nothing(s: Complex) -> Carried:
+    """Return 0 at each s (k,)."""
+    return np.zeros(len(s), np.complex128), np.zeros(len(s))

@@ -53,6 +53,7 @@ from apc.eigen.balls import (
 from apc.eigen.closing import ClosedSystem, close_loop
 from apc.eigen.dissipation import is_positive, least_real, proves_positive_between
 from apc.eigen.modes import split
+from apc.eigen.pseudospectrum import balance
 from apc.eigen.ratios import Ratio
 from apc.eigen.rigid import find_rigid_modes, stays_rigid
 from apc.frame.devices import refuse_hands
@@ -176,15 +177,28 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question | st
         cuts.append(
             _Cut(close_loop(loop), own_sites, own_dampings, cut, _unfelt(port.maps, rigid.get(loop.name, 0)))
         )
-    asked = (system, prepared, tuple(ranges), tuple(cuts))
-    found = _Question(*asked, np.ones(len(ranges)))
-    weights = []
-    for place, varied in enumerate(ranges):
-        point = [(one.low + one.high) / 2 for one in ranges]
-        ends = [[*point[:place], end, *point[place + 1 :]] for end in (varied.low, varied.high)]
-        low, high = (_growth_at(found, one, bounded=False).radius for one in ends)
-        weights.append(abs(high - low) / float(varied.high - varied.low))
-    return _Question(*asked, np.nan_to_num(weights) + np.finfo(np.float64).tiny)
+    weights = np.sum([_matter(one, ranges) for one in cuts], axis=0)
+    return _Question(system, prepared, tuple(ranges), tuple(cuts), weights + np.finfo(np.float64).tiny)
+
+
+def _matter(mode: _Cut, ranges: Sequence[Range]) -> Floats:
+    """Return how much what moves by itself in a mode changes with each range, in units that make it even.
+
+    That is what makes a cell hard to prove, and not how much the damping needed changes.
+    """
+    inner = [rational_ball((one.low + one.high) / 2) for one in ranges]
+    whole = ball_radii(_whole(mode, inner, None))
+    maps = mode.cut.maps(whole, np.zeros(len(mode.dampings)), RADII)
+    found = np.ones(len(ranges))
+    if maps is None:
+        return found
+    scale = balance(np.abs(value_of(maps.a)))
+    for by in range(len(ranges)):
+        slope = ball_radii(mapped(slope_of, _whole(mode, inner, by)))
+        moved = mode.cut.slopes(whole, slope, _dampings(mode, inner, by), mode.free)
+        if moved is not None:
+            found[by] = np.abs(value_of(moved[0]) / scale[:, None] * scale).max(initial=0.0)
+    return found
 
 
 def _translates(system: ClosedSystem, sites: tuple[LinearSite, ...]) -> int:

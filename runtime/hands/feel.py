@@ -23,7 +23,16 @@ from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
-from apc.hands.answers import AROUND, Modes, Responses, Weights, open_modes
+from apc.hands.answers import (
+    AROUND,
+    MOST_TOGETHER,
+    AbstractResponses,
+    Modes,
+    Responses,
+    Weights,
+    many_differ,
+    open_modes,
+)
 from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks_in
 from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
 from apc.hands.viscosity import Viscosity, network_viscosity
@@ -45,6 +54,12 @@ DOUBTED = 10.0
 
 # A speed in 1/s of the slowest motions, and how nearly alike two devices move then.
 SLOWLY, ALIKE = 1e-3, 1e-2
+
+# What is left out where more peers differ than one system holds.
+NO_NORMS = (
+    "left out: the largest gain at any frequency (H∞) and what noise does (H2), which need one system of all "
+    f"peers, and so many that differ have more than {MOST_TOGETHER:,} states and readings in a frame"
+)
 
 # What of slow motions two circles may tell differently, beside the largest.
 SETTLED = 1e-3
@@ -172,8 +187,7 @@ def feel(
     if verdict.stable is False and not unstable:
         raise _unstable(system, verdict.spectral_radius)
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        modes, exchange = open_modes(system, prepared, port, other)
-        responses = Responses(modes, port.peer, other.peer)
+        responses = _responses(system, prepared, port, other)
         s = np.asarray(2j * np.pi * found, dtype=np.complex128)
         own, *aliases, across, error = responses.steady(s, ALIASES)
         one = 1 / own[0]
@@ -186,25 +200,26 @@ def feel(
         slow = _slow(responses) if not quick else None
 
         def damping_of(other_scene: CompiledSystem) -> tuple[float, float] | None:
-            there, _ = open_modes(other_scene, prepare(other_scene), port, other)
-            own = _slow(Responses(there, port.peer, other.peer))
+            own = _slow(_responses(other_scene, prepare(other_scene), port, other))
             return None if own is None else (own.damping, own.errors[1])
 
         if slow is not None:
             # Of slow motions all move alike: none holds back, and none stays behind.
             together = abs(slow.stiffness) <= slow.errors[2] and _alike(responses)
             viscosity = network_viscosity(system, (slow.damping, slow.errors[1]), together, damping_of)
-        hinf = _extremes(modes, responses) if steady else ()
-        h2 = _noise(system, modes, responses) if steady else ()
+        modal = responses if steady and isinstance(responses, Responses) else None
+        hinf = _extremes(modal) if modal else ()
+        h2 = _noise(system, modal) if modal else ()
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     here, there = (
-        f"{exchange.peer_name(one.peer)}.{device.part}"
-        for one, device in ((port, modes.device), (other, modes.other))
+        f"{responses.exchange.peer_name(one.peer)}.{device.part}"
+        for one, device in ((port, responses.device), (other, responses.other))
     )
     notes = {
         "of the map: the scene is unstable": verdict.stable is False,
         "of slow motions nothing is told: something of the scene is slower still": not slow and not quick,
-        "what noise does is not told: the fastest clock has a phase": steady and not h2,
+        "what noise does is not told: the fastest clock has a phase": bool(modal) and not h2,
+        NO_NORMS: steady and not modal,
     }
     return Feel(
         topology=system.name,
@@ -230,11 +245,20 @@ def feel(
     )
 
 
-def _alike(responses: Responses) -> bool:
+def _responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> AbstractResponses:
+    """Return the answers to a push: of modes, or of peers of which more differ than one system holds."""
+    if many_differ(system, prepared):
+        from apc.hands.populations import PopulationResponses
+
+        return PopulationResponses(system, prepared, port, other)
+    modes, exchange = open_modes(system, prepared, port, other)
+    return Responses(modes, exchange, port.peer, other.peer)
+
+
+def _alike(responses: AbstractResponses) -> bool:
     """Say whether the other device moves as this one does as slowly as can be told."""
-    found = responses.steady(np.array([SLOWLY * 1j]), (0,))
-    own, across = found[0][0], found[1][0]
-    return bool(abs(across - own) < ALIKE * abs(own))
+    (own, _), (across, _), _ = responses.at(np.array([SLOWLY * 1j]), apart=False)
+    return bool(abs(across[0] - own[0]) < ALIKE * abs(own[0]))
 
 
 def _unstable(system: CompiledSystem, radius: float) -> ApcError:
@@ -246,7 +270,7 @@ def _unstable(system: CompiledSystem, radius: float) -> ApcError:
     return ApcError(Mistake("E934", Place(system.origin.topology), what, hint=hint))
 
 
-def _slow(responses: Responses) -> Slow | None:
+def _slow(responses: AbstractResponses) -> Slow | None:
     """Return mass, damping and stiffness at low frequency, None where they can't be told.
 
     Notes
@@ -260,7 +284,7 @@ def _slow(responses: Responses) -> Slow | None:
     least = SETTLED
     for _ in range(HALVINGS):
         s = radius * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
-        (velocity, off), *_ = responses.at(s)
+        (velocity, off), *_ = responses.at(s, apart=False)
         values, powers = s / velocity, radius ** np.arange(3)
         doubt = float((np.abs(values) * off / np.abs(velocity)).max())
         found = np.array([(values / s**power).mean().real for power in range(3)])
@@ -276,9 +300,9 @@ def _slow(responses: Responses) -> Slow | None:
     return best
 
 
-def _extremes(modes: Modes, responses: Responses) -> tuple[Extremes, ...]:
+def _extremes(responses: Responses) -> tuple[Extremes, ...]:
     """Return the H∞ norms of the modes that the pushed peer is in."""
-    found = []
+    modes, found = responses.modes, []
     for number in (0, modes.apart.get(responses.own)):
         if number is None:
             continue
@@ -294,9 +318,9 @@ def _extremes(modes: Modes, responses: Responses) -> tuple[Extremes, ...]:
     return tuple(found)
 
 
-def _noise(system: CompiledSystem, modes: Modes, responses: Responses) -> tuple[Noise, ...]:
+def _noise(system: CompiledSystem, responses: Responses) -> tuple[Noise, ...]:
     """Return what white noise at all peers does to the pushed peer."""
-    ticks = ticks_in(system, float(modes.loops[0].frame))
+    modes, ticks = responses.modes, ticks_in(system, responses.frame)
     if ticks is None:
         return ()
     found = []

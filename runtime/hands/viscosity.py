@@ -86,15 +86,19 @@ def network_viscosity(
     without = felt(fresh)
     if without is None:
         return None
-    groups, _ = lifted_groups(system, prepared=prepare(system))
-    together = together and len(groups) == 1  # unlike ones may differ in what they hold
-    shares = [_by_formula(system, link, group) for link in system.links for group in groups]
-    known = [one for one in shares if one is not None]
     return Viscosity(
-        damping[0] - without[0],
-        damping[1] + without[1],
-        float(sum(known)) if together and len(known) == len(shares) else None,
+        damping[0] - without[0], damping[1] + without[1], _of_equals(system) if together else None
     )
+
+
+def _of_equals(system: CompiledSystem) -> float | None:
+    """Return what the formula comes to, None of peers that differ: they may do so in what they hold."""
+    groups, _ = lifted_groups(system, prepared=prepare(system))
+    if len(groups) > 1:
+        return None
+    shares = [_by_formula(system, link, groups[0]) for link in system.links]
+    known = [one for one in shares if one is not None]
+    return float(sum(known)) if len(known) == len(shares) else None
 
 
 def _by_formula(system: CompiledSystem, link: Link, group: PeerGroup) -> float | None:

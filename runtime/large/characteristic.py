@@ -1,7 +1,8 @@
 """The characteristic function of a population: small, whatever the number of peers and the length of delays.
 
 Takes: the `Transfer`s of all sites, and how what they send comes back to them; circles.
-Gives: `Characteristic`, `characteristic_ball`, `refine`, `null_vectors`, `weights_at`; `count_around`.
+Gives: `Characteristic`, `Matrices`, `matrices_at`, `characteristic_ball`, `refine`, `null_vectors`,
+`weights_at`; `count_around`.
 Guarantees: its value in a disc comes with a bound; an eigenvalue of the whole system is a zero of it, or a
 pole of a site that the zero would have to cancel. A count is right, None says that it can't be told.
 Does not: know who the sites are (see `determinant`), or where zeros may be (see `zeros`).
@@ -60,12 +61,17 @@ def weights_at(function: Characteristic, points: Complexes) -> Complexes:
 
 
 @dataclass(frozen=True, slots=True)
-class _Matrices:
-    """I − T W at ζ + h: `value` + h · `slope`, but for what `doubt` bounds in the disc (z, n, n)."""
+class Matrices:
+    """I − T W at ζ + h: `value` + h · `slope`, but for what `doubt` bounds in the disc (z, n, n).
+
+    `weight` (z, n_r, n_s) is W at ζ, `weight_doubt` what it may be off by anywhere in the disc.
+    """
 
     value: Complexes
     slope: Complexes
     doubt: Floats
+    weight: Complexes
+    weight_doubt: Floats
 
 
 def _weight_slopes(function: Characteristic, points: Complexes) -> Complexes:
@@ -74,8 +80,16 @@ def _weight_slopes(function: Characteristic, points: Complexes) -> Complexes:
     return np.asarray(np.einsum("zl,lrs->zrs", -lags * points[:, None] ** (-lags - 1), function.weights))
 
 
-def _bounded(function: Characteristic, points: Complexes, reach: Floats) -> _Matrices:
-    """Return I − T W at the centres of discs, its slope there, and a bound on the rest in each."""
+def matrices_at(function: Characteristic, points: Complexes, reach: Floats) -> Matrices:
+    """Return I − T W at the centres of discs, its slope there, and a bound on the rest in each.
+
+    Parameters
+    ----------
+    function
+        f.
+    points, reach
+        The discs (z,).
+    """
     lags = np.array(function.lags)
     answer = respond(function.transfers, points, reach)
     weight, weight_slope = weights_at(function, points), _weight_slopes(function, points)
@@ -96,7 +110,7 @@ def _bounded(function: Characteristic, points: Complexes, reach: Floats) -> _Mat
     rounded = value_size @ (size + weight_moved) + slope_size @ size + np.eye(n_s)
     total += PRODUCT_ROUNDINGS * (n_s + n_r + 2) * UNIT * rounded
     slope = -(answer.slope @ weight + answer.value @ weight_slope)
-    return _Matrices(np.eye(n_s) - answer.value @ weight, slope, total)
+    return Matrices(np.eye(n_s) - answer.value @ weight, slope, total, weight, weight_doubt + weight_moved)
 
 
 def characteristic_ball(function: Characteristic, points: Complexes, reach: Floats) -> Ball:
@@ -110,7 +124,7 @@ def characteristic_ball(function: Characteristic, points: Complexes, reach: Floa
         The discs (z,).
     """
     with np.errstate(all="ignore"):
-        found = _bounded(function, points, reach)
+        found = matrices_at(function, points, reach)
     return determinant_ball(found.value, found.slope, found.doubt, reach)
 
 

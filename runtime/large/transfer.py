@@ -134,7 +134,7 @@ def _gathered(
             errors[place] = part.errors
             series += part.series
     used = max(1, 1 + int(np.flatnonzero(series.any(axis=(0, 2, 3))).max(initial=0)))
-    series = series[:, :used]
+    series = series[:, :used].copy()  # a view would keep all terms
     return Transfer(
         inner=inner,
         counts=counts,

@@ -4,7 +4,7 @@ For two, three and five users of the paper's scene: the stiffness of the coordin
 hands, with devices clamped and with every passive hand; the viscosity that the network adds to each copy; how
 far copies are apart a newton of a slow push. The mesh is taken at equal stiffness (dashed) and, as circles,
 at equal effective gain, where it must be the average. Then times: a passive verdict, a thousand frequencies,
-three users and a million.
+three users and a million; a hundred frequencies of a thousand users who all differ, beside one system of ten.
 """
 
 from __future__ import annotations
@@ -18,13 +18,16 @@ from apc.analysis.analysis import prepare
 from apc.api import critical, with_hands
 from apc.benchmark.timing import median_time
 from apc.compiler.compiled import CompiledSystem
+from apc.hands.asked import Port
 from apc.hands.feel import feel
 from apc.hands.passivity import passive_hands
+from apc.hands.populations import PopulationResponses
 from apc.optional import need
 from apc.present.pictures import write_figure
 from apc.present.region_picture import PANEL, STYLES
 from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
+from tests.populations import different
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 PEERS = (2, 3, 5)
@@ -41,6 +44,9 @@ NEAR = 2e-5  # what two digits behind the point leave open
 
 # Seconds: a verdict, a response of so many frequencies; a million users may take so many times what three do.
 VERDICT_S, RESPONSE_S, FREQUENCIES, MILLION = 0.020, 0.050, 1000, 1.5
+
+# Users who all differ, few enough for one system, and many; frequencies, seconds; how far two ways are apart.
+FEW, MANY, SOME, MANY_S, APART = 10, 1000, 100, 6.0, 1e-9
 
 
 def scene(text: str, peers: int, stiffness: float) -> CompiledSystem:
@@ -80,6 +86,7 @@ def main() -> None:
         felt = {name: [viscosity(text, peers, STIFFNESS) for peers in PEERS] for name, text in SCENES.items()}
         _alike(judge, bearing, felt)
         _times(judge)
+        _unlike(judge)
     if given.out is not None:
         write_figure(_picture(bearing, felt), given.out)
     judge.end()
@@ -144,6 +151,23 @@ def _times(judge: Judge) -> None:
     for what in ("verdict", "response"):
         ratio = taken[what, 1_000_000] / taken[what, 3]
         _told(judge, f"{what}: a million users beside three", ratio, MILLION)
+
+
+def _unlike(judge: Judge) -> None:
+    """Judge what is felt among users who all differ: peer by peer beside one system of all, and its time."""
+    frequencies = np.geomspace(0.1, 60, SOME)
+    few, many = different(FEW), different(MANY)
+    prepared = prepare(few)
+    one = feel(few, frequencies, quick=True, prepared=prepared)
+    with np.errstate(all="ignore"):
+        alone = PopulationResponses(few, prepared, Port(0, ""), Port(1, ""))
+        own = alone.steady(2j * np.pi * frequencies, (0,))[0][0]
+    judge.within(
+        f"{FEW} users who differ: beside one system of all", abs(own * one.impedance - 1).max(), APART
+    )
+    prepared = prepare(many)
+    taken, _ = median_time(lambda: feel(many, frequencies, quick=True, prepared=prepared), 3)
+    _told(judge, f"{SOME} frequencies felt, {MANY:,} users who all differ [s]", taken, MANY_S)
 
 
 def _told(judge: Judge, what: str, value: float, most: float) -> None:
