@@ -30,6 +30,7 @@ from typing import Any
 import casadi
 
 from apc.compiler.frozen import dataclass
+from apc.compiler.language.expression import SMOOTH
 
 _UNARY = {
     name: getattr(casadi, f"OP_{name.upper()}")
@@ -41,7 +42,7 @@ _UNARY = {
 _BINARY = {
     name: getattr(casadi, f"OP_{name.upper()}")
     for name in (
-        *("add", "sub", "mul", "div", "pow", "constpow", "fmin", "fmax"),
+        *("add", "sub", "mul", "div", "pow", "constpow", "fmin", "fmax", "atan2"),
         *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
     )
 }
@@ -82,12 +83,7 @@ RULES: dict[str, Callable[..., Any]] = {
 }
 
 # Those that have no rational value of a rational number.
-ROUNDED: dict[str, Callable[[float], float]] = {
-    name: getattr(math, name)
-    for name in (
-        *("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
-    )
-}
+ROUNDED: dict[str, Callable[..., float]] = {name: getattr(math, name) for name in ("sqrt", "atan2", *SMOOTH)}
 _WORD = re.compile(r"[a-zA-Z][a-zA-Z0-9]*(_[a-zA-Z0-9]+)*\Z", re.ASCII)  # what CasADi takes as a name
 LONGEST_WORD = 200
 # CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken

@@ -21,6 +21,7 @@ from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
+    SMOOTH,
     Binary,
     Call,
     Conditional,
@@ -44,7 +45,7 @@ CONNECTION = "connection"  # where an equation comes from that is no part's
 _HELD = "held"  # with a number behind it, the name of an expression that is held
 
 # The functions whose value hangs on those of their arguments at the same moment, and on nothing else.
-POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "exp", "log", "sin", "cos", "tanh", "floor"))
+POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "floor", "atan2", *SMOOTH))
 
 
 @dataclass(frozen=True, slots=True)
