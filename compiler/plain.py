@@ -30,7 +30,6 @@ from typing import Any
 import casadi
 
 from apc.compiler.frozen import dataclass
-from apc.compiler.language.expression import SMOOTH
 
 _UNARY = {
     name: getattr(casadi, f"OP_{name.upper()}")
@@ -83,7 +82,13 @@ RULES: dict[str, Callable[..., Any]] = {
 }
 
 # Those that have no rational value of a rational number.
-ROUNDED: dict[str, Callable[..., float]] = {name: getattr(math, name) for name in ("sqrt", "atan2", *SMOOTH)}
+ROUNDED: dict[str, Callable[..., float]] = {
+    name: getattr(math, name)
+    for name in (
+        *("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+        "atan2",
+    )
+}
 _WORD = re.compile(r"[a-zA-Z][a-zA-Z0-9]*(_[a-zA-Z0-9]+)*\Z", re.ASCII)  # what CasADi takes as a name
 LONGEST_WORD = 200
 # CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken

@@ -77,25 +77,27 @@ def test_damped_average_is_its_law(delay: int, stiffness: float, injection: floa
 
 
 @pytest.mark.parametrize("delay", [0, 8, 10, 50, 200])
-@pytest.mark.parametrize("age", [0, 12, 40])
-def test_predicted_average_is_its_law(delay: int, age: int) -> None:
+@pytest.mark.parametrize("age", [None, 0, 12, 40])
+def test_predicted_average_is_its_law(delay: int, age: int | None) -> None:
+    """By the age of each packet at each tick, or by a number."""
+
     def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
         push = contact(x)
-        ahead = mean(heard, 0) + age * 1e-3 * mean(heard, 1)
+        ahead = mean(heard, 0) + (mean(heard, 2) if age is None else age * 1e-3) * mean(heard, 1)
         pull = 500 * (x[1][0] - ahead) + 2 * (x[1][1] - mean(heard, 1))
         return [-push, push - pull], memory, []
 
     text = replaced(
         scene("three-users-predicted"),
-        ("age: 12 ms", f"age: {age} ms"),
+        ("damping: 2 N*s/m,", f"damping: 2 N*s/m,{'' if age is None else f' ages: assumed, assumed: {age} ms,'}"),
         ("delay: 8 ms", f"delay: {delay} ms"),
     )
     same(compiled(text), ByHand([[DEVICE, (0.2, 5.0, 0.0)]] * 3, everybody(3), law, told=1, late=delay))
 
 
 def test_a_prediction_of_age_nought_is_the_average() -> None:
-    text = replaced(scene("three-users-predicted"), ("age: 12 ms, ", "age: 0 s, "))
-    average = replaced(text, ("PredictedAverage", "AveragePosition"), (", age: 0 s", ""))
+    text = replaced(scene("three-users-predicted"), ("2 N*s/m,", "2 N*s/m, ages: assumed,"))
+    average = replaced(text, ("PredictedAverage", "AveragePosition"), (" ages: assumed,", ""))
     found, expected = apc.analyze(compiled(text)), apc.analyze(compiled(average))
     assert found.spectral_radius == pytest.approx(expected.spectral_radius, abs=1e-12)
 

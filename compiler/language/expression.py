@@ -131,6 +131,7 @@ FUNCTIONS: dict[str, tuple[int, int]] = {
     "hold": (1, 2),
     "previous": (1, 1),
     "initial": (1, 1),
+    "age": (1, 1),
     "max": (1, 16),
     "min": (1, 16),
     "abs": (1, 1),

@@ -192,6 +192,9 @@ class _Checker:
             case "atan2":  # of the sides of a triangle, whatever their unit
                 self.agree("E404", list(expr.arguments))
                 return DIMENSIONLESS
+            case "age":
+                self.dimension(first)
+                return SECOND
             case "sign" | "count":
                 self.dimension(first)
                 return DIMENSIONLESS
