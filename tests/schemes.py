@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 # What a peer computes at a tick: (peer, its bodies' positions and velocities, the newest packets of the
-# others by peer, each with its age in seconds behind it, its memory) → (forces on the bodies, its memory, what
-# it holds to be sent).
+# others by peer, each with its age in seconds behind it, its memory) → (forces on the bodies, its memory,
+# what it holds to be sent).
 Law = Callable[
     [int, Sequence[tuple[Any, Any]], dict[int, Sequence[Any]], Sequence[Any]], tuple[Any, Any, Any]
 ]

@@ -35,7 +35,7 @@ from apc.eigen.spectrum import (
     solve_spectrum,
 )
 from apc.finite_equations import finite_equations
-from apc.frame.ages import aged, linear_sites
+from apc.frame.ages import at_timings, linear_sites
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.jacobians import SiteJacobians
@@ -330,9 +330,7 @@ def timed(system: CompiledSystem, prepared: Prepared, numbers: Numbers) -> Prepa
     """Return what was prepared, with the schedules of these timings."""
     if numbers.timings == prepared.timings:
         return prepared
-    sites = prepared.jacobians
-    if aged(system):
-        sites = linear_sites(system, numbers.timings, prepared.order)
+    sites = at_timings(system, prepared.jacobians, numbers.timings, prepared.order)
     return _scheduled(system, sites, numbers.timings, prepared.order)
 
 

@@ -1,7 +1,7 @@
 """How old what is heard is, put into the equations: known at each tick, or told by stamps.
 
 Takes: a `CompiledSystem`, its timings.
-Gives: `aged`, `nominal`, `linear_sites`, `stamped`.
+Gives: `aged`, `nominal`, `linear_sites`, `at_timings`, `stamped`.
 Guarantees: a scene that asks for no age is returned as it is. In `nominal`, where every packet arrives after
 its link's delay, an age is a number of each tick, the same in each frame: what multiplies it stays linear. In
 `stamped`, every packet says when it was sent, as in a real network: its age is right whatever happens to it.
@@ -53,6 +53,16 @@ def linear_sites(
 ) -> tuple[SiteJacobians, ...]:
     """Return the Jacobians of each kind of `nominal`, with the system's own timings if none are given."""
     return tuple(jacobians(kind) for kind in nominal(system, timings, order).kinds)
+
+
+def at_timings(
+    system: CompiledSystem,
+    sites: tuple[SiteJacobians, ...],
+    timings: Mapping[str, Fraction],
+    order: Sequence[str],
+) -> tuple[SiteJacobians, ...]:
+    """Return the Jacobians of each kind, those at hand unless ages follow from timings and order."""
+    return linear_sites(system, timings, order) if aged(system) else sites
 
 
 def nominal(
@@ -131,8 +141,8 @@ def _only_delay(system: CompiledSystem, exchange: Exchange, number: int, link: s
     if len(delays) > 1:
         names = ", ".join(sorted(delays))
         what = (
-            f"{system.kinds[number].name} asks for the age of what it hears over {link}, which differs from "
-            f"sender to sender ({names}): that is not analysed; a simulation plays it"
+            f"the age of what peers of {system.kinds[number].name} hear over {link} differs from sender to "
+            f"sender ({names}): that is not analysed; a simulation plays it"
         )
         raise ApcError(Mistake("E811", Place(system.origin.topology), what, hint="apc simulate"))
     return delays.pop() if delays else exchange.usual[link]

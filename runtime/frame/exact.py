@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from apc.compiler.language.expression import SMOOTH
 from apc.compiler.plain import ROUNDED, RULES, PlainFunction, straight, walk
 
 # Functions whose operations are kept: an analysis walks the same few of a scene's kinds many times, and to
@@ -102,7 +101,8 @@ ROWS: dict[str, Callable[..., Any]] = {
     "constpow": _row_power,
     **{
         name: _row_function(getattr(np, f"arc{name[1:]}" if name.startswith("a") else name))
-        for name in ("sqrt", *SMOOTH)
+        for name in ROUNDED
+        if name != "atan2"
     },
     "atan2": _row_angle,
 }
