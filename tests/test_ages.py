@@ -239,7 +239,7 @@ def test_what_was_heard_before_is_what_was_heard_at_the_tick_before(jit: bool, t
 def test_a_constant_velocity_is_predicted_whatever_the_network_does(
     network: str, jit: bool, tmp_path: Path
 ) -> None:
-    """x + v a is where the sender is by now, for a packet of any age a; at the start it is, from time 0 on."""
+    """x + v a is where a sender is by now, for packets of any age a and the start values of time 0."""
     text = SCENE.replace("delay: DELAY", f"delay: 10 ms, {network}").replace(
         "damping: 5 N*s/m", "damping: 0 N*s/m"
     )

@@ -37,6 +37,7 @@ REFUSED = {
         "million-peers": "nothing is sparse",
         "stiff-wall-passivity": "not linear",
         "three-large-groups": "nothing is sparse",
+        "two-users-dead-reckoning": "not linear",
         "two-users-proxies": "not linear",
     },
     "determinant": {

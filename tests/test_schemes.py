@@ -134,7 +134,8 @@ clocks: {{haptic: 1 ms, network: 8 ms}}
 peers: {{user: {{count: 2}}}}
 masses: {{cube: {{mass: 0.2 kg}}}}
 couplers:
-  it: {{type: ScheduledAverage, object: cube, stiffness: 2000 N/m, injection: 5 N*s/m, clock: haptic, link: lan}}
+  it:
+    {{type: ScheduledAverage, object: cube, stiffness: 2000 N/m, injection: 5 N*s/m, clock: haptic, link: lan}}
 links: {{lan: {{clock: network, delay: {delay} ms}}}}
 """
     assert apc.analyze(compiled(text)).stable
