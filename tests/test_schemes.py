@@ -135,7 +135,8 @@ peers: {{user: {{count: 2}}}}
 masses: {{cube: {{mass: 0.2 kg}}}}
 couplers:
   it:
-    {{type: ScheduledAverage, object: cube, stiffness: 2000 N/m, injection: 5 N*s/m, clock: haptic, link: lan}}
+    {{type: ScheduledAverage, object: cube, stiffness: 2000 N/m, injection: 5 N*s/m, clock: haptic,
+      link: lan}}
 links: {{lan: {{clock: network, delay: {delay} ms}}}}
 """
     assert apc.analyze(compiled(text)).stable
