@@ -212,6 +212,10 @@ class Hold:
 class Receive:
     """Row of r: the `operator` over the others that the peer hears over a link; the newest delivered values.
 
+    `age` says what of it is how old these are, in seconds since they were sent: "factor" multiplies each, or
+    it is of ages "alone", or the last row of s of its "edge" is the age. With `before` it is what was heard
+    at the tick before; then there is no edge.
+
     "mean" and "sum" are weighted by the link's graph. Without an `edge` they are of row `channel` of the
     link's `SendPartition`, so that a complete graph of N peers costs N. With an `edge` the operator runs over
     `edge(x, u, m, s, p, t)`, one evaluation a pair of peers: x, u, m, p, t are the hearing peer's, s (n_c,)
@@ -223,6 +227,8 @@ class Receive:
     link: str
     channel: int
     edge: Any | None = None  # casadi.Function
+    age: str = ""
+    before: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +237,8 @@ class ClockPartition:
 
     `tick(x, u, m, r, p, t) -> y (n_y,)`; `outputs` names the rows of y, `units` their SI units; `memories`
     are the rows of y whose values at the previous tick make up m; `starts` are the parameters holding their
-    start values.
+    start values. Where `variants` are given, y is made of several such columns, one below the other, and tick
+    k computes the one numbered variants[k mod their number]: none in what was compiled (see `frame.ages`).
     """
 
     clock: str
@@ -241,6 +248,7 @@ class ClockPartition:
     starts: tuple[str, ...]
     receives: tuple[Receive, ...]
     tick: Any  # casadi.Function
+    variants: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -166,7 +166,7 @@ EXACT: dict[str, Callable[..., Any]] = {
     **{word: RULES[word] for word in ("neg", "add", "sub", "mul", "div", "fabs", "sign", "floor")},
     **{word: RULES[word] for word in ("fmin", "fmax", "lt", "le", "eq", "ne", "and", "or", "not")},
     "if_else_zero": RULES["if_else_zero"],
-    **{word: ROUNDED[word] for word in ("exp", "log", "sin", "cos", "tanh")},
+    **ROUNDED,
     "sqrt": _root,
     "pow": _power,
 }

@@ -41,7 +41,7 @@ _UNARY = {
 _BINARY = {
     name: getattr(casadi, f"OP_{name.upper()}")
     for name in (
-        *("add", "sub", "mul", "div", "pow", "constpow", "fmin", "fmax"),
+        *("add", "sub", "mul", "div", "pow", "constpow", "fmin", "fmax", "atan2"),
         *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
     )
 }
@@ -82,10 +82,11 @@ RULES: dict[str, Callable[..., Any]] = {
 }
 
 # Those that have no rational value of a rational number.
-ROUNDED: dict[str, Callable[[float], float]] = {
+ROUNDED: dict[str, Callable[..., float]] = {
     name: getattr(math, name)
     for name in (
         *("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+        "atan2",
     )
 }
 _WORD = re.compile(r"[a-zA-Z][a-zA-Z0-9]*(_[a-zA-Z0-9]+)*\Z", re.ASCII)  # what CasADi takes as a name

@@ -26,7 +26,7 @@ import re
 import types
 import typing
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,7 @@ from apc.compiler.compiled import (
     Graph,
     Kind,
     Parameter,
+    Receive,
     Timing,
     counts_peers,
 )
@@ -274,13 +275,21 @@ def _is_heard(kind: Kind, system: CompiledSystem) -> bool:
         bool(rows.get(receive.link))
         and 0 <= receive.channel < min(rows[receive.link])
         and (
-            receive.edge is None
-            or receive.edge.sizes
-            == ([n_x, n_u, len(partition.memories), max(rows[receive.link]), n_p, 1], [1])
+            receive.age in ("", "factor", "alone")
+            if receive.edge is None
+            else receive.age in ("", "edge")
+            and not receive.before
+            and receive.edge.sizes
+            == ([n_x, n_u, len(partition.memories), _heard_rows(receive, rows), n_p, 1], [1])
         )
         for partition in kind.clocks
         for receive in partition.receives
     )
+
+
+def _heard_rows(receive: Receive, rows: Mapping[str, Sequence[int]]) -> int:
+    """Return how many numbers of a sender an edge takes: its rows, and their age."""
+    return max(rows[receive.link]) + (receive.age == "edge")
 
 
 def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], parameters: set[str]) -> bool:
@@ -304,6 +313,7 @@ def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], paramet
         and parameters_of.issuperset(state.start for state in kind.states)
         and partitions.keys() <= clocks
         and all(len(partition.units) == len(partition.outputs) for partition in kind.clocks)
+        and not any(partition.variants for partition in kind.clocks)
         and all(len(partition.starts) == len(partition.memories) for partition in kind.clocks)
         and all(parameters_of.issuperset(partition.starts) for partition in kind.clocks)
         and all(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import sympy
 
 from apc.compiler.equations.terms import Function, Number, Product, Sum, Symbol, Term
+from apc.compiler.language.expression import SMOOTH
 
-SAME = {"abs": sympy.Abs, "exp": sympy.exp, "log": sympy.log, "sin": sympy.sin, "cos": sympy.cos}
-SAME |= {"tanh": sympy.tanh, "min": sympy.Min, "max": sympy.Max, "sign": sympy.sign, "floor": sympy.floor}
+SAME = {"abs": sympy.Abs, "atan2": sympy.atan2, **{name: getattr(sympy, name) for name in SMOOTH}}
+SAME |= {"min": sympy.Min, "max": sympy.Max, "sign": sympy.sign, "floor": sympy.floor}
 
 
 def as_sympy(term: Term) -> sympy.Expr:

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# What a peer computes at a tick: (peer, its bodies' positions and velocities, by whom it is heard: the newest
-# packets of the others by peer, its memory) → (forces on the bodies, its memory, what it holds to be sent).
+# What a peer computes at a tick: (peer, its bodies' positions and velocities, the newest packets of the
+# others by peer, each with its age in seconds behind it, its memory) → (forces on the bodies, its memory,
+# what it holds to be sent).
 Law = Callable[
     [int, Sequence[tuple[Any, Any]], dict[int, Sequence[Any]], Sequence[Any]], tuple[Any, Any, Any]
 ]
@@ -64,10 +65,12 @@ def _tick(scheme: ByHand, now: _Playing, tick: int) -> None:
     if tick == 0:
         for i in peers:
             now.packets[i] = [[*now.motion[i][scheme.told], *now.out[i]], *now.packets[i][:-1]]
-    age = max(-((tick - scheme.late) // scheme.ratio), 0)  # packets sent since the newest that is here
+    sent = (tick - scheme.late) // scheme.ratio  # the newest packet that is here; 0 is the frame's own
+    age = max(-sent, 0)
+    seconds = (tick - sent * scheme.ratio) * scheme.period
     acting: list[Any] = []
     for i in peers:
-        heard = {j: now.packets[j][age] for j in scheme.hears[i]}
+        heard = {j: [*now.packets[j][age], seconds] for j in scheme.hears[i]}
         new, now.memory[i], now.out[i] = scheme.law(i, now.motion[i], heard, now.memory[i])
         queue = [list(new), *now.forces[i]]
         acting.append(queue[scheme.comp])

@@ -54,7 +54,7 @@ HOUSE = (
         exact names parameters overrides
         discretize radius exchange
         site jacobians start devices linearize
-        schedule liveness hyperperiod scheduling
+        schedule liveness hyperperiod ages scheduling
         lift ports batch_lift course residues
         """,
     ),

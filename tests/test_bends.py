@@ -121,6 +121,7 @@ def test_no_bump_is_too_narrow(tmp_path: Path, width: str) -> None:
         ("max(0, 1 - abs(u - 1001)/2)", 999.4),
         ("exp(-(u - 1001)^2/4)", 998.0),
         ("tanh(u - 1001) - tanh(u - 1003)", 1000.5),
+        ("atan2(4, 8*(u - 1003)) - atan2(4, 8*(u - 1001))", 999.0),
     ],
 )
 def test_steps_kinks_and_other_functions_hide_nothing_either(

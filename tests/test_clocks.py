@@ -69,7 +69,7 @@ def test_every_crossing_of_the_papers_scene_is_named() -> None:
         ("contact.f", "haptic", "contact.delay"),
         ("coordination.f", "haptic", "coordination.delay"),
     ]
-    assert [(r.operator, r.send, r.link, r.clock) for r in kind.receives] == [
+    assert [(r.operator, r.of.send, r.link, r.clock) for r in kind.receives] == [
         ("mean", "coordination.x", "lan", "haptic"),
         ("mean", "coordination.v", "lan", "haptic"),
     ]
@@ -170,7 +170,7 @@ def test_a_linear_reduction_of_the_others_is_one_of_what_they_send(
     kind, found = following(tmp_path, force)
     assert found == expected
     for receive in kind.receives:
-        assert (receive.send, receive.link, receive.clock, receive.edge) == ("all.x", "lan", "tick", None)
+        assert (receive.of.send, receive.link, receive.clock, receive.edge) == ("all.x", "lan", "tick", None)
 
 
 def test_a_reduction_that_is_not_linear_is_taken_over_each_pair(tmp_path: Path) -> None:

@@ -118,6 +118,7 @@ E807 runtime/frame: an operator over the others has no linearization inside a lo
 E808 runtime runtime/frame: the equations have no finite value at the start
 E809 runtime/frame: a time that follows from others is below zero
 E810 runtime/analysis: a linearization does not hold while the scene moves
+E811 runtime/frame: what is heard at one tick has several ages
 E812 runtime/frame: too many states of one peer move together
 E820 runtime: a command came to the end of the memory
 E830 runtime/analysis: a box's range is written wrong

@@ -154,7 +154,8 @@ def test_a_value_of_the_tick_before_is_a_memory(tmp_path: Path) -> None:
 def test_every_function_of_the_language_has_its_meaning(tmp_path: Path) -> None:
     terms = (
         "max(a, 1) + min(a, 1) + abs(a) + sign(a) + floor(a) + exp(a) + log(a + 9) + sin(a) + cos(a)"
-        " + tanh(a) + sqrt(a + 9) + a^3 + 1/(a + 9)^2 + (a + 9)^(1/3)"
+        " + tanh(a) + sqrt(a + 9) + a^3 + tan(a) + asin(a/4) + acos(a/4) + atan(a)"
+        " + sinh(a) + cosh(a) + atan2(a, 2) + atan2(2, a) + 1/(a + 9)^2 + (a + 9)^(1/3)"
         " + (if a < 1 and not a >= 2 or a == 3 then 4 else 5)"
     )
     own = library(
@@ -170,6 +171,8 @@ def test_every_function_of_the_language_has_its_meaning(tmp_path: Path) -> None:
 
         expected = max(a, 1) + min(a, 1) + abs(a) + math.copysign(1, a) + math.floor(a) + math.exp(a)
         expected += math.log(a + 9) + math.sin(a) + math.cos(a) + math.tanh(a) + math.sqrt(a + 9) + a**3
+        expected += math.tan(a) + math.asin(a / 4) + math.acos(a / 4) + math.atan(a) + math.sinh(a)
+        expected += math.cosh(a) + math.atan2(a, 2) + math.atan2(2, a)
         expected += 1 / (a + 9) ** 2 + (a + 9) ** (1 / 3) + (4 if a < 1 or a == 3 else 5)
         got = numbers(kind.derivative([a, 0.0], [], p, 0))[1]
         assert got == pytest.approx(-expected / 2, rel=1e-14), a

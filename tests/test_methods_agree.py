@@ -37,6 +37,7 @@ REFUSED = {
         "million-peers": "nothing is sparse",
         "stiff-wall-passivity": "not linear",
         "three-large-groups": "nothing is sparse",
+        "two-users-dead-reckoning": "not linear",
         "two-users-proxies": "not linear",
     },
     "determinant": {
@@ -48,7 +49,7 @@ REFUSED = {
 UNTOLD = {
     "god-object": "hold functions whose values are rounded",
     "limited-motor": "is not linear",
-    "two-users-dead-reckoning": "not linear in what it hears",
+    "three-users-scheduled": "looks at each sender by itself",
     "two-users-passivity": "not linear in what it hears",
     "two-users-set-position": "hold functions whose values are rounded",
 }

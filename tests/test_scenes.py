@@ -23,6 +23,7 @@ VERDICTS = {
     "template": (COMMON, 1),
     "three-users-average": (COMMON, 1),
     "three-users-predicted": (COMMON, 1),
+    "three-users-scheduled": (COMMON, 1),
     "three-users-mesh": (COMMON, 1),
     "two-handed-tool": (COMMON, 3),  # and at each user the hands apart from each other
     "two-users-damped": (COMMON, 1),

@@ -77,27 +77,70 @@ def test_damped_average_is_its_law(delay: int, stiffness: float, injection: floa
 
 
 @pytest.mark.parametrize("delay", [0, 8, 10, 50, 200])
-@pytest.mark.parametrize("age", [0, 12, 40])
-def test_predicted_average_is_its_law(delay: int, age: int) -> None:
+@pytest.mark.parametrize("age", [None, 0, 12, 40])
+def test_predicted_average_is_its_law(delay: int, age: int | None) -> None:
+    """By the age of each packet at each tick, or by a number."""
+
     def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
         push = contact(x)
-        ahead = mean(heard, 0) + age * 1e-3 * mean(heard, 1)
+        ahead = mean(heard, 0) + (mean(heard, 2) if age is None else age * 1e-3) * mean(heard, 1)
         pull = 500 * (x[1][0] - ahead) + 2 * (x[1][1] - mean(heard, 1))
         return [-push, push - pull], memory, []
 
     text = replaced(
         scene("three-users-predicted"),
-        ("age: 12 ms", f"age: {age} ms"),
+        (
+            "damping: 2 N*s/m,",
+            f"damping: 2 N*s/m,{'' if age is None else f' ages: assumed, assumed: {age} ms,'}",
+        ),
         ("delay: 8 ms", f"delay: {delay} ms"),
     )
     same(compiled(text), ByHand([[DEVICE, (0.2, 5.0, 0.0)]] * 3, everybody(3), law, told=1, late=delay))
 
 
 def test_a_prediction_of_age_nought_is_the_average() -> None:
-    text = replaced(scene("three-users-predicted"), ("age: 12 ms, ", "age: 0 s, "))
-    average = replaced(text, ("PredictedAverage", "AveragePosition"), (", age: 0 s", ""))
+    text = replaced(scene("three-users-predicted"), ("2 N*s/m,", "2 N*s/m, ages: assumed,"))
+    average = replaced(text, ("PredictedAverage", "AveragePosition"), (" ages: assumed,", ""))
     found, expected = apc.analyze(compiled(text)), apc.analyze(compiled(average))
     assert found.spectral_radius == pytest.approx(expected.spectral_radius, abs=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0, 8, 10, 50, 200])
+@pytest.mark.parametrize("injection", [1.0, 5.0, 40.0])
+def test_scheduled_average_is_its_law(delay: int, injection: float) -> None:
+    """K = min(500 N/m, B/age) at each tick."""
+
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        push, oldest = contact(x), max(packet[2] for packet in heard.values())
+        gain = injection / oldest if 500 * oldest > injection else 500
+        pull = gain * (x[1][0] - mean(heard, 0)) + injection * x[1][1]
+        return [-push, push - pull], memory, []
+
+    text = replaced(
+        scene("three-users-scheduled"),
+        ("injection: 5 N*s/m, clock", f"injection: {injection} N*s/m, clock"),
+        ("delay: 8 ms", f"delay: {delay} ms"),
+    )
+    hand = ByHand([[DEVICE, (0.2, 5.0, 0.0)]] * 3, everybody(3), law, told=1, late=delay)
+    same(compiled(text), hand)
+
+
+@pytest.mark.parametrize("delay", [8, 50, 200, 1000])
+def test_a_scheduled_stiffness_makes_any_delay_passive(delay: int) -> None:
+    """With B = K·age at every tick Re Z ≥ 0: stable where DampedAverage, of the same numbers, need not be."""
+    text = f"""\
+topology: two-copies
+clocks: {{haptic: 1 ms, network: 8 ms}}
+peers: {{user: {{count: 2}}}}
+masses: {{cube: {{mass: 0.2 kg}}}}
+couplers:
+  it:
+    {{type: ScheduledAverage, object: cube, stiffness: 2000 N/m, injection: 5 N*s/m, clock: haptic,
+      link: lan}}
+links: {{lan: {{clock: network, delay: {delay} ms}}}}
+"""
+    assert apc.analyze(compiled(text)).stable
+    assert not apc.analyze(compiled(replaced(text, ("Scheduled", "Damped")))).stable
 
 
 @pytest.mark.parametrize("late", [8, 24, 48])

@@ -212,7 +212,7 @@ WRONG = {
     "a formula of other sizes": ("parameters.1.formula.numbers", []),
     "a formula of no finite number": ("parameters.1.formula.numbers", ["9" * 400]),
     "a formula of a loop": ("parameters.1.formula.function.loops", []),
-    "a formula of what no expression holds": ("parameters.1.formula.function.operations.0", ["asin", 0]),
+    "a formula of what no expression holds": ("parameters.1.formula.function.operations.0", ["ceil", 0]),
     "a formula beyond its text": ("parameters.1.formula.spans.0", [0, 99]),
     "an edge of other sizes": ("kinds.0.clocks.0.receives.0.edge", "kinds.0.derivative"),
 }

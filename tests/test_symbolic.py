@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from apc.compiler.equations.symbolic import derivative_symbol, differential, is_no_number, to_term
 from apc.compiler.equations.terms import NO_NUMBER, ONE, ZERO, Term, add, apply, multiply, symbol
 from apc.compiler.errors import Place
-from apc.compiler.language.expression import Binary, Call, Expr, Name, Negate, Number, fold
+from apc.compiler.language.expression import SMOOTH, Binary, Call, Expr, Name, Negate, Number, fold
 from apc.compiler.language.grammar import parse_expression
 from tests.algebra import as_sympy
 
@@ -31,7 +31,7 @@ def joined(parts: Any) -> Any:
     two = st.tuples(parts, st.sampled_from("+-*/"), parts).map(lambda t: f"({t[0]}){t[1]}({t[2]})")
     exponents = st.sampled_from(("2", "3", "(-1)", "(-2)", "(1/2)", "(3/2)", "(1/3)"))
     raised = st.tuples(parts, exponents).map(lambda t: f"({t[0]})^{t[1]}")
-    called = st.tuples(st.sampled_from(("sqrt", "exp", "log", "sin", "cos", "tanh", "abs")), parts)
+    called = st.tuples(st.sampled_from(("sqrt", "abs", *SMOOTH)), parts)
     return st.one_of(
         two, two, two, raised, called.map(lambda t: f"{t[0]}({t[1]})"), parts.map("-({})".format)
     )
@@ -89,6 +89,8 @@ def at(text: str, point: dict[str, float]) -> Any:
         ("log(exp(x))", "x"),
         ("sin(x - y) + sin(y - x)", "0"),
         ("cos(-x)", "cos(x)"),
+        ("asin(-x) + asin(x) + cosh(-x) - cosh(x)", "0"),
+        ("acos(1) + tan(0) + atan(0)", "0"),
         ("der(x*y)", "D(x*y)"),
     ],
 )
@@ -118,6 +120,21 @@ def test_a_term_and_its_text_mean_what_is_written(text: str, point: tuple[float,
         found = mpmath.mpf(str(sympy.re(as_sympy(term).subs(table).evalf(40))))
         for one in (found, at(str(term), values)):
             assert abs(one - expected) <= 1e-20 * (1 + abs(expected))
+
+
+@pytest.mark.parametrize("text", ["asin(2)", "acos(-1.5)", "1 + asin(sqrt(2))"])
+def test_no_angle_has_a_sine_beyond_one(text: str) -> None:
+    assert is_no_number(build(text))
+
+
+@pytest.mark.parametrize("text", ["atan2(x, y)", "atan2(y^2, x)", "atan2(x, x*y)", "x*atan2(sin(x), cos(x))"])
+def test_the_slope_of_an_angle_is_sympys(text: str) -> None:
+    x, y = sympy.symbols("x y", real=True)
+    found = as_sympy(differential(build(text), lambda s: ONE if s == X else ZERO))
+    expected = sympy.diff(as_sympy(build(text)), x)
+    for point in ((0.3, 0.7), (-1.2, 0.4), (2.5, -3.0)):
+        at_it = {x: sympy.Rational(str(point[0])), y: sympy.Rational(str(point[1]))}
+        assert abs((found - expected).subs(at_it).evalf(30)) < 1e-20
 
 
 @given(st.lists(TEXTS.map(build), min_size=2, max_size=5), st.randoms())

@@ -50,6 +50,7 @@ def mistakes(text: str) -> list[str]:
         *(("k*x + d*v", "N"), ("m*der(v)", "N"), ("der(x)", "m/s"), ("der(der(x))", "m/s^2"), ("x/v", "s")),
         *(("x^2", "m^2"), ("x^-1", "1/m"), ("sqrt(x*x)", "m"), ("sqrt(k/m)", "1/s"), ("(x^2)^(1/2)", "m")),
         *(("-x", "m"), ("abs(x)", "m"), ("sign(x)", "1"), ("exp(x/x)", "1"), ("tanh(n)", "1"), ("2*x", "m")),
+        *(("atan2(x, 2*x)", "1"), ("acos(n)", "1"), ("asin(x/x)*x", "m")),
         *(
             ("sample(x)", "m"),
             ("previous(x)", "m"),

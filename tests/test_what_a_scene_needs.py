@@ -37,6 +37,7 @@ KEPT = {
     "three-users-average": [(4, 2, 2)],
     "three-users-mesh": [(4, 2, 2)],
     "three-users-predicted": [(4, 2, 2)],
+    "three-users-scheduled": [(4, 2, 1)],  # no velocity is sent
     "two-handed-tool": [(6, 2, 2)],  # two devices and a copy; the tool is midway
     "two-users-damped": [(4, 2, 2)],
     "two-users-proxies": [(4, 2, 2)],

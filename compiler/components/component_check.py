@@ -218,6 +218,9 @@ class ComponentNames:
         """Record a reduction that doesn't run over the other peers."""
         wrong = False
         for node in walk(expression):
+            if isinstance(node, Call) and node.function == "age":
+                wrong |= self._is_age_of_nothing(node, text, place, mistakes)
+                continue
             if not isinstance(node, Call) or any(name.parts[0] == OTHERS for name in names(node)):
                 continue
             if node.function in ("mean", "sum", "count"):
@@ -231,6 +234,24 @@ class ComponentNames:
             where, got = place_in(place, text, node.start), format_expression(node)
             mistakes.add("E506", where, what, expected=expected, got=got, hint=hint)
         return wrong
+
+    def _is_age_of_nothing(self, call: Call, text: str, place: Place, mistakes: Mistakes) -> bool:
+        """Record an age of what is not heard of the others."""
+        (argument,) = call.arguments
+        if isinstance(argument, Name) and argument.parts[0] == OTHERS and len(argument.parts) > 1:
+            return False
+        named = next((n for n in names(argument) if n.parts[0] == OTHERS and len(n.parts) > 1), None)
+        sent = [*(send.name for send in self.component.sends)] or ["x"]
+        shown = format_expression(named) if named is not None else f"others.{sent[0]}"
+        mistakes.add(
+            "E506",
+            place_in(place, text, call.start),
+            "age is of one value that is heard of the others, and",
+            expected=f"{shown} in it",
+            got=format_expression(call),
+            hint=f"age({shown})",
+        )
+        return True
 
     def _check_sent(self, send: Send, mistakes: Mistakes) -> None:
         """Record a send of what is heard: that is known at ticks of the clock, not of the link."""

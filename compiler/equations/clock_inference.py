@@ -14,7 +14,7 @@ from collections.abc import Container
 
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.flatten import CONNECTION, FlatEquation
-from apc.compiler.equations.reductions import hears_others
+from apc.compiler.equations.reductions import hears_others, of_others
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.expression import (
     Call,
@@ -22,6 +22,7 @@ from apc.compiler.language.expression import (
     Name,
     children,
     format_expression,
+    names,
     transform,
 )
 
@@ -133,17 +134,25 @@ class ClockInference:
             if name in self.variables:
                 self._join(domain, name, equation)
             elif expression.parts[0] == OTHERS and not heard:
-                shown = f"others.{expression.parts[-1]}"
-                what = f"{shown} of {equation.origin} is a value of each other peer, and one is due here"
-                self.mistakes.add("E506", equation.place, what, hint=f"mean({shown}), or sum, max, min")
+                self._report_each(f"others.{expression.parts[-1]}", equation)
         elif isinstance(expression, Call):
             self._visit_call(expression, domain, equation, heard)
         else:
             for child in children(expression):
                 self._visit(child, domain, equation, heard=heard)
 
+    def _report_each(self, shown: str, equation: FlatEquation) -> None:
+        """Report what is of each other peer outside of a reduction."""
+        what = f"{shown} of {equation.origin} is a value of each other peer, and one is due here"
+        self.mistakes.add("E506", equation.place, what, hint=f"mean({shown}), or sum, max, min")
+
     def _visit_call(self, call: Call, domain: str, equation: FlatEquation, heard: bool) -> None:
         text = format_expression(call)
+        if of_others(call):
+            if not heard:
+                (name,) = names(call)
+                self._report_each(f"{call.function}(others.{name.parts[-1]})", equation)
+            return
         if call.function == "sample":
             assert isinstance(call.arguments[1], Name)
             self._pin(domain, call.arguments[1].parts[0], text, equation)

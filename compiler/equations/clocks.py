@@ -26,7 +26,7 @@ from apc.compiler.compiled import count_of
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clock_inference import CONTINUOUS, ClockInference, domain
 from apc.compiler.equations.flatten import FlatEquation, FlatKind, FlatSend, FlatSystem, is_made
-from apc.compiler.equations.reductions import affine_in_others, hears_others
+from apc.compiler.equations.reductions import Of, affine_in_others, hears_others, of_others
 from apc.compiler.errors import Mistakes
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
@@ -40,6 +40,8 @@ from apc.compiler.language.expression import (
     transform,
 )
 from apc.compiler.scene.scene import Scene
+
+HEARD_AGE = f"{OTHERS}.age"  # in what a reduction runs over; no send has this name, as a part's stands before
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +76,13 @@ class PreviousCrossing:
 class ReceiveCrossing:
     """`symbol` stands, at a tick, for a reduction over the other peers that are heard over `link`.
 
-    Without an `edge` it is of what they sent under the name `send`; with one, of the value that `edge` has
-    for each of them, in which the names `others.…` are that peer's.
+    Without an `edge` it is of what they sent, as `of` says; with one, of the value that `edge` has for each
+    of them, in which the names `others.…` are that peer's, and `HEARD_AGE` is the age of its packet.
     """
 
     symbol: str
     operator: str
-    send: str
+    of: Of
     link: str
     clock: str
     edge: Expr | None = None
@@ -206,6 +208,8 @@ class _Partitioner:
                 self.mistakes.add("E505", where.place, what, hint=shown)
             self.holds.setdefault(symbol, HoldCrossing(symbol, variable, source, delay))
             return Name((symbol,))
+        if of_others(call):
+            return Name((HEARD_AGE,)) if call.function == "age" else self._no_edge(call, where)
         if call.function == "previous":
             return self._previous(call, symbol, clock, where)
         if call.function == "initial":
@@ -249,30 +253,54 @@ class _Partitioner:
             return Name((symbol,))
         linear = affine_in_others(argument) if call.function in ("mean", "sum") else None
         if linear is None:
-            only = isinstance(argument, Name)
+            only = isinstance(argument, Name)  # max or min
             edge = None if only else self._cross(argument, clock, where)
             link = self.links[sent[0]]
-            self.receives.setdefault(
-                symbol, ReceiveCrossing(symbol, call.function, sent[0], link, clock, edge)
+            of_ages = edge is not None and all(
+                name.parts[0] != OTHERS for name in names(edge) if name.parts != (HEARD_AGE,)
             )
-            return Name((symbol,))
+            return self._reduced(call.function, argument, Of(sent[0]), link, clock, edge, counted=of_ages)
         constant, terms = linear
         total: Expr | None = None
         if constant is not None:
             own = self._cross(constant, clock, where)
             count = Name((count_of(self.links[sent[0]]),))
             total = own if call.function == "mean" else Binary("*", count, own)
-        for send, coefficient in terms.items():
-            heard = Call(call.function, (Name((OTHERS, *send.split("."))),))
-            name = format_expression(heard)
-            link = self.links[send]
-            self.receives.setdefault(name, ReceiveCrossing(name, call.function, send, link, clock))
-            term: Expr = Name((name,))
+        for of, coefficient in terms.items():
+            link = self.links[of.send]
+            term = self._reduced(call.function, of.expression, of, link, clock, counted=not of.value)
             if coefficient is not None:
                 term = Binary("*", self._cross(coefficient, clock, where), term)
             total = term if total is None else Binary("+", total, term)
         assert total is not None
         return total
+
+    def _reduced(
+        self,
+        operator: str,
+        argument: Expr,
+        of: Of,
+        link: str,
+        clock: str,
+        edge: Expr | None = None,
+        *,
+        counted: bool,
+    ) -> Expr:
+        """Return the symbol of a reduction; with `counted` a sum is a mean as often as any are heard."""
+        many = counted and operator == "sum"
+        operator = "mean" if many else operator
+        name = format_expression(Call(operator, (argument,)))
+        self.receives.setdefault(name, ReceiveCrossing(name, operator, of, link, clock, edge))
+        return Binary("*", Name((count_of(link),)), Name((name,))) if many else Name((name,))
+
+    def _no_edge(self, call: Call, where: FlatEquation | FlatSend) -> Expr:
+        """Refuse what was heard before where each sender is looked at by itself."""
+        heard = next(names(call)).parts[-1]
+        what = f"previous(others.{heard})"
+        hint = f"mean(previous(others.{heard})), or sum"
+        expected = "a mean or sum that is linear in it"
+        self.mistakes.add("E506", where.place, what, expected=expected, hint=hint)
+        return Number(Fraction(0))
 
     def _count(self, part: tuple[str, ...], where: FlatEquation | FlatSend) -> Expr:
         """Return how many of the others are heard, each counted with its weight: a parameter of the site."""

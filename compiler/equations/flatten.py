@@ -21,6 +21,7 @@ from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
+    SMOOTH,
     Binary,
     Call,
     Conditional,
@@ -44,7 +45,7 @@ CONNECTION = "connection"  # where an equation comes from that is no part's
 _HELD = "held"  # with a number behind it, the name of an expression that is held
 
 # The functions whose value hangs on those of their arguments at the same moment, and on nothing else.
-POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "exp", "log", "sin", "cos", "tanh", "floor"))
+POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "floor", "atan2", *SMOOTH))
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +189,13 @@ def _flatten_kind(scene: Scene, groups: list[SceneGroup], delays: set[str], mist
     )
 
 
+def _is_linear_reduction(call: Call) -> bool:
+    """Return whether a mean or sum of the others says nothing of ages."""
+    return call.function in ("mean", "sum") and not any(
+        isinstance(node, Call) and node.function == "age" for node in walk(call)
+    )
+
+
 class _Instance:
     """One part: its component's text in whole names."""
 
@@ -296,8 +304,12 @@ class _Instance:
             if isinstance(node, Name):
                 if node.parts in self.names.variables:
                     return Call(call.function, (self._name(node),))
+                if node.parts[0] == OTHERS and call.function == "previous":
+                    return Call(call.function, (self._name(node),))
                 if node.parts[0] not in ("time", OTHERS):
                     return self._name(node)  # a parameter, the same at all times
+            elif isinstance(node, Call) and call.function == "previous" and _is_linear_reduction(node):
+                return None  # of what was heard before
             elif not isinstance(node, Call) or node.function in POINTWISE:
                 return None
             name = next(one for n in count(1) if (one := f"y{n}",) not in self.names.dimensions)

@@ -14,14 +14,13 @@ from fractions import Fraction
 from typing import Any
 
 from apc.compiler.equations.terms import Function, Number, Product, Sum, Symbol, Term, constant, number
+from apc.compiler.language.expression import SMOOTH
 
 # Nodes beyond which no identity is looked for: simplifying takes its time.
 MOST = 200
 
 # Points at which it must vanish, and how nearly, beside the values of its parts.
 POINTS, NEARLY = 4, 1e-9
-
-SMOOTH = ("sin", "cos", "tanh", "exp", "log")
 
 
 def is_identity(expression: Term) -> bool:

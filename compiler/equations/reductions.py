@@ -1,17 +1,21 @@
 """What a peer hears of the others: reductions, and linear ones taken apart.
 
-Takes: expressions that read `others`. Gives: `REDUCTIONS`, `hears_others`, `affine_in_others`.
-Guarantees: c₀ + Σ cₖ·others.k has the value of the expression it was taken from.
+Takes: expressions that read `others`. Gives: `REDUCTIONS`, `hears_others`, `of_others`; `Of`,
+`affine_in_others`.
+Guarantees: c₀ + Σ cₖ·heardₖ has the value of the expression it was taken from.
 Does not: know clocks or links.
 
-A mean or sum of such a form is that of each others.k by itself, so that N peers cost N, not N².
+What is heard is others.k, previous(others.k), the age of its packet, or age times others.k. A mean or sum of
+such a form is that of each by itself, so that N peers cost N, not N².
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 from apc.compiler.components.component import OTHERS
+from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
     Binary,
     Call,
@@ -34,19 +38,51 @@ def hears_others(call: Call) -> bool:
     )
 
 
-Affine = tuple[Expr | None, dict[str, Expr | None]]  # constant and coefficients; None: 0, and 1
+def of_others(call: Call) -> bool:
+    """Return whether a call is of one value that each other peer sends: its age, or what it was before."""
+    argument = call.arguments[0]
+    return call.function in ("age", "previous") and isinstance(argument, Name) and argument.parts[0] == OTHERS
+
+
+@dataclass(frozen=True, slots=True)
+class Of:
+    """What is heard of the send `send`: its value unless `value` is False, times its age if `aged`.
+
+    With `before` it is what was heard at the tick before.
+    """
+
+    send: str
+    value: bool = True
+    aged: bool = False
+    before: bool = False
+
+    @property
+    def expression(self) -> Expr:
+        """It as the language has it."""
+        name = Name((OTHERS, *self.send.split(".")))
+        value: Expr = Call("previous", (name,)) if self.before else name
+        if not self.aged:
+            return value
+        age = Call("age", (name,))
+        return Binary("*", age, value) if self.value else age
+
+
+Affine = tuple[Expr | None, dict[Of, Expr | None]]  # constant and coefficients; None: 0, and 1
 
 
 def affine_in_others(expression: Expr) -> Affine | None:
-    """Return an expression as c₀ + Σ cₖ·others.k, or None when it is not of that form.
+    """Return an expression as c₀ + Σ cₖ·heardₖ, or None when it is not of that form.
 
-    c₀ is None for 0, cₖ None for 1; k is the name of what is sent.
+    c₀ is None for 0, cₖ None for 1.
     """
     if not any(name.parts[0] == OTHERS for name in names(expression)):
         return expression, {}
     match expression:
         case Name(parts=parts):
-            return None, {".".join(parts[1:]): None}
+            return None, {Of(".".join(parts[1:])): None}
+        case Call("age" | "previous", (Name(parts=parts),)):
+            aged = expression.function == "age"
+            return None, {Of(".".join(parts[1:]), value=not aged, aged=aged, before=not aged): None}
         case Negate(operand=operand):
             inside = affine_in_others(operand)
             return None if inside is None else _scaled(inside, Number(Fraction(-1)), "*")
@@ -61,8 +97,24 @@ def affine_in_others(expression: Expr) -> Affine | None:
                 return None
             if not two[1]:
                 return _scaled(one, right, operator)
-            return _scaled(two, left, "*") if operator == "*" and not one[1] else None
+            if operator == "*":
+                return _scaled(two, left, "*") if not one[1] else _product(one, two)
     return None
+
+
+def _product(one: Affine, two: Affine) -> Affine | None:
+    """Return the product of two forms that both hear: one hears nothing but ages, the other no age."""
+    if all(not of.value for of in two[1]):
+        one, two = two, one
+    if any(of.value for of in one[1]) or any(of.aged or of.before for of in two[1]):
+        return None
+    found: Affine = (None, {})
+    for of, factor in one[1].items():
+        terms: dict[Of, Expr | None] = {replace(heard, aged=True): c for heard, c in two[1].items()}
+        if two[0] is not None:
+            terms[of] = two[0]
+        found = _added(found, (None, terms) if factor is None else _scaled((None, terms), factor, "*"))
+    return found if one[0] is None else _added(found, _scaled(two, one[0], "*"))
 
 
 def _scaled(affine: Affine, factor: Expr, operator: str) -> Affine:

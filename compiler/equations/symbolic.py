@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence, Set
 from fractions import Fraction
 
 from apc.compiler.equations.terms import (
+    HALF,
     LARGEST,
     NO_NUMBER,
     ONE,
@@ -148,6 +149,10 @@ def differential(expression: Term, rate: Callable[[Symbol], Term]) -> Term:
         if name in _SLOPES:
             slope = go(node.arguments[0])
             return slope if slope == ZERO else _SLOPES[name](node.arguments[0]) * slope
+        if name == "atan2":
+            y, x = node.arguments
+            turned = multiply(x, go(y)) - multiply(y, go(x))
+            return turned if turned == ZERO else turned / add(power(x, 2), power(y, 2))
         if name in ("sign", "floor"):
             return ZERO
         why = "a value that jumps at its ticks" if name in ("hold", "sample") else "which has none"
@@ -162,6 +167,12 @@ _SLOPES: dict[str, Callable[[Term], Term]] = {
     "log": lambda x: power(x, -1),
     "sin": lambda x: apply("cos", x),
     "cos": lambda x: -apply("sin", x),
+    "tan": lambda x: ONE + power(apply("tan", x), 2),
+    "asin": lambda x: power(ONE - power(x, 2), -HALF),
+    "acos": lambda x: -power(ONE - power(x, 2), -HALF),
+    "atan": lambda x: power(ONE + power(x, 2), -1),
+    "sinh": lambda x: apply("cosh", x),
+    "cosh": lambda x: apply("sinh", x),
     "tanh": lambda x: ONE - power(apply("tanh", x), 2),
 }
 

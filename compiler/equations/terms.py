@@ -21,6 +21,7 @@ from typing import Any, TypeAlias
 
 from apc.compiler.language.expression import (
     COMPARISONS,
+    SMOOTH,
     Binary,
     Call,
     Compare,
@@ -37,13 +38,8 @@ from apc.compiler.language.expression import Number as ExactNumber
 Ratio: TypeAlias = int | Fraction
 LARGEST = int(sys.float_info.max)
 MOST_SYMBOLS = 100_000  # that are kept, so that equal ones are mostly the same object
-_SMOOTH: dict[str, Callable[[float], float]] = {
-    "exp": math.exp,
-    "log": math.log,
-    "sin": math.sin,
-    "cos": math.cos,
-    "tanh": math.tanh,
-}
+_VALUES: dict[str, Callable[..., float]] = {name: getattr(math, name) for name in ("atan2", *SMOOTH)}
+_ODD, _EVEN = ("sin", "tan", "asin", "atan", "sinh", "tanh"), ("cos", "cosh")
 
 
 class Term:
@@ -427,12 +423,20 @@ def apply(name: str, *arguments: Term) -> Term:
         return (
             ONE if first == ZERO else first.parts[0] if _is_call(first, "log") else Function(name, arguments)
         )
-    if name in ("sin", "tanh", "cos"):
+    if name in _ODD or name in _EVEN:
         if first == ZERO:
-            return ONE if name == "cos" else ZERO
+            return ONE if name in _EVEN else ZERO
+        if name == "asin" and _is_beyond_one(first):
+            return NO_NUMBER
         if _is_negative(first):
-            return scaled(Function(name, (-first,)), 1 if name == "cos" else -1)
+            return scaled(Function(name, (-first,)), 1 if name in _EVEN else -1)
+    if name == "acos" and (first == ONE or _is_beyond_one(first)):
+        return ZERO if first == ONE else NO_NUMBER
     return Function(name, arguments)
+
+
+def _is_beyond_one(term: Term) -> bool:
+    return not term.free_symbols and abs(constant(term)) > 1
 
 
 def _is_negative(term: Term) -> bool:
@@ -455,8 +459,8 @@ def constant(term: Term) -> float:
             return math.prod(
                 (constant(base) ** exponent for base, exponent in term.powers), start=float(term.coefficient)
             )
-        if isinstance(term, Function) and term.name in _SMOOTH:
-            return _SMOOTH[term.name](constant(term.arguments[0]))
+        if isinstance(term, Function) and term.name in _VALUES:
+            return _VALUES[term.name](*map(constant, term.arguments))
     except (ArithmeticError, ValueError):
         pass
     return math.nan

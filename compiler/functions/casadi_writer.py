@@ -29,21 +29,21 @@ from apc.compiler.equations.terms import (
     terms_of,
 )
 from apc.compiler.frozen import dataclass
+from apc.compiler.language.expression import SMOOTH
 from apc.compiler.language.recordings import TimeTable
 from apc.compiler.plain import Loop, composed
 
 Definition: TypeAlias = Term | ImplicitBlock
 MOST_FACTORS = 100  # of a power that is written as a product
+# Functions that are infinite or no number somewhere, or whose slopes are; and where none of them is.
+_SOMEWHERE_NONE = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "atan2")
+HARMLESS = 0.5
 _EXTREMES = {"min": casadi.fmin, "max": casadi.fmax}  # of two values each
 _CASADI: dict[str, Callable[..., Any]] = {
     "abs": casadi.fabs,
     "sign": casadi.sign,
     "floor": casadi.floor,
-    "exp": casadi.exp,
-    "log": casadi.log,
-    "sin": casadi.sin,
-    "cos": casadi.cos,
-    "tanh": casadi.tanh,
+    **{name: getattr(casadi, name) for name in ("atan2", *SMOOTH)},
     "and": casadi.logic_and,
     "or": casadi.logic_or,
     "not": casadi.logic_not,
@@ -189,7 +189,7 @@ class Writer:
 
         `taken` is the condition of the branch it stands in. CasADi computes every branch, and the slopes of
         one that isn't taken times 0, which is no number where they are infinite. What is singular somewhere
-        gets the argument 1 there, where the branch isn't taken.
+        gets a harmless argument there, where the branch isn't taken.
         """
         if isinstance(expression, Symbol):
             return self.known[expression]
@@ -208,8 +208,8 @@ class Writer:
             condition, then, otherwise = expression.arguments
             return self._chosen(condition, then, otherwise, taken)
         arguments = [self._build(argument, taken) for argument in expression.arguments]
-        if taken is not None and name in ("log", "exp"):  # infinite, or no number, or so is the slope
-            arguments[0] = casadi.if_else(taken, arguments[0], 1)
+        if taken is not None and name in _SOMEWHERE_NONE:
+            arguments = [casadi.if_else(taken, one, HARMLESS) for one in arguments]
         return _fold(arguments, _EXTREMES[name]) if name in _EXTREMES else _CASADI[name](*arguments)
 
     def _chosen(self, condition: Term, then: Term, otherwise: Term, taken: Any) -> Any:

@@ -26,7 +26,7 @@ from apc.compiler.compiled import (
     State,
 )
 from apc.compiler.components.component import OTHERS
-from apc.compiler.equations.clocks import HoldCrossing, ReceiveCrossing
+from apc.compiler.equations.clocks import HEARD_AGE, HoldCrossing, ReceiveCrossing
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
 from apc.compiler.equations.symbolic import derivative_symbol
@@ -276,13 +276,22 @@ class _KindBuilder:
                     receive.symbol,
                     receive.operator,
                     receive.link,
-                    channels[receive.send][1],
+                    channels[receive.of.send][1],
                     self._edge(receive, channels, alone, remembering, inputs),
+                    self._age(receive),
+                    receive.of.before,
                 )
                 for receive in heard.values()
             ),
             tick,
         )
+
+    def _age(self, receive: ReceiveCrossing) -> str:
+        """Return what of a receive is the age of what is heard (see `Receive`)."""
+        edge = self.reached.edges.get(symbol(receive.symbol))
+        if edge is not None:
+            return "edge" if symbol(HEARD_AGE) in edge.free_symbols else ""
+        return "" if not receive.of.aged else "factor" if receive.of.value else "alone"
 
     def _edge(
         self, receive: ReceiveCrossing, channels: _Channels, writer: Writer, remembering: Any, inputs: _Inputs
@@ -292,8 +301,11 @@ class _KindBuilder:
         if expression is None:
             return None
         rows = {name: row for name, (link, row) in channels.items() if link == receive.link}
-        sent = casadi.SX.sym("s", 1 + max(rows.values()))
+        aged = self._age(receive) == "edge"
+        sent = casadi.SX.sym("s", 1 + max(rows.values()) + aged)
         theirs = {symbol(f"{OTHERS}.{name}"): sent[row] for name, row in rows.items()}
+        if aged:
+            theirs[symbol(HEARD_AGE)] = sent[sent.numel() - 1]
         pair = writer.extended(theirs, {})
         value = pair.translate(expression)
         return self._function("edge", pair, inputs, "value", value, {"m": remembering, "s": sent})

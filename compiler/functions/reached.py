@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from apc.compiler.components.component import OTHERS
-from apc.compiler.equations.clocks import HoldCrossing, PreviousCrossing, ReceiveCrossing
+from apc.compiler.equations.clocks import HEARD_AGE, HoldCrossing, PreviousCrossing, ReceiveCrossing
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSend
 from apc.compiler.equations.symbolic import derivative_symbol, no_derivative, to_term
@@ -62,7 +62,7 @@ class Reached:
         """The names this kind hears of the others, each once."""
         found: dict[str, None] = {}
         for s, receive in self.receives.items():
-            found[receive.send] = None
+            found[receive.of.send] = None
             found.update(dict.fromkeys(_others(self.edges.get(s))))
         return list(found)
 
@@ -120,7 +120,7 @@ class Reached:
         if s in self._known.previous:
             yield symbol(self._known.previous[s].variable)
         if s in self._known.receives:
-            for name in (self._known.receives[s].send, *_others(self.edges.get(s))):
+            for name in (self._known.receives[s].of.send, *_others(self.edges.get(s))):
                 if name in self.sends:
                     yield from self.sends[name].expression.free_symbols
 
@@ -150,4 +150,5 @@ def _others(expression: Term | None) -> list[str]:
     if expression is None:
         return []
     prefix = f"{OTHERS}."
-    return sorted(s.name.removeprefix(prefix) for s in expression.free_symbols if s.name.startswith(prefix))
+    found = (s.name for s in expression.free_symbols if s.name.startswith(prefix) and s.name != HEARD_AGE)
+    return sorted(name.removeprefix(prefix) for name in found)

@@ -19,6 +19,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.formula import FaultError, exactly
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
+    SMOOTH,
     Binary,
     Call,
     Compare,
@@ -57,7 +58,7 @@ _FUNCTIONS = {
     "abs": "fabs",
     "max": "fmax",
     "min": "fmin",
-    **{name: name for name in ("sign", "floor", "sqrt", "exp", "log", "sin", "cos", "tanh")},
+    **{name: name for name in ("sign", "floor", "sqrt", "atan2", *SMOOTH)},
 }
 
 

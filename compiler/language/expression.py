@@ -121,6 +121,9 @@ class Equation:
     place: Place
 
 
+# Smooth functions of a number, as Modelica has them (Language Specification 3.6, section 3.7.3).
+SMOOTH = ("exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")
+
 # function -> (fewest arguments, most arguments)
 FUNCTIONS: dict[str, tuple[int, int]] = {
     "der": (1, 1),
@@ -128,16 +131,14 @@ FUNCTIONS: dict[str, tuple[int, int]] = {
     "hold": (1, 2),
     "previous": (1, 1),
     "initial": (1, 1),
+    "age": (1, 1),
     "max": (1, 16),
     "min": (1, 16),
     "abs": (1, 1),
     "sign": (1, 1),
     "sqrt": (1, 1),
-    "exp": (1, 1),
-    "log": (1, 1),
-    "sin": (1, 1),
-    "cos": (1, 1),
-    "tanh": (1, 1),
+    **dict.fromkeys(SMOOTH, (1, 1)),
+    "atan2": (2, 2),
     "floor": (1, 1),
     "interpolate": (2, 2),
     "mean": (1, 1),

@@ -15,6 +15,7 @@ from fractions import Fraction
 from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
+    SMOOTH,
     Binary,
     Call,
     Compare,
@@ -185,9 +186,15 @@ class _Checker:
         match expr.function:
             case "max" | "min":
                 return self.agree("E404", list(expr.arguments))
-            case "exp" | "log" | "sin" | "cos" | "tanh" | "floor":
+            case name if name == "floor" or name in SMOOTH:
                 self.plain(first)
                 return DIMENSIONLESS
+            case "atan2":  # of the sides of a triangle, whatever their unit
+                self.agree("E404", list(expr.arguments))
+                return DIMENSIONLESS
+            case "age":
+                self.dimension(first)
+                return SECOND
             case "sign" | "count":
                 self.dimension(first)
                 return DIMENSIONLESS

@@ -191,6 +191,9 @@ class _Writer:
                 return self.product(expr)
             case "count":
                 return expr  # of peers, whatever they send
+            case "age":  # of a vector, which travels in one packet
+                found = self.written(first)
+                return replace(expr, arguments=found[:1]) if isinstance(found, tuple) else expr
             case "sample":
                 return self.each(expr, [self.written(first), *others])  # the second is a clock
             case "hold":

@@ -127,7 +127,7 @@ def _(clocked: ClockedSystem) -> str:
 
 
 def _heard(receive: ReceiveCrossing) -> str:
-    what = receive.send if receive.edge is None else format_expression(receive.edge)
+    what = format_expression(receive.of.expression if receive.edge is None else receive.edge)
     return f"{receive.operator} of {what}"
 
 

@@ -35,9 +35,10 @@ from apc.eigen.spectrum import (
     solve_spectrum,
 )
 from apc.finite_equations import finite_equations
+from apc.frame.ages import at_timings, linear_sites
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.exchange import Exchange, build_exchange
-from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.jacobians import SiteJacobians
 from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import ORDER, Schedule
 from apc.frame.scheduling import build_schedules
@@ -103,9 +104,8 @@ def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared
     order
         The order of coincident events, see `schedule.ORDER`.
     """
-    built = tuple(jacobians(kind) for kind in system.kinds)
     timings = {timing.name: timing.value for timing in system.timings}
-    return _scheduled(system, built, timings, tuple(order))
+    return _scheduled(system, linear_sites(system, timings, order), timings, tuple(order))
 
 
 def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | None:
@@ -330,7 +330,8 @@ def timed(system: CompiledSystem, prepared: Prepared, numbers: Numbers) -> Prepa
     """Return what was prepared, with the schedules of these timings."""
     if numbers.timings == prepared.timings:
         return prepared
-    return _scheduled(system, prepared.jacobians, numbers.timings, prepared.order)
+    sites = at_timings(system, prepared.jacobians, numbers.timings, prepared.order)
+    return _scheduled(system, sites, numbers.timings, prepared.order)
 
 
 def _scheduled(

@@ -310,7 +310,7 @@ def _open_site(group: PeerGroup, vector: Sequence[Any], system: CompiledSystem) 
     built = group.jacobians
     zeros = [[Fraction(0)] * built.function.numel_in(argument) for argument in range(4)]
 
-    def refuse(name: str, value: Any) -> Any:
+    def refuse(name: str, *_: Any) -> Any:
         raise NotRational(f"hold {name}(), which is no quotient of polynomials")
 
     try:

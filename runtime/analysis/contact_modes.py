@@ -108,7 +108,7 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
         E863 a part that takes too many decisions.
     """
     prepared = prepared or prepare(system)
-    switched = [find_switches(kind) for kind in system.kinds]
+    switched = [find_switches(site.kind) for site in prepared.jacobians]
     hidden = dict.fromkeys(one.kind.name for one in switched if not one.walkable)
     notes = tuple(f"not looked into: {name}, which has a nonlinear loop" for name in hidden)
     parts = parts_of_kinds(system, switched, resolve(system))

@@ -28,6 +28,7 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
+from apc.frame.ages import at_timings
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.scheduling import build_schedules
@@ -156,14 +157,17 @@ def conventions(
     readings = [SENDER, NOTHING] if matters else [""]
     if quick and (why := _too_much(prepared, default, len(classes) * len(readings) - 1)):
         return Conventions(system.name, (first,), matters, why)
-    silent = tuple(_silent(site) for site in prepared.jacobians)
     outcomes = []
     for orders, schedules in classes:
         for start in readings:
             if ORDER in orders and start != NOTHING:
                 outcomes.append(_outcome(default, orders, pairs, start))
                 continue
-            heard = silent if start == NOTHING else prepared.jacobians
+            sites = at_timings(system, prepared.jacobians, prepared.timings, orders[0])
+            if sites is not prepared.jacobians:  # the ages of this order
+                patterns = [site.pattern for site in sites]
+                schedules = build_schedules(system, prepared.timings, patterns, order=orders[0])
+            heard = tuple(map(_silent, sites)) if start == NOTHING else sites
             changed = Prepared(heard, schedules, prepared.timings, orders[0])
             try:
                 found = analyze(system, prepared=changed)

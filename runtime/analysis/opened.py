@@ -108,7 +108,10 @@ def contact_groups(
         E863 a part that takes too many decisions.
     """
     numbers = resolve(system)
-    switched = [find_switches(kind) for kind in system.kinds]
+    kinds_now = [site.kind for site in prepared.jacobians]
+    if any(partition.variants for kind in kinds_now for partition in kind.clocks):
+        return "what is computed of what is heard changes with its age, from tick to tick"
+    switched = [find_switches(kind) for kind in kinds_now]
     parts = parts_of_kinds(system, switched, numbers)
     on = tuple(
         bind(one, site, settings(listed, on=True)) if one.decisions else site

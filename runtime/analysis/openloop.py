@@ -263,6 +263,10 @@ def _misfits(group: PeerGroup) -> Iterator[str]:
     if not group.site.affine:
         yield f"linear equations ({kind.name} is not linear)"
     for partition, tick in zip(kind.clocks, pattern.ticks, strict=True):
+        if partition.variants:
+            yield "forces that are the same at every tick (they follow the age of what is heard)"
+        if any(receive.before for receive in partition.receives):
+            yield "forces of what is heard now (what the tick before heard counts as well)"
         if tick.m.any():
             names = [partition.outputs[partition.memories[m]] for m in np.flatnonzero(tick.m.any(axis=0))]
             yield f"forces of the samples alone ({', '.join(names)} is remembered from tick to tick)"

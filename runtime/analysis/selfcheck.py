@@ -22,6 +22,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
+from apc.frame.ages import linear_sites
 from apc.frame.discretize import (
     COEFFICIENT_ROUNDINGS,
     FEW_TOGETHER,
@@ -31,7 +32,7 @@ from apc.frame.discretize import (
     moved_together,
 )
 from apc.frame.exact import evaluate_exact
-from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, lift
 from apc.frame.linearize import linearize, linearize_exact
 from apc.frame.parameters import Numbers, exact_numbers, resolve
@@ -75,7 +76,7 @@ def check_frame(system: CompiledSystem) -> float:
         The two differ by more than rounding.
     """
     numbers = resolve(system)
-    sites = [jacobians(kind) for kind in system.kinds]
+    sites = linear_sites(system, numbers.timings)
     schedules = build_schedules(system, numbers.timings, [site.pattern for site in sites])
     chance = random.Random(SEED)  # NumPy's own takes longer to import than this to check
     largest = 0.0
@@ -112,7 +113,7 @@ def _terms(frame: FrameMap, z: Floats, r: Floats) -> Floats:
 
 def skipped(system: CompiledSystem) -> tuple[str, ...]:
     """Return the kinds that are not checked, as they are not affine or look at each sender by itself."""
-    sites = [jacobians(kind) for kind in system.kinds]
+    sites = linear_sites(system)
     return tuple(site.kind.name for site in sites if not site.parameters_suffice)
 
 
@@ -184,7 +185,8 @@ def _stepped(site: _Stepped, schedule: Schedule, z: Floats, r: Floats) -> list[A
                 memories = site.kind.clocks[partition].memories
                 m = [value.get(Value(partition, o, index - 1), zero) for o in memories]
                 received = [sum((heard[row] for row in rows), zero) for rows in rows_heard]
-                outputs = _sums(site.ticks[partition], [*x, *u, *m, *received])
+                own = event.rows(len(site.kind.clocks[partition].outputs))
+                outputs = _sums(site.ticks[partition][own], [*x, *u, *m, *received])
                 value |= {Value(partition, o, index): number for o, number in enumerate(outputs)}
     after = [
         value[Value(one.partition, one.output, one.index + schedule.ticks[one.partition])]

@@ -193,7 +193,7 @@ def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
             "tick": kind.clocks[p].outputs if what == "tick" else (),
             "send": kind.sends[p].channels if what == "send" else (),
         }.get(what, ())
-        found |= dict.fromkeys(names[row] for row in rows)
+        found |= dict.fromkeys(names[row % len(names)] for row in rows)
     return tuple(found)
 
 
@@ -271,18 +271,18 @@ def _changed(kind: Kind, one: _Opened, symbol: Any, operands: Sequence[Any]) -> 
     what, p, place = one.where
     rows = [row for row in range(one.output.numel()) if casadi.depends_on(one.output[row], symbol)]
     if what == "tick":
-        return [kind.clocks[p].outputs[row] for row in rows]
+        outputs = kind.clocks[p].outputs
+        return list(dict.fromkeys(outputs[row % len(outputs)] for row in rows))  # of all variants
     if what == "send":
         return [kind.sends[p].channels[row] for row in rows]
     if what == "edge":
         partition = kind.clocks[p]
         inputs = partition.tick.sx_in()
         outputs = partition.tick(*inputs)
-        return [
-            name
-            for row, name in enumerate(partition.outputs)
-            if casadi.depends_on(outputs[row], inputs[3][place])
-        ]
+        every = partition.outputs * (outputs.numel() // len(partition.outputs))  # of all variants
+        heard = inputs[3][place]
+        found = (name for row, name in enumerate(every) if casadi.depends_on(outputs[row], heard))
+        return list(dict.fromkeys(found))
     # A continuous force has no name in the equations of motion; the part whose parameters decide has.
     symbols = casadi.vertsplit(one.inputs[2]) if kind.parameters else []
     used = [

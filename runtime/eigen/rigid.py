@@ -298,10 +298,10 @@ def _standing(system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: 
                 )
                 for place in range(len(partition.receives))
             ]
-            for o in range(len(partition.outputs)):
-                terms = [*zip(tick.x[o], x, strict=True), *zip(tick.u[o], u, strict=True)]
-                terms += [*zip(tick.m[o], m, strict=True), *zip(tick.r[o], r, strict=True)]
-                yield _combine([*terms, (-1, y[o])])
+            for row in range(len(tick.x)):  # of all variants
+                terms = [*zip(tick.x[row], x, strict=True), *zip(tick.u[row], u, strict=True)]
+                terms += [*zip(tick.m[row], m, strict=True), *zip(tick.r[row], r, strict=True)]
+                yield _combine([*terms, (-1, y[row % len(y)])])
 
 
 def _standing_inputs(site: LinearSite, number: _Numbering, g: int) -> tuple[list[Form], list[Form]]:
@@ -448,8 +448,8 @@ class _Ramp:
                     before = (Value(event.partition, o, event.index - 1) for o in partition.memories)
                     inputs = [*x, *u, *(self.value(g, one) for one in before)]
                     inputs += [self.heard(g, rows, sent) for rows in event.heard]
-                    for o in range(len(partition.outputs)):
-                        row = [*tick.x[o], *tick.u[o], *tick.m[o], *tick.r[o]]
+                    for o, k in enumerate(range(len(tick.x))[event.rows(len(partition.outputs))]):
+                        row = [*tick.x[k], *tick.u[k], *tick.m[k], *tick.r[k]]
                         own = self.value(g, Value(event.partition, o, event.index))
                         yield _combine([*zip(row, inputs, strict=True), (-1, own)])
 

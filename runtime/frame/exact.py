@@ -55,6 +55,15 @@ def _row_function(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return value
 
 
+def _row_angle(y: Any, x: Any) -> Any:
+    """Return atan2(y, x)."""
+    value = np.arctan2(np.real(y), np.real(x))
+    if not (np.iscomplexobj(y) or np.iscomplexobj(x)):
+        return value
+    turned = np.real(x) * np.imag(y) - np.real(y) * np.imag(x)
+    return _step(value, turned / (np.real(x) ** 2 + np.real(y) ** 2))
+
+
 def _step(value: Any, slope: Any) -> Any:
     """Return a complex step: a product with 1j would spoil the value where the slope is infinite."""
     found = np.empty(np.broadcast_shapes(np.shape(value), np.shape(slope)), dtype=np.complex128)
@@ -93,7 +102,9 @@ ROWS: dict[str, Callable[..., Any]] = {
     **{
         name: _row_function(getattr(np, f"arc{name[1:]}" if name.startswith("a") else name))
         for name in ROUNDED
+        if name != "atan2"
     },
+    "atan2": _row_angle,
 }
 
 
@@ -102,7 +113,7 @@ def evaluate_exact(
     arguments: Sequence[Sequence[Any]],
     *,
     number: Callable[[float], Any] = Fraction,
-    rounded: Callable[[str, Any], Any] | None = None,
+    rounded: Callable[..., Any] | None = None,
     rules: Mapping[str, Callable[..., Any]] | None = None,
 ) -> list[list[Any]]:
     """Evaluate an SX function operation by operation over another number type.
@@ -116,8 +127,8 @@ def evaluate_exact(
     number
         Turns the function's own constants (doubles, taken as exact) into the number type.
     rounded
-        Evaluates a transcendental function, by its name in `math`, in the number type. Left out, its
-        value is rounded to a double first.
+        Evaluates a transcendental function, by its name in `math` and its operands, in the number type. Left
+        out, its value is rounded to a double first.
     rules
         Operations, by their names in `plain`, that this kind of number does in another way than Python's;
         `const` is what it makes of the function's constants, of NaN too.
@@ -178,7 +189,7 @@ def _operations(function: Any) -> PlainFunction:
 
 @functools.lru_cache(maxsize=KEPT)
 def _rules_of(
-    number: Callable[[float], Any], rounded: Callable[[str, Any], Any] | None
+    number: Callable[[float], Any], rounded: Callable[..., Any] | None
 ) -> dict[str, Callable[..., Any]]:
     """Return the operations of a kind of number that computes as Python's do."""
     power = functools.partial(_power, number)
@@ -189,8 +200,8 @@ def _rules_of(
     return found
 
 
-def _rounded(number: Callable[[float], Any], of_float: Callable[[float], float], value: Any) -> Any:
-    return number(of_float(float(value)))
+def _rounded(number: Callable[[float], Any], of_float: Callable[..., float], *values: Any) -> Any:
+    return number(of_float(*map(float, values)))
 
 
 def _short(value: Any) -> Any:

@@ -16,7 +16,8 @@ u and m: its own part, ∂r/∂x and so on, is part of the tick's X, U and M; �
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi
@@ -159,9 +160,7 @@ def jacobians(kind: Kind) -> SiteJacobians:
         and all(edge.affine for edge in edges.values())
     )
     listening = [_listening(kind, p, edges) for p in range(len(kind.clocks))]
-    pattern = assemble(
-        kind, affine, [structural_pattern(block) for block in blocks], [heard for _, heard in listening]
-    )
+    pattern = assemble(kind, affine, _patterns(kind, blocks), [heard for _, heard in listening])
     own = [parts for parts, _ in listening]
     return SiteJacobians(
         kind=kind,
@@ -172,6 +171,19 @@ def jacobians(kind: Kind) -> SiteJacobians:
         timed=_depends(flat, t) or any(edge.timed for edge in edges.values()),
         edges=edges,
     )
+
+
+def _patterns(kind: Kind, blocks: Sequence[Any]) -> list[NDArray[np.bool_]]:
+    """Return the pattern of each block; of a clock's, of all its variants together."""
+    heights = [0, 0, *(len(one.outputs) for one in kind.clocks for _ in range(4))]
+    found = []
+    for block, height in itertools.zip_longest(blocks, heights, fillvalue=0):
+        pattern = structural_pattern(block)
+        if height:
+            variants = pattern.reshape(len(pattern) // height, height, pattern.shape[1])
+            pattern = np.logical_or.reduce(variants, axis=0)
+        found.append(pattern)
+    return found
 
 
 def edge_name(partition: ClockPartition, receive: Receive) -> str:

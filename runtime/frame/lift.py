@@ -441,10 +441,12 @@ class _Playing:
                     for channel, row in rows:
                         yield row, everything[..., channel, :]
                 case Tick(partition, index, rows_heard):
-                    memories = self.kind.clocks[partition].memories
+                    own = self.kind.clocks[partition]
+                    memories = own.memories
                     before = [value.get(Value(partition, o, index - 1), at.nothing) for o in memories]
                     received = yield from _received(rows_heard, hear, at.nothing)
-                    computed = self.multiply(self.ticks[partition], _over(moving, [*before, *received]))
+                    slopes = self.ticks[partition][..., event.rows(len(own.outputs)), :]
+                    computed = self.multiply(slopes, _over(moving, [*before, *received]))
                     for output in range(computed.shape[-2]):
                         value[Value(partition, output, index)] = computed[..., output, :]
 

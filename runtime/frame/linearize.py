@@ -114,7 +114,8 @@ def _finite_slopes(
         memories, heard = iter(m), iter(r)
         for clock in kind.clocks:
             own = [next(memories) for _ in clock.memories], [next(heard) for _ in clock.receives]
-            values.append(("{}", list(clock.outputs), clock.tick(x, u, *own, p, t)))
+            column = clock.tick(x, u, *own, p, t)
+            values.append(("{}", list(clock.outputs) * (column.numel() // len(clock.outputs)), column))
         values += [("{}", list(send.channels), send.send(x, u, p, t)) for send in kind.sends]
         for form, rows, column in values:
             _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", kind.name)
@@ -122,7 +123,10 @@ def _finite_slopes(
     if not np.isfinite(flat).all():
         matrices = iter(cut(flat, site.shapes))
         rates = [f"der({state.name})" for state in kind.states]
-        blocks: list[tuple[Sequence[str], int]] = [(rates, 2), *((clock.outputs, 4) for clock in kind.clocks)]
+        ticks = [
+            (clock.outputs * (clock.tick.numel_out(0) // len(clock.outputs)), 4) for clock in kind.clocks
+        ]
+        blocks: list[tuple[Sequence[str], int]] = [(rates, 2), *ticks]
         blocks += [(send.channels, 2) for send in kind.sends]
         for names, count in blocks:
             for _ in range(count):

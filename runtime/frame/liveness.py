@@ -108,7 +108,10 @@ def hearing_of(
             own.append(
                 tuple(
                     (
-                        Way(receive.operator, receive.link, delay, edge, names[c] if edge else ""),
+                        Way(
+                            *(receive.operator, receive.link, delay, edge, names[c] if edge else ""),
+                            before=receive.before,
+                        ),
                         names[c],
                     )
                     for delay in delays

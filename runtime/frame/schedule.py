@@ -65,7 +65,7 @@ class Way:
 
     Only those pairs of peers are on it whose delay is the timing `delay`. A receive that weighs every sender
     apart, by the slope of its edge function, has a way of its own for each channel: `edge` and `channel` name
-    it, and are empty for a plain sum or mean.
+    it, and are empty for a plain sum or mean. With `before`, a tick hears on it what the tick before heard.
     """
 
     operator: str
@@ -73,6 +73,7 @@ class Way:
     delay: str
     edge: str = ""
     channel: str = ""
+    before: bool = False
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -115,11 +116,19 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Clock partition `partition` computes, tick `index`; `heard` are each receive's rows of r, to add."""
+    """Clock partition `partition` computes, tick `index`; `heard` are each receive's rows of r, to add.
+
+    `variant` is which of the partition's columns it computes (see `ClockPartition.variants`).
+    """
 
     partition: int
     index: int
     heard: tuple[tuple[int, ...], ...]
+    variant: int = 0
+
+    def rows(self, outputs: int) -> slice:
+        """Return its own rows, of a partition's that has so many outputs."""
+        return slice(self.variant * outputs, (self.variant + 1) * outputs)
 
 
 @dataclass(frozen=True, slots=True)

@@ -222,7 +222,7 @@ def _heard_at_ticks(
 
     def rows(way: Way, channel: str, clock: str, index: int) -> tuple[Heard | Selected, ...]:
         if way.link not in kept:
-            instant = times.clocks[clock].at(index)
+            instant = times.clocks[clock].at(index - way.before)
             return (newest(way, channel, exchange.links[way.link], instant, times, rank),)
         row = Selected(way, channel, clock, index)
         law = exchange.links[way.link].channel
@@ -341,7 +341,9 @@ def _computations(
     place_of = {one: index for index, one in enumerate(received)}
     for (p, index), row in heard_at.items():
         places = tuple(tuple(place_of[one] for one in receive) for receive in row)
-        yield times.clocks[pattern.kind.clocks[p].clock].at(index), rank, Tick(p, index, places)
+        partition = pattern.kind.clocks[p]
+        variant = partition.variants[index % len(partition.variants)] if partition.variants else 0
+        yield times.clocks[partition.clock].at(index), rank, Tick(p, index, places, variant)
 
 
 def _sendings(
@@ -431,7 +433,7 @@ def _demanded(
             case Send(partition, rows):
                 for channel, _ in rows:
                     read(sent[partition][channel])
-            case Tick(partition, index, _):
+            case Tick(partition, index):
                 read(computed[partition])
                 memories = kind.clocks[partition].memories
                 demanded.update(Value(partition, memories[m], index - 1) for m in recalled[partition])
@@ -485,8 +487,8 @@ def _counted(events: Sequence[Event], clocks: int) -> Iterator[tuple[int, ...]]:
 def _moved(event: Event, by: Sequence[int]) -> Event:
     """Return an event with its ticks counted from later ones."""
     match event:
-        case Tick(partition, index, heard):
-            return Tick(partition, index - by[partition], heard)
+        case Tick(partition, index):
+            return replace(event, index=index - by[partition])
         case Act(hold, value):
             return Act(hold, _earlier(value, by))
     return event

@@ -207,7 +207,7 @@ def _felt_velocity(group: PeerGroup, device: Device) -> str:
     kind = group.jacobians.kind
     for partition, tick in zip(kind.clocks, group.exact.ticks, strict=True):
         for row in np.flatnonzero(tick.x[:, device.velocity].astype(np.bool_)):
-            name = partition.outputs[row]
+            name = partition.outputs[row % len(partition.outputs)]
             return (
                 f"{name} samples the velocity of {device.part}, and a hand that moves it just then, and "
                 "hardly at all, gets any force for nothing"

@@ -23,6 +23,7 @@ from apc.compiler.compiled import CompiledSystem, Link, Timing, count_of
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.vectors import whole_and_index
 from apc.eigen.peer_group import PeerGroup
+from apc.frame.ages import aged
 
 # The timing of packets that take no time.
 AT_ONCE = "at once"
@@ -107,7 +108,7 @@ def _by_formula(system: CompiledSystem, link: Link, group: PeerGroup) -> float |
     K is what those of the group are drawn by together as all others move by 1, over this link.
     """
     kind, site = group.jacobians.kind, group.site
-    if link.delays or kind.ports is None:
+    if link.delays or kind.ports is None or aged(system):  # a prediction by age counts against the delay
         return None
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     period = {clock.name: seconds[clock.period] for clock in system.clocks}

@@ -230,6 +230,8 @@ def _channels(link: Link, peers: int) -> int:
 
 def _unserved(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
     """Return what of the scene can't be judged, "" if all can."""
+    if why := next((why for link, _ in lossy if (why := _asked_of_packets(system, link))), ""):
+        return why
     if any(law.trace is not None for _, law in lossy):
         if not all(law.trace is not None for _, law in lossy):
             return "recorded delays beside links whose packets get lost or come late by chance"
@@ -254,6 +256,22 @@ def _unserved(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) 
             return f"jitter and bursts of {link.name} together"
         if law.jitter and link.channel.reorder == "all" and _overtakes(system, link, law):
             return f"packets of {link.name} that are overtaken and count all the same (reorder: all)"
+    return ""
+
+
+def _asked_of_packets(system: CompiledSystem, link: Link) -> str:
+    """Return what a scene asks of packets over a link beside what is in them, "" if nothing."""
+    receives = [
+        receive
+        for kind in system.kinds
+        for partition in kind.clocks
+        for receive in partition.receives
+        if receive.link == link.name
+    ]
+    if any(receive.age for receive in receives):
+        return f"the age of what is heard over {link.name}, which is left to chance and enters the equations"
+    if any(receive.before for receive in receives):
+        return f"what was heard over {link.name} at the tick before"
     return ""
 
 
@@ -302,7 +320,9 @@ def judge_network(
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         found = growth(system, prepared)
-        worst = worst_case(system, prepared) if any(law.mean_loss for _, law in unreliable(system)) else None
+        lost = [link for link, law in unreliable(system) if law.mean_loss]
+        followed = lost and not any(_asked_of_packets(system, link) for link in lost)
+        worst = worst_case(system, prepared) if followed else None
         surely, unsure = _almost_sure(system, prepared, found)
         rms = _rms_error(found)
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)

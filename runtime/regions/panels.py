@@ -18,8 +18,8 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
+from apc.frame.ages import linear_sites
 from apc.frame.exchange import build_exchange
-from apc.frame.jacobians import jacobians
 from apc.frame.linearize import linearize_rows, site_of_row
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply, parse_override
@@ -185,8 +185,9 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
     second = resolve(apply(system, [Override(axis.free, value)]))
     exchange = build_exchange(system, first.timings)
     found: set[int] = set()
+    sites = linear_sites(system, first.timings)
     for place, group in enumerate(system.groups):
-        built = jacobians(system.kinds[group.kind])
+        built = sites[group.kind]
         if not built.parameters_suffice:
             what = "the scene weighs its others one by one, so that there is no effective gain to compare at"
             raise ApcError(Mistake("E906", PLACE, what))

@@ -261,12 +261,14 @@ class _Listing:
         """Return what is done before a segment: all that is heard in it was sent before it began."""
         found: list[Operation] = []
         late: dict[tuple[int, int], list[Operation]] = {}  # by the tick of a route that it hears
+        before: dict[tuple[int, int], list[Operation]] = {}  # what the tick before heard is still there
         for g, member in enumerate(self.members):
             segment, schedule = member.program.segments[index], member.program.schedule
             for place, row in enumerate(segment.heard):
                 one = schedule.received[row]
                 if isinstance(one, Selected):
-                    late.setdefault(self._tick(one), []).append(self._on_ways(g, place, one))
+                    listed = before if one.way.before else late
+                    listed.setdefault(self._tick(one), []).append(self._on_ways(g, place, one))
                 else:
                     found += self._heard(g, place, one)
             for place, pairwise in enumerate(segment.pairs, len(segment.heard)):
@@ -276,8 +278,8 @@ class _Listing:
                     late.setdefault(self._tick(heard), []).append(look)
                 else:
                     found.append(look)
-        for route, tick in sorted(late):
-            found += [Deliver(route, tick), *late[route, tick]]
+        for route, tick in sorted({*late, *before}):
+            found += [*before.get((route, tick), ()), Deliver(route, tick), *late.get((route, tick), ())]
         return tuple(found)
 
     def _tick(self, row: Selected) -> tuple[int, int]:

@@ -136,6 +136,9 @@ def refuse_unheard_of(system: CompiledSystem) -> None:
                         "value of its own to stand in for a missing one"
                     )
                     raise ApcError(Mistake("E893", Place(system.name), what, hint="on_loss: hold"))
+                if receive.link in zero and receive.before:
+                    what = f"{receive.name}: what stood in for a missing value at the tick before is not kept"
+                    raise ApcError(Mistake("E893", Place(system.name), what, hint="on_loss: hold"))
 
 
 def build_population(

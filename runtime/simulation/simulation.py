@@ -21,6 +21,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
+from apc.frame.ages import stamped
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.parameters import Numbers, resolve
@@ -173,6 +174,7 @@ def prepare(
         step that does not fit; and those of `build_schedules`, `build_population` and `routes_of`.
     """
     refuse_unheard_of(system)
+    system = stamped(system)
     with finite_equations(system.name):
         plan = _plan(system, settings.method)
         choices = _choices(plan, signals)

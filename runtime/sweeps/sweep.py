@@ -24,7 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
-from apc.frame.jacobians import jacobians
+from apc.frame.ages import linear_sites
 from apc.frame.names import notes_for_all_groups
 from apc.memory import refuse_beyond
 from apc.network.nominal import left_out, refuse_channel_number
@@ -216,7 +216,7 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
         "left_out": [
             *left_out(
                 system,
-                linear=all(jacobians(kind).affine for kind in system.kinds),
+                linear=all(site.affine for site in linear_sites(system)),
                 network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]),
             ),
             *notes_for_all_groups(system, [axis.free for axis in work.grid.axes]),

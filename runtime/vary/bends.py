@@ -230,8 +230,10 @@ _RULES: dict[str, Callable[..., Any]] = {
 }
 
 
-def _transcendental(name: str, value: Any) -> Any:
-    value = _series(value)
+def _transcendental(name: str, *values: Any) -> Any:
+    if name == "atan2":
+        return _angle(*values)
+    value = _series(values[0])
     match name:
         case "tanh":
             return _tanh(value)
@@ -239,6 +241,13 @@ def _transcendental(name: str, value: Any) -> Any:
             up, down = value.exp(), (-value).exp()
             return (up - down if name == "sinh" else up + down) / 2
     return getattr(value, name)()
+
+
+def _angle(y: Any, x: Any) -> Any:
+    """Return atan2(y, x), whose jump at y = 0 > x is not decided."""
+    if _series(x)[0] > 0:
+        return (y / x).atan()
+    return -(x / y).atan() + flint.arb.pi() / 2 * _sign(y)
 
 
 def _tanh(value: Any) -> Any:

@@ -28,6 +28,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import time_left
+from apc.frame.ages import at_timings
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
@@ -261,15 +262,15 @@ def _piece(
     value = low + INSIDE * (high - low)
     inside = system_with_delay(system, free, value)
     timings = resolve(inside).timings
-    patterns = [site.pattern for site in prepared.jacobians]
-    schedules = build_schedules(system, timings, patterns, order=prepared.order)
+    sites = at_timings(system, prepared.jacobians, timings, prepared.order)
+    schedules = build_schedules(system, timings, [site.pattern for site in sites], order=prepared.order)
     durations: dict[int, tuple[float, float]] = {}
     for schedule, group in zip(schedules, system.groups, strict=True):
         for quanta, slope in _steps(schedule, system.kinds[group.kind], slopes).items():
             durations[quanta] = (float(quanta * schedule.quantum - slope * value), float(slope))
     if not follows and not any(slope for _, slope in durations.values()):
         return Piece(low, high, None, inside)
-    shared = Prepared(prepared.jacobians, schedules, timings, prepared.order)
+    shared = Prepared(sites, schedules, timings, prepared.order)
     groups, exchange = lifted_groups(inside, prepared=shared)
     found = batch_evaluator(inside, (free,), groups, exchange, durations=durations, follows=follows)
     return Piece(low, high, found, inside)

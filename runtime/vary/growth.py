@@ -23,6 +23,7 @@ from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
+from apc.frame.ages import aged
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
 from apc.hands.passivity import passive_growth, passive_hands
@@ -153,8 +154,9 @@ def growth_at(
     found = growth(changed, prepared, bounded=bounded)
     if found.why:
         what = f"the scene can't be judged in mean square: {found.why}"
-        narrower = any(one.free.name in channel_numbers(system) for one in overrides)
-        hint = "a narrower range between --lower and --upper" if narrower else f"--in {NOMINAL}"
+        hint = f"--in {NOMINAL}"
+        if any(one.free.name in channel_numbers(system) for one in overrides):
+            hint = "apc simulate" if aged(system) else "a narrower range between --lower and --upper"
         raise ApcError(Mistake("E898", place, what, hint=hint))
     return found
 

@@ -29,6 +29,7 @@ from apc.eigen.bordered import Bordered, Logarithm, bordered, logarithm, side_by
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.modes import arrange
 from apc.eigen.rigid import find_rigid_modes
+from apc.frame.ages import aged
 from apc.frame.hyperperiod import ClockGrid, Times
 from apc.frame.names import Free
 from apc.frame.parameters import resolve
@@ -171,7 +172,9 @@ def late_stretches(
 
 
 def _only_late(system: CompiledSystem, free: Free, prepared: Prepared, moving: set[str]) -> bool:
-    """Say whether a value makes packets late, and nothing else that matters."""
+    """Say whether a value makes packets late, and nothing else that matters: no age of theirs."""
+    if aged(system):
+        return False
     held = {
         hold.delay
         for group, schedule in zip(system.groups, prepared.schedules, strict=True)
@@ -209,7 +212,7 @@ def _packets(
     for place in range(len(apart) // max(len(delays), 1)):
         here = replace(times, delays={name: int(late[place] / quantum) for name, late in delays.items()})
         for row, listed in found.items():
-            at = here.clocks[row.clock].at(row.tick)
+            at = here.clocks[row.clock].at(row.tick - row.way.before)
             one = newest(row.way, row.channel, links[row.way.link], at, here, rank)
             listed.append((one.sent.slot, one.lag))
     return found

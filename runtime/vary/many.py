@@ -31,8 +31,8 @@ from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, judge
 from apc.finite_equations import finite_equations
+from apc.frame.ages import linear_sites
 from apc.frame.exchange import build_exchange
-from apc.frame.jacobians import jacobians
 from apc.frame.names import Free, find, notes_for_all_groups, unit_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import Numbers, resolve, scope_of
@@ -250,7 +250,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
     found = many_analyses(system, varied).at(np.stack(places, axis=1))
     shape = arrays[0].shape
     units = [unit_of(system, one.name) for one in frees]
-    affine = all(jacobians(kind).affine for kind in system.kinds)
+    affine = all(site.affine for site in linear_sites(system))
     return Analyses(
         topology=system.name,
         parameters=tuple(
@@ -286,7 +286,8 @@ def _shortest(numbers: Floats, place: int) -> Fraction:
 
 def by_matrices(system: CompiledSystem) -> bool:
     """Say whether matrices of many points can be had at once: all follows from the parameters alone."""
-    return all(jacobians(system.kinds[group.kind]).parameters_suffice for group in system.groups)
+    sites = linear_sites(system)
+    return all(sites[group.kind].parameters_suffice for group in system.groups)
 
 
 def many_analyses(system: CompiledSystem, varied: Sequence[Varied]) -> ManyAnalyses:

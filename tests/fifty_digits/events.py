@@ -102,6 +102,8 @@ def refusal(system: CompiledSystem, *, in_time: bool) -> str:
             return f"{kind.name} looks at each sender by itself"
         if any(r.operator not in ("mean", "sum") for clock in kind.clocks for r in clock.receives):
             return f"{kind.name} hears a maximum or minimum"
+        if in_time and any(receive.age for clock in kind.clocks for receive in clock.receives):
+            return f"{kind.name} asks for ages, which are counted from time 0 at first"
         if not _is_affine(kind.derivative):
             return f"between its ticks {kind.name} is not linear"
         if in_time and (reason := in_the_way(kind)):
@@ -349,7 +351,8 @@ class Happening:
             for i, site in enumerate(self.sites):
                 for place, clock in enumerate(site.kind.clocks):
                     if self._ticks_now(clock.clock, now):
-                        r = [self._heard(play, i, one, now) for one in clock.receives]
+                        period = self.clocks[clock.clock][1]
+                        r = [self._heard(play, i, one, now, period) for one in clock.receives]
                         before = play.computed[i][place]
                         m = [before[-1][1][row] for row in clock.memories] if clock.memories else []
                         before.append((now, site.ticks[place](now, play.x[i], held[i], m, r)))
@@ -375,15 +378,19 @@ class Happening:
                 found.append(0)
         return found
 
-    def _heard(self, play: Play, i: int, receive: Any, now: Fraction) -> Number:
-        """Return what a receive of a peer hears at a tick."""
+    def _heard(self, play: Play, i: int, receive: Any, now: Fraction, period: Fraction) -> Number:
+        """Return what a receive of a peer hears at a tick, or heard at the one before, a period ago."""
         total: Number = 0
+        then = now - period if receive.before else now
         for j, weight in self.whom(receive.link, receive.operator, i):
             site = self.sites[j]
             delay = self.delay[receive.link, site.group, self.sites[i].group]
             place = next(n for n, send in enumerate(site.kind.sends) if send.link == receive.link)
-            packet = next(p for time, p in reversed(play.packets[j][place]) if time + delay <= now)
-            total = total + packet[receive.channel] * rational_ball(weight)
+            sent, packet = next(one for one in reversed(play.packets[j][place]) if one[0] + delay <= then)
+            value = packet[receive.channel] if receive.age != "alone" else 1
+            if receive.age:
+                value = value * rational_ball(now - sent)
+            total = total + value * rational_ball(weight)
         return total
 
 

@@ -245,7 +245,8 @@ def _constant(value: Any) -> Germ:
     return Germ(*(flint.arb_series([_ball(Fraction(value))]) for _ in range(3)))
 
 
-def _transcendental(name: str, value: Any) -> Germ:
+def _transcendental(name: str, *values: Any) -> Germ:
+    (value,) = values
     germ = value if isinstance(value, Germ) else _constant(value)
     return germ.each(lambda series: _SERIES[name](series))
 

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import random
 
+from apc.compiler.language.expression import SMOOTH
+
 NUMBERS = ("0", "1", "2", "0.5", "3", "-1", "1e-9", "1e9", "0.1")
 POWERS = ("2", "3", "-1", "-2", "0.5", "1.5", "(1/3)", "0", "1", "(-0.5)")
-FUNCTIONS = ("sin", "cos", "tanh", "exp", "log", "sqrt", "abs", "sign", "floor")
+FUNCTIONS = (*SMOOTH, "sqrt", "abs", "sign", "floor")
 SMALL = {"m": "L", "N": "F", "m/s": "L/T0", "s": "T0", "N/m": "K", "N*s/m": "D"}
 
 

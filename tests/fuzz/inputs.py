@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from apc.compiler.language.expression import SMOOTH
 from tests.fuzz.equations import odd_equations
 from tests.fuzz.vectors import odd_vectors
 
@@ -108,7 +109,7 @@ KEYS = (
 NAMES = ("x", "v", "f", "a.x", "b.x", "a.f", "b.f", "flange.x", "flange.f", "object.x", "object.f", "mass", "damping", "stiffness", "delay",
          "limit", "side", "others.x", "others.v", "others", "time", "peers", "device.x", "kt", "haptic", "held1", "q", "a", "b", "x[1]", "a.x[2]", "device.x[1]")  # fmt: skip
 UNITS = ("", "kg", "N", "N/m", "N*s/m", "s", "ms", "m", "m/s", "Hz", "1", "rad", "N/m^(3/2)", "kg*m/s^2", "furlong", "µm", "N//m", "N/m/", "^2", "m^0", "m^(1/3)")  # fmt: skip
-UNARY = ("der", "sample", "hold", "previous", "initial", "abs", "sign", "sqrt", "exp", "log", "sin", "cos", "tanh", "floor",
+UNARY = ("der", "sample", "hold", "previous", "initial", "abs", "sign", "sqrt", *SMOOTH, "atan2", "age", "floor",
          "mean", "sum", "max", "min", "count", "dot", "norm", "cross", "foo")  # fmt: skip
 LIKE = str.maketrans(
     {"a": "а", "e": "е", "o": "о", "c": "с", "x": "х", "-": "−", ":": "：", "*": "∗", "/": "∕", " ": "\u00a0"}
