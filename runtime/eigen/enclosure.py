@@ -108,12 +108,10 @@ def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
 
     first = int((sizes >= SMALL).sum())
     tried = [_enclose(matrix, error, values, right, left, first)]
-    for count in _splits(sizes, first):
-        low = max(one.low for one in tried)
-        if min(one.high for one in tried) - low <= WIDE * max(low, 1.0):
-            break
+    low, high, splits = tried[0].low, tried[0].high, _splits(sizes, first)
+    while not high - low <= WIDE * max(low, 1.0) and (count := next(splits, None)) is not None:
         tried.append(_enclose(matrix, error, values, right, left, count))
-    low, high = max(one.low for one in tried), min(one.high for one in tried)
+        low, high = max(one.low for one in tried), min(one.high for one in tried)
     # No estimate is farther from its eigenvalue than both are from zero.
     errors = np.minimum(np.min([one.errors for one in tried], axis=0), sizes + high)
     return Eigenpairs(values, right * scale[:, None], left / scale), Enclosure(min(low, high), high, errors)

@@ -73,23 +73,19 @@ def balance(size: Floats) -> Floats:
     np.fill_diagonal(squared, 0.0)
     scale = np.ones(len(size))
     for _ in range(SWEEPS):
-        # Up to the first that changes nothing has to be gone through one by one.
-        columns, rows = squared.sum(axis=0), squared.sum(axis=1)
-        finite = (columns > 0) & (rows > 0) & (columns < np.inf) & (rows < np.inf)
-        with np.errstate(all="ignore"):
-            apart = np.abs(np.log2(rows / columns)) > 2 - 1e-9  # a little early: the next look tells
-        waiting = np.flatnonzero(finite & apart)
-        if not len(waiting):
-            break
-        for i in range(int(waiting[0]), len(size)):
+        settled = True
+        for i in range(len(size)):
             column, row = float(squared[:, i].sum()), float(squared[i].sum())
             if not (0 < column < np.inf and 0 < row < np.inf):
                 continue
-            factor = 2.0 ** round(math.log2(row / column) / 4)
+            factor = 2.0 ** round(np.log2(row / column) / 4)
             if factor != 1.0:
+                settled = False
                 scale[i] *= factor
                 squared[:, i] *= factor * factor
                 squared[i] /= factor * factor
+        if settled:
+            break
     return scale
 
 
