@@ -460,7 +460,7 @@ def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:
             site = site_of_row(built, linearize_rows(built, group.parameters[None])[0])
             known[key] = site, lift(site, group.schedule, exact=group.exact)
         site, frame = known[key]
-        return replace(group, site=site, lifted=frame)
+        return replace(group, site=site).with_lifted(frame)
 
     return tuple(replace(system, sites=tuple(map(lifted, system.sites))) for system in systems)
 
