@@ -81,7 +81,7 @@ def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
         order = load_pool("scipy.linalg").lu(scaled.T, p_indices=True, check_finite=False)[0]
         return np.flatnonzero(order < len(rows))
     left = np.array(rows)
-    size = np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    size = np.abs(rows).max(axis=1, keepdims=True, initial=np.finfo(np.float64).tiny)
     places: list[int] = []
     for _ in range(len(rows)):
         line, place = divmod(int(np.argmax(np.abs(left) / size)), rows.shape[1])

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import exponential, exponential_rows
+from apc.frame.discretize import exponential, exponential_values
 from apc.frame.lift import follow
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix
@@ -190,7 +190,7 @@ def _courses(
     below = np.eye(n_x + n_u)[n_x:]
     steps, fine = {}, {}
     for duration, number in points.items():
-        step = exponential_rows(a, b, float(duration * schedule.quantum) / number).matrix
+        step = exponential_values(a, b, float(duration * schedule.quantum) / number)
         power = np.concatenate([step, np.broadcast_to(below, (len(step), *below.shape))], axis=1)
         fine[duration], power = _followed(power, states, number)
         steps[duration] = power[:, :n_x]
@@ -230,7 +230,7 @@ def _finest(site: LinearSite, schedule: Schedule, points: dict[int, int]) -> dic
 
 @functools.lru_cache(maxsize=KEPT)
 def _known_step(entries: bytes, n_x: int, seconds: float) -> Floats:
-    """Return `_square_step` of few entries, row by row: what only couplers and delays change is remembered."""
+    """Return `_square_step` of few entries, row by row; what only couplers change is remembered."""
     return _square_step(np.frombuffer(entries).reshape(n_x, -1), seconds)
 
 
