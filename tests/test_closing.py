@@ -66,7 +66,7 @@ def test_what_is_heard_in_the_frame_it_is_sent_in_is_ordered_by_time() -> None:
     [group] = loop.sites
     lifted = replace(group.lifted, d=np.ones_like(group.lifted.d))
     with pytest.raises(AssertionError, match="heard before it is sent"):
-        close_loop(replace(loop, sites=(replace(group, lifted=lifted),)))
+        close_loop(replace(loop, sites=(group.with_lifted(lifted),)))
 
 
 def test_what_a_weight_may_be_off_by_is_in_the_bound() -> None:

@@ -165,6 +165,8 @@ def test_lines_scanned_in_step_have_the_crossings_of_each_and_none_beyond_the_fi
         [],
     ]
     assert all(one.whole for one in every)
+    assert first[0].points[-1] < points[0][-1], "far beyond its crossing nothing is looked at"
+    assert first[2].points[-1] == points[2][-1]
     assert scan_lines(course, [np.empty(0)], [1.0])[0].roots == ()
 
 

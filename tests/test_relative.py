@@ -44,3 +44,8 @@ def test_what_is_left_has_all_other_eigenvalues_of_one_matrix_of_many_and_of_fra
     np.testing.assert_allclose(exact.astype(float), left, rtol=1e-15)
     _, error = relative_bounded(matrix, np.zeros((3, 3)), at)
     assert (np.abs(exact.astype(float) - left) <= error).all() and error.max() < 1e-13
+
+
+def test_without_states_there_is_nothing_to_take_out() -> None:
+    at = relative_coordinates(np.zeros((0, 0)))
+    assert not len(at.held) and not len(at.rest)

@@ -136,6 +136,7 @@ class _KindBuilder:
             for table in part.tables
         }
         self.timings = timings
+        self.dimensions = {one.name: one.dimension for one in kind.clocked.flat.variables}
         self.dropped: list[tuple[str, str]] = []
         self.reached = reached
 
@@ -236,8 +237,7 @@ class _KindBuilder:
         return writer.function(name, columns, output, value)
 
     def _unit(self, name: str) -> str:
-        variable = next(v for v in self.kind.clocked.flat.variables if v.name == name)
-        return format_dimension(variable.dimension)
+        return format_dimension(self.dimensions[name])
 
     def _channels(self, rows: dict[str, str]) -> _Channels:
         """Return for each send that is heard its link and its row among what this kind sends over it."""

@@ -174,14 +174,14 @@ def open_loops(system: CompiledSystem, prepared: Prepared) -> list[OpenLoop] | s
             if one.sector and not one.shares:
                 return one.sector
         opened.append(_cut_open(group, pushes))
-    of_site = {id(one.group.lifted): one for one in opened}
+    of_site = {id(one.group.lifting): one for one in opened}
     exchange = build_exchange(system, resolve(system).timings)
     loops = loops_at_right_angles([one.group for one in opened], exchange, MOST_STATES)
     if isinstance(loops, str):
         return loops
     found = []
     for loop in loops:
-        listed = [of_site[id(site.lifted)] for site in loop.sites]
+        listed = [of_site[id(site.lifting)] for site in loop.sites]
         size = loop.states + sum(len(one.ticks) for one in listed)
         if size > MOST_STATES:
             return f"{size:,} states and ticks of contacts move together, and {MOST_STATES} are the most"

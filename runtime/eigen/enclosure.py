@@ -14,6 +14,7 @@ have nothing to do with the next part's.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -105,22 +106,27 @@ def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
     values, right, left = pairs.values, pairs.right, pairs.left
     sizes = np.abs(values)
 
-    # Splits between k and k + 1: conjugates stay together.
-    ratios = np.append(sizes[1:], 0.0) / np.maximum(sizes, np.finfo(np.float64).tiny)
     first = int((sizes >= SMALL).sum())
-    counts = [int(k) + 1 for k in np.argsort(ratios[:-1], kind="stable") if ratios[k] < 1 - CLOSE]
-    others = [count for count in counts if count != first and sizes[count - 1] > SMALL]
     tried = [_enclose(matrix, error, values, right, left, first)]
-    most = SPLITS_TRIED if len(matrix) <= MANY_STATES else FEWER_SPLITS
-    for count in (*others[:most], 0):
-        low = max(one.low for one in tried)
-        if min(one.high for one in tried) - low <= WIDE * max(low, 1.0):
-            break
+    low, high, splits = tried[0].low, tried[0].high, _splits(sizes, first)
+    while not high - low <= WIDE * max(low, 1.0) and (count := next(splits, None)) is not None:
         tried.append(_enclose(matrix, error, values, right, left, count))
-    low, high = max(one.low for one in tried), min(one.high for one in tried)
+        low, high = max(one.low for one in tried), min(one.high for one in tried)
     # No estimate is farther from its eigenvalue than both are from zero.
     errors = np.minimum(np.min([one.errors for one in tried], axis=0), sizes + high)
     return Eigenpairs(values, right * scale[:, None], left / scale), Enclosure(min(low, high), high, errors)
+
+
+def _splits(sizes: Floats, first: int) -> Iterator[int]:
+    """Yield after how many eigenvalues of falling magnitude to split besides the first, the widest gap first.
+
+    Conjugates stay together; the last is before all.
+    """
+    ratios = np.append(sizes[1:], 0.0) / np.maximum(sizes, np.finfo(np.float64).tiny)
+    counts = [int(k) + 1 for k in np.argsort(ratios[:-1], kind="stable") if ratios[k] < 1 - CLOSE]
+    others = [count for count in counts if count != first and sizes[count - 1] > SMALL]
+    yield from others[: SPLITS_TRIED if len(sizes) <= MANY_STATES else FEWER_SPLITS]
+    yield 0
 
 
 def _enclose(

@@ -250,7 +250,7 @@ def split_exchangeable(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
 def _are_exchangeable(loop: Loop, g: int, h: int) -> bool:
     """Say whether two sites can change places."""
     one, other = loop.sites[g], loop.sites[h]
-    if one.lifted is not other.lifted or one.schedule is not other.schedule:
+    if one.lifting is not other.lifting or one.schedule is not other.schedule:
         return False
     rest = [place for place in range(len(loop.sites)) if place not in (g, h)]
     return all(

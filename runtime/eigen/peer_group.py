@@ -10,8 +10,9 @@ Does not: find out who is alike (see `peers`); close a loop (see `closing`).
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
@@ -23,7 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import LiftedSite, lift
+from apc.frame.lift import LiftedSite, check_packets, lift
 from apc.frame.linearize import linearize_exact
 from apc.frame.schedule import Schedule, Way
 from apc.frame.site import LinearSite, rational_floats
@@ -89,7 +90,8 @@ class PeerGroup:
 
     `peers` are their numbers in the scene, from 0; `role` is the scene's group where it has delays of its own
     (see `Exchange.role`); `place` is what `gains` calls the group. `exact` holds the site's matrices in
-    rationals; where they can't be had, its floats taken at their word.
+    rationals; where they can't be had, its floats taken at their word. `lifting` gives `lifted`, which is
+    made when it is asked for.
     """
 
     name: str
@@ -99,12 +101,21 @@ class PeerGroup:
     site: LinearSite
     exact: LinearSite
     schedule: Schedule
-    lifted: LiftedSite
+    lifting: Callable[[], LiftedSite]
     peers: Peers
     role: int
     place: int
     listening: Listening | None
     gains: Gains
+
+    @property
+    def lifted(self) -> LiftedSite:
+        """The map of one frame."""
+        return self.lifting()
+
+    def with_lifted(self, lifted: LiftedSite) -> PeerGroup:
+        """Return the same peers with another map of one frame."""
+        return replace(self, lifting=lambda: lifted)
 
     def sends(self, link: str) -> bool:
         """Say whether these peers send over a link."""
@@ -137,7 +148,7 @@ class PeerGroup:
             site=site,
             exact=exact,
             schedule=schedule,
-            lifted=lifted or lift(site, schedule, exact=exact),
+            lifting=functools.cache(lambda: lifted or lift(site, schedule, exact=exact)),
         )
 
 
@@ -153,7 +164,7 @@ def build_group(
     listening: Listening | None = None,
     gains: Gains | None = None,
 ) -> PeerGroup:
-    """Lift a site and put it together with what is known of its peers, `parts` of the scene's groups.
+    """Put a site together with what is known of its peers, `parts` of the scene's groups.
 
     Parameters
     ----------
@@ -168,6 +179,7 @@ def build_group(
     listening, gains
         What it hears at the start and weighs each sender by, where that matters.
     """
+    check_packets(schedule)
     peers = joined([shifted(peers, int(exchange.starts[group])) for group, peers in parts])
     # The functions of a nonlinear loop can't be walked one by one.
     exact = linearize_exact(built, vector, listening) if built.walkable else None
@@ -179,7 +191,7 @@ def build_group(
         site=site,
         exact=rational_floats(site) if exact is None else exact,
         schedule=schedule,
-        lifted=lift(site, schedule, exact=exact),
+        lifting=functools.cache(lambda: lift(site, schedule, exact=exact)),
         peers=peers,
         role=exchange.role(parts[0][0]),
         place=place,

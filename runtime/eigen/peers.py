@@ -47,7 +47,7 @@ def peer_groups(
     numbers: Numbers,
     exchange: Exchange,
 ) -> tuple[PeerGroup, ...]:
-    """Find the groups of equal peers of a system, linearize and lift each once.
+    """Find the groups of equal peers of a system, linearize each once.
 
     Parameters
     ----------

@@ -81,14 +81,14 @@ def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
         order = load_pool("scipy.linalg").lu(scaled.T, p_indices=True, check_finite=False)[0]
         return np.flatnonzero(order < len(rows))
     left = np.array(rows)
+    size = np.abs(rows).max(axis=1, keepdims=True, initial=np.finfo(np.float64).tiny)
     places: list[int] = []
     for _ in range(len(rows)):
-        scaled = np.abs(left) / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        line, place = divmod(int(np.argmax(scaled)), rows.shape[1])
+        line, place = divmod(int(np.argmax(np.abs(left) / size)), rows.shape[1])
         places.append(place)
         if left[line, place] != 0:
             pivot = left[line] / left[line, place]
-            left = left - left[:, [place]] * pivot
+            left -= left[:, [place]] * pivot
             left[line] = 0.0
     return np.array(sorted(places), dtype=np.intp)
 

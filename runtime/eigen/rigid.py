@@ -206,15 +206,11 @@ def stays_rigid(
     for form in _standing(other, others, numbering) if solutions else ():
         for index in form:
             forms.setdefault(index, []).append(form)
-    for solution in solutions:
+    for solution, state in solutions:
         moving = (index for index, value in enumerate(solution) if value)
         if any(_value(form, solution) for index in moving for form in forms.get(index, ())):
             return False
-        moved = zip(
-            _standing_state(system, others, numbering, solution),
-            _standing_state(system, exact, numbering, solution),
-            strict=True,
-        )
+        moved = zip(_standing_state(system, others, numbering, solution), state, strict=True)
         if any(one - other for one, other in moved):
             return False
     return True
@@ -226,22 +222,22 @@ def _standing_motions(
     """Return the exact sites, the numbers of the unknowns, the standing solutions, and the state of each."""
     exact = [group.exact for group in system.sites]
     numbering = _Numbering(system.sites)
-    still = _standing_solutions(system, exact, numbering)
-    return exact, numbering, still, [_standing_state(system, exact, numbering, one) for one in still]
+    found = _standing_solutions(system, exact, numbering)
+    return exact, numbering, [still for still, _ in found], [state for _, state in found]
 
 
 def _standing_solutions(
     system: ClosedSystem | Loop, exact: Sequence[LinearSite], numbering: _Numbering
-) -> list[list[Fraction]]:
-    """Return the standing solutions whose states are independent.
+) -> list[tuple[list[Fraction], list[Fraction]]]:
+    """Return the standing solutions whose states are independent, each with its state.
 
     An output nobody reads may be free without being part of the state.
     """
     still = _null_space(
         list(_standing(system, exact, numbering)), numbering.size, split=numbering.size, known=0
     )
-    kept = _independent([_standing_state(system, exact, numbering, solution) for solution in still])
-    return [still[place] for place in kept]
+    states = [_standing_state(system, exact, numbering, solution) for solution in still]
+    return [(still[place], states[place]) for place in _independent(states)]
 
 
 class _Numbering:

@@ -29,6 +29,7 @@ from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
 from apc.frame.course import turns
+from apc.frame.discretize import UNIT
 from apc.frame.schedule import Propagate
 
 Floats = NDArray[np.float64]
@@ -332,9 +333,8 @@ def whole_vectors(
     vectors[rest], covectors[rest] = pairs.right, pairs.left.T
     if count:
         driven = matrix[np.ix_(held, rest)] @ pairs.right
-        for place, value in enumerate(pairs.values):
-            shifted = value * (1 + aside) * np.eye(count) - corner
-            vectors[held, place] = np.linalg.lstsq(shifted, driven[:, place], rcond=None)[0]
+        shifted = (pairs.values * (1 + aside))[:, None, None] * np.eye(count) - corner
+        vectors[held] = np.einsum("kij,jk->ik", np.linalg.pinv(shifted, rcond=count * 2 * UNIT), driven)
         vectors[rest] += weights @ vectors[held]
         covectors[held] = -(pairs.left @ weights).T
     shares = np.abs(vectors * covectors)

@@ -13,13 +13,14 @@ vector are real, each change of sign is half a turn.
 
 from __future__ import annotations
 
+import functools
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import exponential, exponential_rows
+from apc.frame.discretize import exponential, exponential_values
 from apc.frame.lift import follow
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix
@@ -36,6 +37,12 @@ DOUBLINGS, MOST = 8, 2**22
 
 # Of many sites, so many points at most from one event to the next.
 A_FEW = 256
+
+# Steps that are remembered, and of how many entries at most.
+KEPT, FEW_ENTRIES = 128, 4096
+
+# So many modes are followed at once, complex and real: to go through a frame twice takes longer.
+FEW = 64
 
 # From point to point a motion that turns by less is followed closely enough.
 CLOSE = 1.0
@@ -97,15 +104,16 @@ def turns(
         seen = np.zeros(len(values), dtype=np.bool_)
         steps = _finest(site, schedule, points)
         # A real course is half the work of a complex one.
-        alike = [left[real[left]], left[~real[left]]]
+        alike = [left] if len(left) <= FEW else [left[real[left]], left[~real[left]]]
         for some in (one[first : first + chunk] for one in alike for first in range(0, len(one), chunk)):
             given: list[NDArray[Any]] = [start[:, some], heard[:, some]]
-            if real[some[0]]:
+            if real[some].all():
                 given = [block.real for block in given]
             course = _course(site, schedule, steps, points, given[0], given[1], states[some])
             angle, widest = turned_along(course)
-            before, _ = turned_along(course[::2])  # half as finely
-            agreed = (np.abs(angle - before) < OFF) | (widest < CLOSE)
+            agreed = widest < CLOSE
+            if not agreed.all():
+                agreed |= np.abs(angle - turned_along(course[::2])[0]) < OFF  # half as finely
             found[some[agreed]] = _of_eigenvalue(angle[agreed], values[some[agreed]])
             seen[some[agreed]] = True
         left = left[~seen[left]]
@@ -182,7 +190,7 @@ def _courses(
     below = np.eye(n_x + n_u)[n_x:]
     steps, fine = {}, {}
     for duration, number in points.items():
-        step = exponential_rows(a, b, float(duration * schedule.quantum) / number).matrix
+        step = exponential_values(a, b, float(duration * schedule.quantum) / number)
         power = np.concatenate([step, np.broadcast_to(below, (len(step), *below.shape))], axis=1)
         fine[duration], power = _followed(power, states, number)
         steps[duration] = power[:, :n_x]
@@ -211,12 +219,26 @@ def _power_of_two(least: float, doubled: int) -> int:
 
 def _finest(site: LinearSite, schedule: Schedule, points: dict[int, int]) -> dict[int, Floats]:
     """Return the steps from one of so many points of each step to the next, square, of one site (1, n, n)."""
-    n_x, n_u = site.b.shape
+    generator = np.hstack([site.a, site.b])
+    entries, n_x = generator.tobytes() if generator.size <= FEW_ENTRIES else b"", len(generator)
     finest = {}
     for duration, number in points.items():
-        step, units = exponential(site.a, site.b, float(duration * schedule.quantum) / number)
-        finest[duration] = np.vstack([units * step.matrix, np.eye(n_x + n_u)[n_x:]])[None]
+        seconds = float(duration * schedule.quantum) / number
+        finest[duration] = _known_step(entries, n_x, seconds) if entries else _square_step(generator, seconds)
     return finest
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _known_step(entries: bytes, n_x: int, seconds: float) -> Floats:
+    """Return `_square_step` of few entries, row by row; what only couplers change is remembered."""
+    return _square_step(np.frombuffer(entries).reshape(n_x, -1), seconds)
+
+
+def _square_step(generator: Floats, seconds: float) -> Floats:
+    """Return the step of [A B] (n_x, n), square (1, n, n)."""
+    n_x, n = generator.shape
+    step, units = exponential(generator[:, :n_x], generator[:, n_x:], seconds)
+    return np.vstack([units * step.matrix, np.eye(n)[n_x:]])[None]
 
 
 def _followed(power: Floats, states: Integers, number: int) -> tuple[Floats, Floats]:

@@ -1,7 +1,8 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
 Takes: the matrices of dx/dt = A x + B u, exact, or of many sites at once in floats.
-Gives: `Step`, `discretize`, `moved_together`; in floats, `exponential` and `exponential_rows`; `step_balls`.
+Gives: `Step`, `discretize`, `moved_together`; in floats, `exponential`, `exponential_rows`,
+`exponential_values`; `step_balls`.
 Guarantees: every entry of `discretize` is right to the last digit but one, proved by ball arithmetic, whether
 a mode dies out in a nanosecond or never; where many states move together and it is off by no more than
 composing it rounds, it is had in floats. Every step comes with a bound.
@@ -17,6 +18,7 @@ precision loses log₂(bT/m) bits where the mass is tiny. Arb's exponential (Joh
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from typing import Any
@@ -51,6 +53,9 @@ FEW_TOGETHER, MOST_TOGETHER = 64, 250
 DOUBTFUL = 1e4
 # Inputs beside fewer states: each is a row more of the exponential.
 FEWEST_INPUTS = 8
+
+# Steps of sites that are remembered, and of how many entries in all, A's and B's for each duration.
+KEPT, FEW_ENTRIES = 128, 4096
 
 # Entries of a large matrix, as a share of all, up to which its products leave out the zeros.
 SPARSE = 1 / 16
@@ -102,6 +107,24 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
         E806 an entry of the exponential is too large for a float: something grows without measure within T;
         E812 too many states, or too many that move together.
     """
+    if len(durations) * (a.size + b.size) > FEW_ENTRIES:
+        return _discretized(a, b, durations)
+    entries = (*a.ravel().tolist(), *b.ravel().tolist())
+    return _known_steps(entries, a.shape, b.shape, tuple(durations))
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _known_steps(
+    entries: tuple[Any, ...], of_a: tuple[int, int], of_b: tuple[int, int], durations: tuple[Fraction, ...]
+) -> tuple[Step, ...]:
+    """Return `discretize` of few entries, row by row: what only couplers and links change is remembered."""
+    whole = np.array([*entries, None])[:-1]  # of objects, also where there are no entries
+    split = of_a[0] * of_a[1]
+    return _discretized(whole[:split].reshape(of_a), whole[split:].reshape(of_b), durations)
+
+
+def _discretized(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> tuple[Step, ...]:
+    """Return `discretize`, computed."""
     n_x = len(a)
     matrices = np.zeros((len(durations), n_x, n_x + b.shape[1]))
     sizes = np.full(matrices.shape, UNDERFLOW)
@@ -226,16 +249,10 @@ def exponential_rows(
     is less than 2^−64 of the largest, which counts where more states stand in a row than it has terms.
     """
     n_x, n_u = b.shape[-2:]
-    x = a * seconds
-    times, limit, last = _products(x)
-    norm = float(np.abs(x).sum(axis=-2).max(initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(norm / limit)))) if 0 < norm < np.inf else 0
-    scale = 2.0**-squarings
-    x, g = x * scale, b * (seconds * scale)
-    phi = _phi(lambda other: times(other) * scale, x, last)
+    x, g, last, steps = _squared_steps(a, b, seconds)
+    step = next(steps)
     absolute = _products(np.abs(x))[0]
     large = _phi(absolute, np.abs(x), last)
-    step = np.concatenate([np.eye(n_x) + times(phi) * scale, phi @ g], axis=-1)
     terms = max(np.count_nonzero(x, axis=-1).max(initial=0), np.count_nonzero(g, axis=-2).max(initial=0))
     charge = float(terms + 6 + rounded)
     grown, pushed = np.eye(n_x) + absolute(large), np.abs(g)
@@ -244,17 +261,49 @@ def exponential_rows(
     if n_x > last:
         error[..., :n_x] += LEFT_OUT
         error[..., n_x:] += LEFT_OUT * pushed.sum(axis=-2, keepdims=True)
-    below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (*b.shape[:-2], n_u, n_x + n_u))
-    for _ in range(squarings):
-        whole, off = np.concatenate([step, below], axis=-2), np.concatenate([error, 0 * below], axis=-2)
+    for following in steps:
+        whole, off = _whole(step), np.concatenate([error, np.zeros((*b.shape[:-2], n_u, n_x + n_u))], axis=-2)
         size = np.abs(whole)
         terms = int(np.count_nonzero(whole, axis=-1).max(initial=0))
         error = (size[..., :n_x, :] + error) @ off + error @ size
         error += (terms + 2) * UNIT * (size[..., :n_x, :] @ size)
-        step = step @ whole
+        step = following
     # Composing a step rounds it as often as it is wide: one that is off by so much is no larger for it.
     charge = max(charge, float(n_x + n_u))
     return Step(step, np.maximum(np.abs(step), error / (charge * UNIT)), charge)
+
+
+def exponential_values(a: Matrix, b: Matrix, seconds: float) -> Matrix:
+    """Return the matrices of `exponential_rows` without their errors, which are most of its work."""
+    *_, step = _squared_steps(a, b, seconds)[-1]
+    return step
+
+
+def _squared_steps(a: Matrix, b: Matrix, seconds: float) -> tuple[Matrix, Matrix, int, Iterator[Matrix]]:
+    """Return X and B T/2^s of `exponential_rows`, the last power, and what gives each [F G] in turn."""
+    x = a * seconds
+    times, limit, last = _products(x)
+    norm = float(np.abs(x).sum(axis=-2).max(initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(norm / limit)))) if 0 < norm < np.inf else 0
+    scale = 2.0**-squarings
+    x, g = x * scale, b * (seconds * scale)
+
+    def steps() -> Iterator[Matrix]:
+        phi = _phi(lambda other: times(other) * scale, x, last)
+        step = np.concatenate([np.eye(a.shape[-1]) + times(phi) * scale, phi @ g], axis=-1)
+        yield step
+        for _ in range(squarings):
+            step = step @ _whole(step)
+            yield step
+
+    return x, g, last, steps()
+
+
+def _whole(step: Matrix) -> Matrix:
+    """Return [F G; 0 I] of [F G]."""
+    n_x, n = step.shape[-2:]
+    below = np.broadcast_to(np.eye(n)[n_x:], (*step.shape[:-2], n - n_x, n))
+    return np.concatenate([step, below], axis=-2)
 
 
 def _phi(times: Callable[[Matrix], Matrix], x: Matrix, last: int) -> Matrix:

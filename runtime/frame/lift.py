@@ -17,7 +17,6 @@ sent.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -266,7 +265,7 @@ def _play_again(
 
     def named_at(value: Value, later: int) -> Value:
         index = value.index + before[value.partition] + later * again.ticks[value.partition]
-        return replace(value, index=index)
+        return Value(value.partition, value.output, index)
 
     unit = numbers.exact(np.eye(n + n_r))
     once = playing.at_rest(unit[..., :n_x, :])

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from apc.compiler.frozen import dataclass
 from apc.eigen.dissipation import peak_gain
 from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
-from apc.frame.discretize import UNIT, exponential_rows
+from apc.frame.discretize import UNIT, exponential_values
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.hands.response import Pushed, Site, force_lanes
 from apc.moments.gains import around, stein
@@ -121,7 +121,7 @@ def _within(site: Site, seconds: float, at: Floats, row: int, forces: Floats) ->
     n, count = len(site.states), len(at)
     seen, pushed = [], []
     for share in at.tolist():
-        step = exponential_rows(value_of(site.a)[None], value_of(site.b)[None], seconds * share).matrix[0]
+        step = exponential_values(value_of(site.a)[None], value_of(site.b)[None], seconds * share)[0]
         seen.append(step[row])
         # σ^i/i! up to a share of the interval: in units of that share, so many powers of it smaller.
         lanes = _lanes(site, seconds * share, count) * share ** np.arange(count)

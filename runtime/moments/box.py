@@ -232,4 +232,4 @@ def _lifted(group: PeerGroup, site: LinearSite, balls: Sequence[Any]) -> PeerGro
     steps = {duration: ball_radii(step) for duration, step in frame_steps(inside, group.schedule).items()}
     found = compose(every_matrix(inside, ball_radii), group.schedule, steps, numbers=RADII)
     kind, schedule = group.jacobians.kind, group.schedule
-    return replace(group, lifted=named(kind, schedule, found.mapped(value_of), found.mapped(radius_of)))
+    return group.with_lifted(named(kind, schedule, found.mapped(value_of), found.mapped(radius_of)))

@@ -76,7 +76,7 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
     groups, rows, peers, built = [], {}, {}, {}
     pushed = False
     for group in told.groups:
-        key = id(group.schedule), id(group.lifted)
+        key = id(group.schedule), id(group.lifting)
         if key not in built:
             held = find_device(group.jacobians, group.parameters, unit_of, group.listening)
             if isinstance(held, str):
@@ -91,7 +91,7 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
                 site=found.site,
                 exact=found.exact,
                 schedule=found.schedule,
-                lifted=found.lifted,
+                lifting=found.lifting,
             )
         )
         rows[id(found.schedule)] = told.rows[id(group.schedule)]

@@ -30,7 +30,7 @@ from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.batch_lift import lift_rows
-from apc.frame.discretize import UNIT, Step, exponential_rows
+from apc.frame.discretize import UNIT, Step, exponential_rows, exponential_values
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, LiftedSite, compose, composed_bounded, lift
@@ -54,6 +54,7 @@ from apc.vary.wiring import (
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
 Wired = TypeVar("Wired", ClosedSystem, Loop)
+T = TypeVar("T")
 
 # The complex step: its square vanishes beside 1, whatever the parameter's size.
 STEP = 1e-60
@@ -253,34 +254,36 @@ class BatchEvaluator:
         return tuple(found)
 
     def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> Lift:
-        site, steps, lost = self._placed(group, linearize_rows(group.jacobians, vectors), np.zeros((1, 1)))
+        site, steps, lost = self._placed(group, linearize_rows(group.jacobians, vectors))
+        steps = steps or self.steps(site, np.zeros((1, 1)), exponential_rows)
         with np.errstate(all="ignore"):
             frame = composed_bounded(site, group.schedule, steps)
         _lose(frame, lost)
         return Lift(site, steps, frame)
 
     def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
-        site, steps, lost = self._placed(
-            group, self.rows(group.jacobians, self.vectors(group, values)), values
-        )
+        site, fixed, lost = self._placed(group, self.rows(group.jacobians, self.vectors(group, values)))
+        steps = {quanta: step.matrix for quanta, step in fixed.items()}
+        steps = steps or self.steps(site, values, exponential_values)
         with np.errstate(all="ignore"):
-            frame = compose(site, group.schedule, {quanta: step.matrix for quanta, step in steps.items()})
+            frame = compose(site, group.schedule, steps)
         _lose(frame, lost)
         return frame
 
     def _placed(
-        self, group: PeerGroup, rows: Matrices, values: Matrices
+        self, group: PeerGroup, rows: Matrices
     ) -> tuple[LinearSite, Mapping[int, Step], NDArray[np.bool_]]:
-        """Return a group's sites with their exponentials, and which of them are beyond any."""
+        """Return a group's sites, their exponentials if nothing free reaches these, and which have none."""
         site = sites_of_rows(group.jacobians, rows)
         beyond = is_beyond(site.a, site.b)
-        steps = self.fixed.get(site_key(group))
-        if steps is None:
-            site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
-            return site, self.steps(site, values), beyond
-        return replace(site, a=site.a[:1], b=site.b[:1]), steps, beyond
+        if site_key(group) in self.fixed:
+            return replace(site, a=site.a[:1], b=site.b[:1]), self.fixed[site_key(group)], beyond
+        site.a[beyond], site.b[beyond] = 0.0, 0.0  # they would spoil the others' exponentials
+        return site, {}, beyond
 
-    def steps(self, site: LinearSite, values: Matrices) -> dict[int, Step]:
+    def steps(
+        self, site: LinearSite, values: Matrices, exponential: Callable[[Matrices, Matrices, float], T]
+    ) -> dict[int, T]:
         """Return the exponentials of every step, one for all points where A, B and the time stay."""
         a, b = _shared(site.a, site.b)
         steps = {}
@@ -292,7 +295,7 @@ class BatchEvaluator:
                 gone = np.abs(seconds) < VANISHING * abs(constant)
                 seconds = np.where(gone, seconds - seconds.real, seconds)
             with np.errstate(all="ignore"):
-                steps[quanta] = exponential_rows(a * seconds, b * seconds, 1.0)
+                steps[quanta] = exponential(a * seconds, b * seconds, 1.0)
         return steps
 
     def rows(self, built: SiteJacobians, vectors: Matrices) -> Matrices:
@@ -391,7 +394,7 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
         vectors = evaluator.vectors(group, point + (STEP * 1j) * along)
         site = sites_of_rows(group.jacobians, evaluator.rows(group.jacobians, vectors))
         if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
-            found[site_key(group)] = evaluator.steps(site, point)
+            found[site_key(group)] = evaluator.steps(site, point, exponential_rows)
     return found
 
 
@@ -460,7 +463,7 @@ def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:
             site = site_of_row(built, linearize_rows(built, group.parameters[None])[0])
             known[key] = site, lift(site, group.schedule, exact=group.exact)
         site, frame = known[key]
-        return replace(group, site=site, lifted=frame)
+        return replace(group, site=site).with_lifted(frame)
 
     return tuple(replace(system, sites=tuple(map(lifted, system.sites))) for system in systems)
 

@@ -58,6 +58,9 @@ MOST_OPEN, MOST_LEVELS = 64, 40
 # A Newton step so small, relatively, is the last: what is left is about its square.
 SETTLED = 1e-7
 
+# Stretches of a line of which only the first crossing is wanted: mostly it is in the first or second.
+STRETCHES = 3
+
 # Newton's steps at most, each with a bracket to fall back on.
 MOST_STEPS = 60
 
@@ -166,14 +169,14 @@ def scan_lines(
     least
         For each line, what its cells are measured against at least.
     first
-        Whether what lies beyond the first crossing at which the magnitude rises is left alone.
+        Whether what lies beyond the first crossing at which the magnitude rises is left alone: then mostly
+        it is not looked at.
     """
     count = len(points)
     if not any(len(one) for one in points):
         return tuple(Scan(np.empty(0), np.empty(0, dtype=bool), (), whole=True) for _ in points)
     narrow = [narrowest(*pair) for pair in zip(points, least, strict=True)]
-    lines = np.repeat(np.arange(count), [len(one) for one in points])
-    samples = _sample(courses, lines, np.concatenate(points), ends=True)
+    samples = _with_ends(_begun(courses, points, STRETCHES if first else 1))
     new = np.ones(len(samples.points), dtype=bool)
     whole, going = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
     for _ in range(MOST_LEVELS):
@@ -217,28 +220,57 @@ def _last_cells(samples: _Samples, count: int) -> Integers:
     return found
 
 
-def _sample(courses: Courses, lines: Integers, points: Floats, *, ends: bool = False) -> _Samples:
-    """Return the samples at points that have matrices and a side.
+def _begun(courses: Courses, points: Sequence[Floats], stretches: int) -> _Samples:
+    """Return the samples at the points to begin with, those of a line in so many stretches.
 
-    Parameters
-    ----------
-    courses, lines, points
-        The matrices, and where.
-    ends
-        Whether the first and last point of each line may lie on the circle, see `_off_circle`.
+    No stretch of a line is looked at after one in which the magnitude rises across 1.
     """
+    going, found = np.arange(len(points)), None
+    for stretch in range(stretches):
+        ends = [len(one) * np.array([stretch, stretch + 1]) // stretches for one in points]
+        some = [points[line][slice(*ends[line])] for line in going.tolist()]
+        lines = np.repeat(going, [len(one) for one in some])
+        if not len(lines):
+            continue
+        more = _sampled(courses, lines, np.concatenate(some))
+        found = more if found is None else found.merged(more)[0]
+        radius = found.radius()
+        going = np.array([line for line in going if not _rises(radius[found.lines == line])], dtype=np.int64)
+    assert found is not None
+    return found
+
+
+def _rises(radius: Floats) -> bool:
+    """Say whether magnitudes in order are clearly below 1, and clearly above it later."""
+    below = np.flatnonzero(radius < 1 - UNSURE)
+    return bool(len(below)) and bool((radius[below[0] :] > 1 + UNSURE).any())
+
+
+def _sample(courses: Courses, lines: Integers, points: Floats) -> _Samples:
+    """Return the samples at points that have matrices and a side."""
+    samples = _sampled(courses, lines, points)
+    return samples.chosen(_sure(samples))
+
+
+def _sampled(courses: Courses, lines: Integers, points: Floats) -> _Samples:
+    """Return the samples at points that have matrices."""
     pairs = courses(lines, points)
     sound = np.ones(len(points), dtype=bool)
     for matrix, slope in pairs:
         sound &= np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(slope).all(axis=(1, 2))
     found = [eigenvalues(matrix[sound], slope[sound]) for matrix, slope in pairs]
     values, slopes = tuple(v for v, _ in found), tuple(d for _, d in found)
-    samples = _Samples(lines[sound], points[sound], values, slopes)
-    # What lies on the circle within rounding tells no side, unless something is clearly outside.
-    sure = np.abs(samples.radius() - 1) > UNSURE
-    if not ends:
-        return samples.chosen(sure)
-    lines = samples.lines
+    return _Samples(lines[sound], points[sound], values, slopes)
+
+
+def _sure(samples: _Samples) -> Truths:
+    """Say which samples tell a side: not what lies on the circle, unless something is clearly outside."""
+    return np.abs(samples.radius() - 1) > UNSURE
+
+
+def _with_ends(samples: _Samples) -> _Samples:
+    """Return the samples that tell a side, the first and last of each line if on the circle, too."""
+    sure, lines = _sure(samples), samples.lines
     first, last = np.diff(lines, prepend=-1) > 0, np.diff(lines, append=len(lines)) > 0
     # Beside an end that only rounding moves off the circle, the next sample tells no side either.
     way = np.where(first & np.append(sure[1:], False), 1, np.where(last & np.append(False, sure[:-1]), -1, 0))

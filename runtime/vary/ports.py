@@ -23,6 +23,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Feedback, Loop, StateLayout, close, feedback_of, lay_out_loop
 from apc.frame.devices import refuse_hands
+from apc.frame.discretize import exponential_rows, exponential_values
 from apc.frame.lift import FrameMap, compose, composed_bounded
 from apc.frame.linearize import linearize_rows, sites_of_rows
 from apc.frame.names import Free
@@ -155,13 +156,13 @@ class PortEvaluator:
         driven = opened.site(site, inverse)
         beyond = is_beyond(driven.a, driven.b)
         driven.a[beyond], driven.b[beyond] = 0.0, 0.0
-        steps = self.batch.steps(driven, values)
         with np.errstate(all="ignore"):
             if numbers is RADII:
-                frame = composed_bounded(driven, opened.ported.schedule, steps)
+                bounded = self.batch.steps(driven, values, exponential_rows)
+                frame = composed_bounded(driven, opened.ported.schedule, bounded)
             else:
-                plain = {quanta: step.matrix for quanta, step in steps.items()}
-                frame = compose(driven, opened.ported.schedule, plain)
+                steps = self.batch.steps(driven, values, exponential_values)
+                frame = compose(driven, opened.ported.schedule, steps)
         frame.p[beyond] = np.nan
         return frame, damping
 

@@ -26,7 +26,7 @@ from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.batch_lift import HOPELESS, PERTURBED_FRAMES, SAFE, lift_rows
-from apc.frame.discretize import FEW_TOGETHER, UNIT, Step, exponential_rows
+from apc.frame.discretize import FEW_TOGETHER, UNIT, Step, exponential_rows, exponential_values
 from apc.frame.lift import FrameMap, compose, roundings_of, with_roundings
 from apc.frame.linearize import linearize_rows, sites_of_rows
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
@@ -318,14 +318,14 @@ def _step(site: LinearSite, seconds: float) -> Step:
     """
     (a, b), n_x, n_u = (site.a, site.b), *site.b.shape[-2:]
     step = exponential_rows(a[:1], b[:1], seconds)
-    half = exponential_rows(a[:1], b[:1], seconds / 2).matrix
+    half = exponential_values(a[:1], b[:1], seconds / 2)
     found, size = np.zeros((2, len(a), n_x, n_x + n_u))
     found[:1], size[:1] = step.matrix, np.maximum(np.abs(step.matrix), step.size)
     moved = 1 + np.flatnonzero(a[1:].any(axis=(1, 2)) | b[1:].any(axis=(1, 2)))
     # Of a large site one by one, as its own products leave out the zeros.
     for some in np.split(moved, len(moved) if n_x > FEW_TOGETHER else 1) if len(moved) else ():
         near, pushed = (one[:1] + (STEP * 1j) * one[some] for one in (a, b))
-        found[some] = exponential_rows(near, pushed, seconds).matrix.imag / STEP
+        found[some] = exponential_values(near, pushed, seconds).imag / STEP
     whole = np.maximum(np.maximum(step.size, np.abs(half)), np.eye(n_x, n_x + n_u))
     below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (1, n_u, n_x + n_u))
     slopes = np.abs(np.concatenate([a[moved], b[moved]], axis=-1))
