@@ -19,7 +19,7 @@ from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 Floats = NDArray[np.float64]
 
-# Groups of unlike clocks and delays, contacts, damping, a server, packets heard in the frame they are sent in.
+# Groups of unlike clocks and delays, contacts, a server, packets heard in the frame they are sent in.
 NAMES = ("mixed-clocks", "experiment-average", "client-server", "star-lecture", "two-users-waves", "finger")
 LATE = AVERAGE.replace("lan: {clock: network, delay: 8 ms}", "lan: {clock: network, delay: 3.5 ms}")
 PUSHED = AVERAGE + "hands:\n  hand: {type: ConstantForce, flange: device, force: 0 N}\n"
@@ -104,7 +104,7 @@ def pushed(text: str, peer: int, group: str = "user") -> tuple[apc.CompiledSyste
     count = compiled(text).peers
     push = ", ".join("1 N" if one == peer else "0 N" for one in range(count))
     own = f"{group}: {{count: {count}}}"
-    moved = replaced(text, own, f"{group}: {{count: {count}, set: {{hand.force: [{push}]}}}}")
+    moved = replaced(text, (own, f"{group}: {{count: {count}, set: {{hand.force: [{push}]}}}}"))
     return compiled(text), compiled(moved)
 
 
@@ -126,3 +126,125 @@ def test_its_step_response_is_what_simulate_plays(text: str) -> None:
             1.0, np.abs(rows).max()
         )
         assert np.abs(rows).max() > 1e-6  # something is compared
+
+
+HELD = """\
+topology: held
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}}
+couplers: {wall: {type: SampledSpringDamper, a: device, b: ground, stiffness: 400 N/m, clock: haptic}}
+"""
+
+
+def test_what_a_force_and_noise_move_in_the_end_is_known() -> None:
+    """A spring gives way by F/k; one that is told of a place too far by n pulls back by n."""
+    found = state_space(compiled(HELD))
+    assert [port.name for port in found.inputs] == ["force on user[1].device", "noise on user[1].device.x"]
+    steady = found.c @ np.linalg.solve(np.eye(len(found.a)) - found.a, found.b) + found.d
+    gains = dict(zip((port.name for port in found.outputs), steady.tolist(), strict=True))
+    assert gains["user[1].device.x"] == pytest.approx([1 / 400, -1.0], rel=1e-12)
+    assert gains["user[1].wall.f"] == pytest.approx([1.0, 0.0], abs=1e-9)
+
+
+def matrices(found: StateSpace) -> list[list[list[float]]]:
+    return [one.tolist() for one in found.matrices]
+
+
+@pytest.mark.parametrize("suffix", [".py", ".mat", ".npz"])
+def test_every_file_holds_the_same(
+    suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    path = tmp_path / f"loop{suffix}"
+    assert run(["export", "--out", path.name, "--cut", "lan", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    found = state_space(compiled(AVERAGE), cut="lan")
+    assert [told[name] for name in "abcd"] == matrices(found)
+    names = [port.name for port in found.states]
+    read: dict[str, Any]
+    if suffix == ".py":
+        pytest.importorskip("control")
+        read = runpy.run_path(str(path))
+        assert read["states"] == [(port.name, port.unit) for port in found.states]
+        assert read["system"].state_labels == found.to_control().state_labels
+        assert read["system"].A.tolist() == read["A"]
+        assert [read[name] for name in "ABCD"] == matrices(found)
+    elif suffix == ".mat":
+        read = pytest.importorskip("scipy.io").loadmat(path, squeeze_me=True)
+        assert read["states"].tolist() == names
+        assert read["state_units"].tolist() == [port.unit for port in found.states]
+        assert [read[name].tolist() for name in "ABCD"] == matrices(found)
+        assert json.loads(str(read["provenance"]))["topology"] == "three-users-average"
+    else:
+        with np.load(path, allow_pickle=False) as archive:
+            read = dict(archive)
+        assert read["states"].tolist() == names
+        assert [read[name].tolist() for name in "ABCD"] == matrices(found)
+    assert float(read["dt"]) == 0.008
+
+
+def test_a_scenes_words_are_never_read_as_python(tmp_path: Path) -> None:
+    """Python quotes, ends of lines and braces in what a scene says of itself."""
+    found = state_space(compiled(AVERAGE))
+    evil = StateSpace(
+        'x"""\\\nimport os; os.abort()\n"""{0}', found.cut, found.frame_s, *found.matrices,
+        *(found.states, found.inputs, found.outputs), ('"""\nraise SystemExit',), '"""\nraise SystemExit',
+    )  # fmt: skip
+    from apc.exports.files import write_script
+
+    write_script(path := tmp_path / "loop.py", evil)
+    pytest.importorskip("control")
+    assert runpy.run_path(str(path))["made_by"] == evil.made_by
+
+
+def test_names_for_python_control_are_never_alike() -> None:
+    from apc.exports.files import control_names
+    from apc.exports.lifted import Port
+
+    assert control_names([Port("a.b", ""), Port("a_b", ""), Port("a_b_2", ""), Port("a[b]", "")]) == [
+        "a_b", "a_b_2", "a_b_2_2", "a_b_3",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--out", "x.foo"], "x.foo: E878 the suffix of --out wants one of .py"),
+        (["--out", "x.npz", "--to", "mat"], "x.npz: E878 the suffix of --out wants .mat, got .npz"),
+        (["--out", "x.mat", "--to", "matlab"], "--to: E952 a format wants one of control"),
+        (
+            ["--out", "x.mat", "--cut", "lann"],
+            "--cut: E950 lann is no link or coupler of three-users-average",
+        ),
+        (["--out", "no/x.mat"], "no/x.mat: E601 can't be written"),
+        (["--out", "scene.yaml", "--to", "npz"], "scene.yaml: E878"),
+    ],
+)
+def test_what_cannot_be_is_told_and_nothing_is_written(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["export", *words]) == 1
+    assert capsys.readouterr().err.startswith(message)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
+
+
+def test_more_peers_than_the_memory_holds_are_refused_before_anything_is_built() -> None:
+    many = compiled(replaced(AVERAGE, ("count: 3", "count: 1000000")))
+    with pytest.raises(ApcError, match=r"E951 .* all 1,000,000 peers .* take about .* of memory"):
+        state_space(many)
+
+
+def test_from_python_the_suffix_says_the_format(tmp_path: Path) -> None:
+    found = apc.export(SCENES / "three-users-average.yaml", out=tmp_path / "loop.npz")
+    assert isinstance(found, StateSpace)
+    assert matrices(found) == matrices(state_space(compiled(AVERAGE)))
+    with pytest.raises(ApcError, match="E952"):
+        apc.export(ALL["average"])
