@@ -658,6 +658,7 @@ def export(
     *,
     set: Mapping[str, str] | None = None,
     cut: str = "",
+    free: Sequence[str] = (),
 ) -> Result:
     """Hand a scene over to other tools.
 
@@ -671,6 +672,8 @@ def export(
         The file to write; nothing is written if not given.
     cut
         The link or coupler to cut the loop open at.
+    free
+        Parameters that stay free: `.function` is a `casadi.Function` of them that gives A, B, C and D.
 
     Returns
     -------
@@ -689,7 +692,7 @@ def export(
     chosen = handing.format_of(to, path, option="=")
     system = _model(model, set)
     _check_out(model, system, path)
-    return handing.export(system, chosen, handing.Asked(cut=cut), path)
+    return handing.export(system, chosen, handing.Asked(cut, tuple(free)), path)
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

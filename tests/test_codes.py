@@ -190,6 +190,7 @@ E950 runtime/exports: a loop is to be cut where there is no link or coupler
 E951 runtime/exports: a state space is too large for the memory or a file
 E952 runtime/exports: a format to export to is not known
 E953 runtime/exports: an option means nothing to the format
+E954 runtime/exports: a number can't be left free
 """
 
 

@@ -42,6 +42,13 @@ from apc.threads import start_single_threaded
     help="Cut the loop open at a link or a coupler, for margins and designs of your own: closed again by "
     "u = -y it is the closed loop.",
 )
+@click.option(
+    "--free",
+    multiple=True,
+    metavar="PATH",
+    help="Leave a number free: A, B, C and D are a casadi.Function of it too, `function` in the file. May "
+    "be repeated.",
+)
 @file_option("--out", "The file to write.", required=True)
 @json_option
 def export_command(
@@ -49,6 +56,7 @@ def export_command(
     to: str | None,
     settings: tuple[str, ...],
     cut: str,
+    free: tuple[str, ...],
     out: Path,
     as_json: bool,
 ) -> None:
@@ -61,6 +69,7 @@ def export_command(
     \b
         apc export --out loop.mat
         apc export --to control --cut lan --out open_loop.py
+        apc export --free coordination.stiffness --out family.npz
     """
     start_single_threaded()
     from apc.exports.export import Asked, export, format_of
@@ -68,7 +77,7 @@ def export_command(
 
     chosen = format_of(to, out)
     system = open_scene(file, settings, {"--out": out}, told=note_aside)
-    found = export(system, chosen, Asked(cut=cut), out)
+    found = export(system, chosen, Asked(cut, free), out)
     print_result(found, as_json=as_json, err=beside(out))
     if not as_json:
         tell(f"\n{out} is written", err=beside(out))
