@@ -667,7 +667,8 @@ def export(
     model, set
         As for `analyze`.
     to
-        "control", "mat" or "npz": a state space; the suffix of `out` says it if not given.
+        "control", "mat" or "npz": a state space; "modelica": a model. The suffix of `out`
+        says it if not given.
     out
         The file to write; nothing is written if not given.
     cut
@@ -679,7 +680,7 @@ def export(
     -------
     Result
         What was made, and written if asked: of a state space its matrices with the names and units of states,
-        inputs and outputs, and `.to_control()`.
+        inputs and outputs, and `.to_control()`; of a model its `.text`.
 
     Raises
     ------

@@ -114,7 +114,7 @@ HOUSE = (
         panels
         """,
     ),
-    ("apc.exports", "words lifted free files export"),
+    ("apc.exports", "words lifted free files expressions modelica export"),
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",

@@ -191,6 +191,7 @@ E951 runtime/exports: a state space is too large for the memory or a file
 E952 runtime/exports: a format to export to is not known
 E953 runtime/exports: an option means nothing to the format
 E954 runtime/exports: a number can't be left free
+E955 runtime/exports: Modelica has no words for what a scene says
 """
 
 

@@ -32,7 +32,7 @@ from apc.threads import start_single_threaded
     "--to",
     metavar="FORMAT",
     help="control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
-    "MATLAB, SciPy, NumPy. Taken from --out if not given.",
+    "MATLAB, SciPy, NumPy; modelica: a flat model with clocks (.mo). Taken from --out if not given.",
 )
 @set_option
 @click.option(
@@ -64,10 +64,12 @@ def export_command(
 
     FILE is a topology or a compiled model. As a state space it is the whole
     loop over one frame, all peers in it: from a force on every mass and noise
-    on every measurement to every position, velocity and force.
+    on every measurement to every position, velocity and force. As a Modelica
+    model it is every equation, tick and packet.
 
     \b
         apc export --out loop.mat
+        apc export --out scene.mo
         apc export --to control --cut lan --out open_loop.py
         apc export --free coordination.stiffness --out family.npz
     """
