@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 import apc
 from apc.__main__ import run
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.errors import ApcError
 from apc.exports.lifted import StateSpace, state_space
+from apc.frame.devices import Push, find_push
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 Floats = NDArray[np.float64]
@@ -23,6 +25,14 @@ Floats = NDArray[np.float64]
 NAMES = ("mixed-clocks", "experiment-average", "client-server", "star-lecture", "two-users-waves", "finger")
 LATE = AVERAGE.replace("lan: {clock: network, delay: 8 ms}", "lan: {clock: network, delay: 3.5 ms}")
 PUSHED = AVERAGE + "hands:\n  hand: {type: ConstantForce, flange: device, force: 0 N}\n"
+
+HELD = """\
+topology: held
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}}
+couplers: {wall: {type: SampledSpringDamper, a: device, b: ground, stiffness: 400 N/m, clock: haptic}}
+"""
 
 
 def scenes() -> dict[str, apc.CompiledSystem]:
@@ -99,6 +109,29 @@ def test_the_gain_margin_of_a_coupler_cut_open_is_that_of_its_stiffness(cut: str
     assert grows(found, margin.factor * (1 + 1e-8))
 
 
+def test_python_control_finds_the_margins_that_apc_finds() -> None:
+    """A loop of one peer and one tick a frame has one input and one output, cut at its wall."""
+    control = pytest.importorskip("control")
+    system = compiled(HELD)
+    gain, _, crossing, _ = control.margin(state_space(system, cut="wall").to_control())
+    margin = next(one for one in apc.margins(system).rows if one.parameter == "wall.stiffness")
+    assert gain == pytest.approx(margin.factor, rel=1e-9)
+    assert crossing / (2 * np.pi) == pytest.approx(margin.frequency_hz, rel=1e-9)
+
+
+def test_a_force_on_what_a_bar_joins_moves_both_its_ends() -> None:
+    """Of a tool m_t midway between m and m: M = [[m + m_t/4, m_t/4], [m_t/4, m + m_t/4]]."""
+    system = apc.compile(SCENES / "two-handed-tool.yaml")
+    (group,), _ = lifted_groups(system)
+    units = {one.name: one.unit for one in system.parameters}
+    found = [find_push(group.jacobians, group.parameters, units, None, place) for place in (0, 2)]
+    wanted = np.linalg.inv([[0.15, 0.05], [0.05, 0.15]])
+    for column, push in zip(wanted.T, found, strict=True):
+        assert isinstance(push, Push)
+        assert push.velocities == (1, 3)
+        assert [*map(float, push.inverses)] == pytest.approx(column, rel=1e-14)
+
+
 def pushed(text: str, peer: int, group: str = "user") -> tuple[apc.CompiledSystem, apc.CompiledSystem]:
     """Return a scene at rest, and the same with 1 N at a peer's device."""
     count = compiled(text).peers
@@ -126,15 +159,6 @@ def test_its_step_response_is_what_simulate_plays(text: str) -> None:
             1.0, np.abs(rows).max()
         )
         assert np.abs(rows).max() > 1e-6  # something is compared
-
-
-HELD = """\
-topology: held
-clocks: {haptic: 1 ms}
-peers: {user: {count: 1}}
-masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}}
-couplers: {wall: {type: SampledSpringDamper, a: device, b: ground, stiffness: 400 N/m, clock: haptic}}
-"""
 
 
 def test_what_a_force_and_noise_move_in_the_end_is_known() -> None:
