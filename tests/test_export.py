@@ -239,7 +239,7 @@ def test_words_for_names_are_never_alike() -> None:
         (["--out", "x.mat", "--to", "matlab"], "--to: E952 a format wants one of control"),
         (
             ["--out", "x.mat", "--cut", "lann"],
-            "--cut: E950 lann is no link or coupler of three-users-average",
+            "--cut: E950 lann is no link or coupler with ticks of three-users-average",
         ),
         (["--out", "x.npz", "--free", "lan.delay"], "--free: E954 lan.delay is a time"),
         (["--out", "x.npz", "--free", "device.mas"], "--free: E622 device.mas is no parameter"),
@@ -269,6 +269,13 @@ def test_what_cannot_be_is_told_and_nothing_is_written(
 def test_more_peers_than_the_memory_holds_are_refused_before_anything_is_built() -> None:
     many = compiled(replaced(AVERAGE, ("count: 3", "count: 1000000")))
     with pytest.raises(ApcError, match=r"E951 .* all 1,000,000 peers .* take about .* of memory"):
+        state_space(many)
+
+
+def test_different_peers_that_are_too_many_are_refused_too() -> None:
+    masses = ", ".join(f"{0.1 + k * 1e-4} kg" for k in range(400))
+    many = compiled(replaced(AVERAGE, ("{count: 3}", f"{{set: {{device.mass: [{masses}]}}}}")))
+    with pytest.raises(ApcError, match=r"E951 400 different peers .* Write: fewer peers"):
         state_space(many)
 
 

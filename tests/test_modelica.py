@@ -117,6 +117,25 @@ def test_rumoca_plays_contacts_that_are_not_linear_as_simulate_does() -> None:
     assert worst(system, 0.06, "cvodes:1e-10") < 1e-7
 
 
+HANDS = {
+    "StepForce": "force: 2 N, start: 20 ms",
+    "RampForce": "force: 2 N, start: 10 ms, rise: 20 ms",
+    "SineForce": "force: 2 N, frequency: 7 Hz",
+    "TableForce": "force: push.csv",
+    "MassSpringDamperArm": "mass: 0.2 kg, stiffness: 100 N/m, damping: 1 N*s/m, position: 3 mm",
+}
+
+
+@needs_rumoca
+@pytest.mark.parametrize("hand", HANDS)
+def test_rumoca_plays_hands_as_simulate_does(hand: str, tmp_path: Path) -> None:
+    (tmp_path / "push.csv").write_text("time [s],force [N]\n0,0\n0.01,1\n0.02,-1\n", encoding="utf-8")
+    path = tmp_path / "scene.yaml"
+    held = f"hands:\n  hand: {{type: {hand}, flange: device, {HANDS[hand]}}}\n"
+    path.write_text(AVERAGE + held, encoding="utf-8")
+    assert worst(apc.compile(path), 0.04) < 1e-9
+
+
 def test_the_text_is_readable() -> None:
     """Names as in `apc simulate`, units, what each number is, one equation a line, where it comes from."""
     text = modelica(compiled(AVERAGE)).text
@@ -197,6 +216,26 @@ MEET = replaced(
 def test_what_modelica_has_no_words_for_is_refused_by_name(text: str, message: str) -> None:
     with pytest.raises(ApcError, match=message):
         modelica(compiled(text))
+
+
+SOFT = """\
+component: SoftSpring
+about: A spring that gives way more the harder it is pulled.
+connectors: {a: Flange, b: Flange}
+parameters: {stiffness: {unit: N/m}, soft: {unit: 1/N^2}}
+variables: {f: {unit: N}}
+equations: [f + soft*f^3 = stiffness*(a.x - b.x), a.f = f, b.f = -a.f]
+"""
+
+
+def test_a_loop_that_newtons_method_solves_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "soft.yaml").write_text(SOFT, encoding="utf-8")
+    path = tmp_path / "scene.yaml"
+    spring = "{type: SoftSpring, a: device, b: cube, stiffness: 100 N/m, soft: 1 1/N^2}"
+    couplers = ("couplers:", f"couplers:\n  spring: {spring}")
+    path.write_text(replaced(AVERAGE, ("topology:", "library: ./\ntopology:"), couplers), encoding="utf-8")
+    with pytest.raises(ApcError, match=r"E955 .*: the nonlinear loop of user that Newton's method solves"):
+        modelica(apc.compile(path))
 
 
 def test_a_refused_scene_leaves_no_file(

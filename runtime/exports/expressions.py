@@ -66,8 +66,7 @@ def identifier(name: str) -> str:
     """Return a name as Modelica writes it, in quotes where it is no word."""
     if _PLAIN.match(name) and name not in _KEYWORDS:
         return name
-    escaped = "".join(one if one.isascii() and one.isprintable() else "_" for one in name)
-    return "'" + escaped.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    return "'" + name.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def number(value: float) -> Text:

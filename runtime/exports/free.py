@@ -21,12 +21,12 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups, prepare, prepare_at_start
+from apc.analysis.analysis import prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.plain import symbolic
 from apc.eigen.peer_group import PeerGroup
-from apc.exports.lifted import Numbers, StateSpace, lifted, state_space, steps_in_floats
+from apc.exports.lifted import Numbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
 from apc.exports.words import Port, words
 from apc.frame.devices import Push
 from apc.frame.linearize import site_of_entries
@@ -69,7 +69,7 @@ def with_free(system: CompiledSystem, names: Sequence[str], *, cut: str = "") ->
     if prepared is None:
         what = "where the scene is linearized does not follow from its numbers alone"
         raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"no {OPTION}"))
-    groups, exchange = lifted_groups(system, prepared=prepared)
+    groups, exchange = peers_of(system, prepared=prepared)
     apart = [part for group in groups for part in _by_groups(group, exchange.starts)]
     values = dict(zip(frees, symbols, strict=True))
 

@@ -1,7 +1,7 @@
 """A scene over one frame as a state space, all peers in it: from forces and noise to what is simulated.
 
 Takes: a `CompiledSystem`; a link or coupler to cut it at.
-Gives: `StateSpace`, `state_space`; `Numbers`, `lifted`, `steps_in_floats`: the same in any kind of number.
+Gives: `StateSpace`, `state_space`; `Numbers`, `lifted`, `peers_of`, `steps_in_floats`: the same in any kind of number.
 Guarantees: every event within a frame is in it, exactly but for rounding; its eigenvalues are those that
 `analyze` finds, and 0 for each force that nothing else remembers until the frame ends. Cut open and closed
 again by u = −y it is the closed loop.
@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups, prepare
+from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.frozen import dataclass
@@ -168,13 +168,26 @@ def state_space(system: CompiledSystem, *, cut: str = "") -> StateSpace:
     ApcError
         E950 nothing to cut at; E951 too many states; and those of `analysis.lifted_groups`.
     """
-    groups, exchange = lifted_groups(system)
+    groups, exchange = peers_of(system)
     (a, b, c, d), (states, inputs, outputs), unpushed = lifted(system, groups, exchange, cut, IN_FLOATS)
     if not all(np.isfinite(block).all() for block in (a, b, c, d)):
         raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
     frame_s, notes = about(system)
     notes = (*notes, *unpushed)
     return StateSpace(system.name, cut, frame_s, a, b, c, d, states, inputs, outputs, notes, made_by(system))
+
+
+def peers_of(
+    system: CompiledSystem, *, prepared: Prepared | None = None
+) -> tuple[tuple[PeerGroup, ...], Exchange]:
+    """Return the peers of a system as `analysis.lifted_groups`, and what is too large as E951."""
+    try:
+        return lifted_groups(system, prepared=prepared)
+    except ApcError as error:
+        if any(one.code != "E804" for one in error.mistakes):
+            raise
+        what = error.mistakes[0].what
+        raise ApcError(Mistake("E951", Place(system.origin.topology), what, hint="fewer peers")) from None
 
 
 def about(system: CompiledSystem) -> tuple[float, tuple[str, ...]]:
@@ -379,7 +392,8 @@ def _link_of(system: CompiledSystem, cut: str) -> str:
         return cut
     if cut and cut not in parts:
         known = [*links, *sorted(parts)]
-        what = f"{cut[:80]} is no link or coupler of {system.name} ({', '.join(known) or 'it has none'})"
+        listed = ", ".join(known) or "it has none"
+        what = f"{cut[:80]} is no link or coupler with ticks of {system.name} ({listed})"
         near = nearest(cut, known) or (known[0] if known else "")
         raise ApcError(Mistake("E950", Place("--cut"), what, hint=f"--cut {near}" if near else ""))
     return ""

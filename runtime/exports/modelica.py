@@ -106,7 +106,7 @@ class _Writer:
         self.numbers = resolve(system)
         self.exchange: Exchange = build_exchange(system, self.numbers.timings)
         self.taken: dict[str, None] = {}
-        self.parameters: dict[str, str] = {}
+        self.parameters: dict[str, tuple[Text, str]] = {}
         self.declared: list[str] = []
         self.equations: list[str] = []
         self.units = {one.name: one.unit for one in system.parameters}
@@ -118,6 +118,7 @@ class _Writer:
         self.starts: dict[tuple[int, str], list[Text]] = {}
         self.heard: dict[tuple[int, str, int, str, str], Text] = {}
         self.sampled: dict[tuple[int, str, str], Text] = {}
+        self.senders: dict[str, dict[int, list[tuple[int, Fraction]]]] = {}
 
     def model(self) -> ModelicaModel:
         """Return the model."""
@@ -134,7 +135,14 @@ class _Writer:
                 self._tick(peer, partition, moving[peer], vectors[peer])
         lines = [f"model {name} {_quoted(system.about or system.name)}"]
         lines += [f"  // {one}" for one in self._header()]
-        lines += ["", *self.parameters.values(), "", *self.clock_lines, "", *self.declared]
+        lines += [
+            "",
+            *(line for _, line in self.parameters.values()),
+            "",
+            *self.clock_lines,
+            "",
+            *self.declared,
+        ]
         duration = float(system.experiment.duration or SECOND)
         step = min((self._timing(clock.period) for clock in system.clocks), default=SECOND / 1000)
         lines += ["equation", *self.equations, "", f"  annotation(experiment(StopTime={duration!r}, "]
@@ -168,8 +176,9 @@ class _Writer:
         return self.numbers.timings[name]
 
     def _name(self, wanted: str) -> str:
-        """Return a name that nothing else has."""
-        name, number_ = wanted, 1
+        """Return a name that nothing else has, of letters that Modelica takes in quotes."""
+        wanted = name = "".join(one if one.isascii() and one.isprintable() else "_" for one in wanted)
+        number_ = 1
         while name in self.taken:
             number_ += 1
             name = f"{wanted} ({number_})"
@@ -221,13 +230,13 @@ class _Writer:
                 label = name if usual.get(name) == value else f"{group.name}.{name}"
             label += " at the start" if any(state.start == name for state in kind.states) else ""
             if label not in self.parameters:
-                self._name(label)
+                named = Text(identifier(self._name(label)))
                 unit = unit_of_modelica(self.units.get(name, "1"))
                 said = f'(unit="{unit}")' if unit else ""
                 about = f" {_quoted(self.abouts[name])}" if self.abouts.get(name) else ""
-                line = f"  parameter Real {identifier(label)}{said} = {number(value).text}{about};"
-                self.parameters[label] = line
-            found.append(Text(identifier(label)))
+                line = f"  parameter Real {named.text}{said} = {number(value).text}{about};"
+                self.parameters[label] = (named, line)
+            found.append(self.parameters[label][0])
         return found
 
     def _moving(self, peer: int, p: Sequence[Text]) -> tuple[list[Text], list[Text]]:
@@ -434,13 +443,14 @@ class _Writer:
 
     def _heard_of(self, peer: int, link: str) -> list[tuple[int, Fraction]]:
         """Return whom a peer hears over a link, and with what weights."""
-        pairs, weights = self.exchange.arcs(link)
-        found = [
-            (int(sender), exact_weight(float(weight)))
-            for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True)
-            if receiver == peer and (int(sender), link) in self.sent
-        ]
-        return sorted(found)
+        if link not in self.senders:
+            found: dict[int, list[tuple[int, Fraction]]] = {}
+            pairs, weights = self.exchange.arcs(link)
+            for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
+                if (sender, link) in self.sent:
+                    found.setdefault(receiver, []).append((sender, exact_weight(weight)))
+            self.senders[link] = {receiver: sorted(one) for receiver, one in found.items()}
+        return self.senders[link].get(peer, [])
 
     def _heard(self, sender: int, receiver: int, link: str, channel: int, clock: str) -> Text:
         """Return what a peer sent as a clock of another sees it."""
