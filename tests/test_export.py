@@ -171,6 +171,24 @@ def test_what_a_force_and_noise_move_in_the_end_is_known() -> None:
     assert gains["user[1].wall.f"] == pytest.approx([1.0, 0.0], abs=1e-9)
 
 
+@pytest.mark.parametrize("settings", [{}, {"wan.delay": "13.7 ms", "near.contact.stiffness": "700 N/m"}])
+def test_groups_of_unlike_clocks_answer_a_step_as_simulate_plays_it(settings: dict[str, str]) -> None:
+    text = (SCENES / "mixed-clocks.yaml").read_text(encoding="utf-8")
+    held = compiled(text + "hands:\n  hand: {type: ConstantForce, flange: device, force: 0 N}\n")
+    system = apc.set_parameters(held, settings)
+    found = state_space(system)
+    played = apc.simulate(system, set={"far.hand.force": "1 N"}, duration="0.4 s", jit=False)
+    at = {port.name: place for place, port in enumerate(found.inputs)}
+    x, push = np.zeros(len(found.a)), found.b[:, at["force on far[1].device"]]
+    every = round(found.frame_s / float(played.time[1] - played.time[0]))
+    for row in range(0, len(played.time), every):
+        for place, port in enumerate(found.outputs):
+            size = max(1e-3, np.abs(played[port.name]).max())
+            assert abs(found.c[place] @ x - played[port.name][row]) <= 1e-9 * size, port.name
+        x = found.a @ x + push
+    assert np.abs(played["near[1].cube.x"]).max() > 1e-5  # it came through
+
+
 def matrices(found: StateSpace) -> list[list[list[float]]]:
     return [one.tolist() for one in found.matrices]
 
@@ -327,7 +345,7 @@ def test_the_function_is_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "family.npz"
     apc.export(ALL["average"], out=path, free=["coordination.stiffness"])
     with np.load(path, allow_pickle=False) as archive:
-        function = casadi.Function.deserialize(str(archive["function"]))
+        function = casadi.Function.deserialize(str(archive["casadi_function"]))
         assert archive["free"].tolist() == ["coordination.stiffness"]
     there = state_space(apc.set_parameters(ALL["average"], {"coordination.stiffness": "800 N/m"}))
     assert np.abs(np.array(function(800.0)[0]) - there.a).max() < 1e-12 * np.abs(there.a).max()

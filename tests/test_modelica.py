@@ -171,7 +171,6 @@ def test_two_peers_that_differ_share_what_they_share() -> None:
         ("left[2].x", "'left[2].x'"),
         ("end", "'end'"),
         ("a'b\\", r"'a\'b\\'"),
-        ("é\n", "'__'"),
     ],
 )
 def test_a_name_is_written_as_modelica_reads_it(name: str, written: str) -> None:

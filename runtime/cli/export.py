@@ -46,8 +46,8 @@ from apc.threads import start_single_threaded
     "--free",
     multiple=True,
     metavar="PATH",
-    help="Leave a number free: A, B, C and D are a casadi.Function of it too, `function` in the file. May "
-    "be repeated.",
+    help="Leave a number free: A, B, C and D are a casadi.Function of it too, `casadi_function` in the "
+    "file. May be repeated.",
 )
 @file_option("--out", "The file to write.", required=True)
 @json_option

@@ -1,7 +1,8 @@
 """A scene over one frame as a state space, all peers in it: from forces and noise to what is simulated.
 
 Takes: a `CompiledSystem`; a link or coupler to cut it at.
-Gives: `StateSpace`, `state_space`; `Numbers`, `lifted`, `peers_of`, `steps_in_floats`: the same in any kind of number.
+Gives: `StateSpace`, `state_space`; `Numbers`, `lifted`, `peers_of`, `steps_in_floats`: the same in any kind
+of number.
 Guarantees: every event within a frame is in it, exactly but for rounding; its eigenvalues are those that
 `analyze` finds, and 0 for each force that nothing else remembers until the frame ends. Cut open and closed
 again by u = −y it is the closed loop.
