@@ -111,7 +111,7 @@ E703 compiler/language: a cell or row of a table is wrong
 E801 runtime/frame: an operator runs over nobody
 E802 runtime/frame: the weights of a mean add up to nothing
 E803 runtime/eigen: an operator over equal peers has no linearization
-E804 runtime/analysis runtime/eigen runtime/exports runtime/large runtime/vary: too large, or equals not linear
+E804 runtime/analysis runtime/eigen runtime/exports runtime/large runtime/vary: too large, or not linear
 E805 runtime/frame: a frame is too long to be taken apart
 E806 runtime/analysis runtime/exports runtime/frame: numbers leave the range of floats
 E807 runtime/frame: an operator over the others has no linearization inside a loop

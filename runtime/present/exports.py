@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
-from apc.exports.files import as_control
-from apc.exports.lifted import StateSpace
-from apc.exports.modelica import ModelicaModel
-from apc.exports.words import Port
 from apc.present.forms import document, note
+
+if TYPE_CHECKING:
+    from apc.exports.lifted import StateSpace
+    from apc.exports.modelica import ModelicaModel
+    from apc.exports.words import Port
 
 MOST_NAMED = 6
 
@@ -41,6 +42,8 @@ def _named(ports: Sequence[Port]) -> str:
 
 def state_space_control(found: StateSpace) -> Any:
     """Return a state space as python-control's."""
+    from apc.exports.files import as_control  # what writes files is asked for where one is written
+
     return as_control(found)
 
 
