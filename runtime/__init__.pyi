@@ -36,6 +36,9 @@ from .api import (
     describe_network as describe_network,
 )
 from .api import (
+    export as export,
+)
+from .api import (
     feel as feel,
 )
 from .api import (

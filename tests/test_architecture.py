@@ -115,12 +115,14 @@ HOUSE = (
         panels
         """,
     ),
+    ("apc.exports", "words lifted free files expressions modelica export"),
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",
         """
-        forms pictures network recorded_network loop hands analysis vary comparison_picture comparison
-        region_picture region planar simulation still recording bench """,
+        forms pictures exports network recorded_network loop hands analysis vary comparison_picture comparison
+        region_picture region planar simulation still recording bench
+        """,
     ),
     # what a person calls
     (
@@ -129,7 +131,10 @@ HOUSE = (
     ),
     (
         "apc.cli",
-        "options progress region simulate sweep compare critical feel bench analyze network play commands",
+        """
+        options progress region simulate sweep compare critical feel export bench analyze network play
+        commands
+        """,
     ),
     ("apc", "__main__"),
 )

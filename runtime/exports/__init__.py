@@ -1,0 +1,1 @@
+"""What other tools read: a judged scene as files of theirs."""

@@ -1,0 +1,67 @@
+"""What an export is, in words and as plain data.
+
+Takes: what `exports` makes.
+Gives: `state_space_text`, `state_space_document`, `state_space_control`; `modelica_text`,
+`modelica_document`.
+Guarantees: at most 80 columns.
+Does not: write files.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from apc.compiler.words import counted, wrapped
+from apc.present.forms import document, note
+
+if TYPE_CHECKING:
+    from apc.exports.lifted import StateSpace
+    from apc.exports.modelica import ModelicaModel
+    from apc.exports.words import Port
+
+MOST_NAMED = 6
+
+
+def state_space_text(found: StateSpace) -> str:
+    """Return what a state space has."""
+    lines = [f"{found.topology}: {found.what} over one frame of {found.frame_s * 1e3:.6g} ms", ""]
+    for word, ports in (("state", found.states), ("input", found.inputs), ("output", found.outputs)):
+        lines += wrapped(f"{counted(len(ports), word)}: {_named(ports)}", "  ", "    ")
+    if found.free:
+        lines += wrapped(f"A, B, C and D are a function of {_named(found.free)}", "  ", "    ")
+    lines += ["", *note(found.meaning), *(line for one in found.notes for line in note(one))]
+    return "\n".join(lines)
+
+
+def _named(ports: Sequence[Port]) -> str:
+    names = [port.name for port in ports[:MOST_NAMED]]
+    return ", ".join([*names, "…"] if len(ports) > MOST_NAMED else names) or "none"
+
+
+def state_space_control(found: StateSpace) -> Any:
+    """Return a state space as python-control's."""
+    from apc.exports.files import as_control  # what writes files is asked for where one is written
+
+    return as_control(found)
+
+
+def state_space_document(found: StateSpace) -> dict[str, Any]:
+    """Return a state space as plain data."""
+    function = found.function and found.function.serialize()
+    plain: dict[str, Any] = document(found, {"made_by": json.loads(found.made_by), "function": function})
+    return {**plain, "meaning": found.meaning}
+
+
+def modelica_text(found: ModelicaModel) -> str:
+    """Return what a Modelica model has."""
+    has = f"{counted(found.peers, 'peer')}, {counted(found.variables, 'variable')}, one equation each"
+    lines = [f"{found.topology}: the model {found.name} of Modelica 3.3", "", f"  {has}"]
+    return "\n".join([*lines, *(f"  {clock}" for clock in found.clocks)])
+
+
+def modelica_document(found: ModelicaModel) -> dict[str, Any]:
+    """Return a Modelica model as plain data."""
+    plain: dict[str, Any] = document(found)
+    return plain
