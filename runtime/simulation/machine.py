@@ -1,7 +1,7 @@
 """All peers' frames in machine code: the kernels as loops over peers, and the engine that plays them.
 
 Takes: a `Population`, the laws of its unreliable links.
-Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `Kernel`.
+Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `Kernel`; `straight_lines`.
 Guarantees: the numbers of `stepwise` to a few roundings of the sums, and the same packets; the text depends
 on what a peer does in a frame, not on how many peers there are or on their numbers.
 Does not: compile (see `native`), or play kernels that are not straight code, such as solvers.
@@ -170,7 +170,7 @@ def _kernel(place: int, kernel: Kernel) -> str:
         "frame",
     ]
     after, sent, rows = function.results
-    values, lines = _straight(function, inputs)
+    values, lines = straight_lines(function, inputs)
     stores = [f"carry[{k} * n + i] = {values[one]};" for k, one in enumerate(after)]
     stores += [f"sent[keys[{k}] * peers + i] = {values[one]};" for k, one in enumerate(sent)]
     stores += [
@@ -206,7 +206,7 @@ def _look(place: int, function: PlainFunction) -> str:
         "missing[s]",
         "t",
     ]
-    values, lines = _straight(function, inputs)
+    values, lines = straight_lines(function, inputs)
     body = "\n    ".join(lines)
     return f"""\
 static void look{place}({LOOKED}) {{
@@ -221,7 +221,7 @@ static void look{place}({LOOKED}) {{
 """
 
 
-def _straight(function: PlainFunction, inputs: Sequence[str]) -> tuple[list[str], list[str]]:
+def straight_lines(function: PlainFunction, inputs: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the names of a function's values, and the lines of C that make them."""
     used = {place for _, *places in function.operations for place in places}
     used |= {place for places in function.results for place in places}

@@ -1,0 +1,1 @@
+"""What goes out of the house: files that other programs read."""
